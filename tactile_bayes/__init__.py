@@ -27,35 +27,20 @@ from importlib import import_module
 
 __version__ = "0.1.0"
 
-_NAMES = {
-    "actions.record": ("record",),
-    "api.arrays": ("scan",),
-    "api.comparing": ("Comparison", "compare"),
-    "api.diagnosing": ("Diagnosis", "diagnose"),
-    "api.estimates": ("estimate", "pool"),
-    "api.maps": ("Map", "build_map", "check", "demo_map", "demo_scan", "map_of", "read_map", "read_scan", "simulate"),
-    "api.pooled": ("PooledSize",),
-    "api.reports": ("ExportedFiles", "exam_report", "export"),
-    "api.repeatability": ("calibrate_repeatability",),
-    "api.size_calibration": ("calibrate_size",),
-    "api.sized": ("SizeEstimate",),
-    "api.trials": ("TrialPlan", "TrialResult", "plan", "validate"),
-    "campaigns.campaign": ("CampaignResult", "campaign"),
-    "inference.draws": ("Draws",),
-}
-"""What the package offers, by the modules that have it."""
-_HOME = {name: module for module, names in _NAMES.items() for name in names}
+with open(f"{__path__[0]}/__init__.pyi", encoding="utf-8") as _stub:  # noqa: PTH123 (pathlib is not loaded here)
+    _HOME = {words[-1]: words[1] for words in map(str.split, _stub) if words[:1] == ["from"]}
+"""What the package offers, and the modules that have it: both stand in the stub, for type checkers too."""
 
-__all__ = sorted([*_HOME, "errors"])
+__all__ = sorted(_HOME)
 
 
 def __getattr__(name: str) -> object:
     """Load a name's module when it is first used: `import tactile_bayes` alone loads neither numpy nor scipy."""
-    if name == "errors":
-        return import_module(f"{__name__}.errors")
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    if _HOME[name] == __name__:
+        return import_module(f"{__name__}.{name}")
+    return getattr(import_module(_HOME[name]), name)
 
 
 def __dir__() -> list[str]:

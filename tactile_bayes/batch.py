@@ -310,98 +310,72 @@ def run_batch(
         progress(len(outcomes), len(work))
     todo = [(name, item) for name, item in work.items() if name not in outcomes]
     try:
-        _Run(function, todo, executor=executor or InlineExecutor(), keep=keep).run()
+        _run(function, todo, executor=executor or InlineExecutor(), keep=keep)
     except KeyboardInterrupt:
         done = [outcomes[name] for name in work if name in outcomes]
         raise BatchInterrupted(done, total=len(work), store=None if store is None else store.path) from None
     return [outcomes[name] for name in work]
 
 
-class _Run(Generic[Item, Result]):
-    """A running batch: submits a few items ahead of their results, and stores each outcome as it arrives.
+def _run(
+    function: Callable[[Item], Result],
+    todo: Iterable[tuple[str, Item]],
+    *,
+    executor: Executor,
+    keep: Callable[[Outcome[Result]], None],
+) -> None:
+    """Run all items: submit a few ahead of their results, and keep each outcome as it arrives.
 
-    An item whose worker process was lost is run again at the end, alone: if its process ends again, it is at fault.
+    An item whose worker process was lost is run again at the end, alone: if its process ends again, it is at fault. On
+    the way out of an interruption or a fault what is finished is kept, and nobody waits for running items.
     """
+    workers = executor if isinstance(executor, LocalWorkers) else None
+    ahead: int = getattr(executor, "ahead", _WINDOW)
+    rest, suspects = deque(todo), deque[tuple[str, Item]]()
+    waiting: dict[Future[Outcome[Result]], tuple[str, Item]] = {}
+    finished: SimpleQueue[Future[Outcome[Result]]] = SimpleQueue()
 
-    def __init__(
-        self,
-        function: Callable[[Item], Result],
-        todo: Iterable[tuple[str, Item]],
-        *,
-        executor: Executor,
-        keep: Callable[[Outcome[Result]], None],
-    ) -> None:
-        self._function, self._executor, self._keep = function, executor, keep
-        self._workers = executor if isinstance(executor, LocalWorkers) else None
-        self._rest: deque[tuple[str, Item]] = deque(todo)
-        self._suspects: deque[tuple[str, Item]] = deque()
-        self._waiting: dict[Future[Outcome[Result]], tuple[str, Item]] = {}
-        self._finished: SimpleQueue[Future[Outcome[Result]]] = SimpleQueue()
-        self._alone = False
+    def submit(work: tuple[str, Item]) -> None:
+        future = executor.submit(_attempt, function, *work)
+        waiting[future] = work
+        future.add_done_callback(finished.put)
 
-    def run(self) -> None:
-        """Run all items; on the way out of an interruption or a fault keep what is finished."""
-        try:
-            while self._rest or self._suspects or self._waiting:
-                raise_if_asked()
-                self._hand_out()
-                self._take()
-        except BaseException:
-            self._abandon()
-            raise
-
-    def _hand_out(self) -> None:
-        """Submit what may run now: an item suspected of killing its worker alone, otherwise the next few."""
-        if not self._waiting and not self._rest:
-            self._alone = True
-            self._submit(self._suspects.popleft())
-        ahead: int = getattr(self._executor, "ahead", _WINDOW)
-        while self._rest and len(self._waiting) < ahead:
-            self._submit(self._rest.popleft())
-            if not self._finished.empty():
+    try:
+        while rest or suspects or waiting:
+            raise_if_asked()
+            if alone := not waiting and not rest:
+                submit(suspects.popleft())
+            while rest and len(waiting) < ahead:
+                submit(rest.popleft())
+                if not finished.empty():
+                    break
+            future = finished.get()
+            name, _ = work = waiting.pop(future)
+            if workers is not None and not future.cancelled() and isinstance(future.exception(), BrokenExecutor):
+                if alone:
+                    keep(Outcome(name, error=DIED_TWICE))
+                else:
+                    suspects.append(work)
+                continue
+            outcome = _settle(name, future)
+            keep(outcome)
+            if outcome.error == CLUSTER_LOST:  # nobody would answer: keep what has come, hand out nothing more
+                for other, (name, _) in waiting.items():
+                    came = other.done()
+                    other.cancel()
+                    keep(_settle(name, other) if came else Outcome(name, error=CLUSTER_LOST))
+                for name, _ in rest:
+                    keep(Outcome(name, error=CLUSTER_LOST))
                 return
-
-    def _submit(self, work: tuple[str, Item]) -> None:
-        future = self._executor.submit(_attempt, self._function, work[0], work[1])
-        self._waiting[future] = work
-        future.add_done_callback(self._finished.put)
-
-    def _take(self) -> None:
-        """Wait for one result."""
-        done = self._finished.get()
-        work = self._waiting.pop(done)
-        if self._workers is None or done.cancelled() or not isinstance(done.exception(), BrokenExecutor):
-            outcome = _settle(work[0], done)
-            self._keep(outcome)
-            if outcome.error == CLUSTER_LOST:
-                self._give_up()
-            return
-        if self._alone:
-            self._keep(Outcome(work[0], error=DIED_TWICE))
-        else:
-            self._suspects.append(work)
-
-    def _give_up(self) -> None:
-        """End without the cluster: keep what has come, and hand out nothing more, for nobody would answer."""
-        for future, (name, _) in list(self._waiting.items()):
-            done = future.done()
+    except BaseException:
+        for future in waiting:
             future.cancel()
-            self._keep(_settle(name, future) if done else Outcome(name, error=CLUSTER_LOST))
-        for name, _ in self._rest:
-            self._keep(Outcome(name, error=CLUSTER_LOST))
-        self._waiting.clear()
-        self._rest.clear()
-
-    def _abandon(self) -> None:
-        """Cancel pending items, keep finished ones, and do not wait for running ones."""
-        for future in list(self._waiting):
-            future.cancel()
-        for future in [one for one in self._waiting if one.done() and not one.cancelled()]:
-            name, _ = self._waiting.pop(future)
-            if not isinstance(future.exception(), BrokenExecutor):
-                self._keep(_settle(name, future))
-        if self._workers is not None:
-            self._workers.stop()
+        for future, (name, _) in waiting.items():
+            if future.done() and not future.cancelled() and not isinstance(future.exception(), BrokenExecutor):
+                keep(_settle(name, future))
+        if workers is not None:
+            workers.stop()
+        raise
 
 
 def _attempt(function: Callable[[Item], Result], name: str, item: Item) -> Outcome[Result]:

@@ -417,9 +417,18 @@ class RecordOptions(Options, kw_only=True):
             option="session",
         ),
     ] = None
-    live: bool = False
-    serve: str | None = None
-    size_calibration: str = "solid-mean"
+    live: Annotated[bool, says("Draw the map on the terminal while it grows.")] = False
+    serve: Annotated[
+        str | None,
+        named("HOST:PORT", "Show the map in a browser on this computer, with a tone for the pressure."),
+    ] = None
+    size_calibration: Annotated[
+        str,
+        named(
+            "solid-mean|plane-strain|none|SIZE.json",
+            "Size calibration of the live view, whose frames are divided by their means.",
+        ),
+    ] = "solid-mean"
     force: bool = False
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -111,8 +110,13 @@ def estimate_action(
         answers = [found.answer]
     else:
         found = None
-        with _printed_if_interrupted(maps, as_json=as_json, verbose=verbose):
+        try:
             answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
+        except BatchInterrupted as stop:
+            done = {one.key for one in stop.outcomes}
+            finished = [path for path in maps if str(path) in done]
+            _print(finished, _answers(stop.outcomes), as_json=as_json, verbose=verbose, listed=True)
+            raise
     try:
         if found is not None and output and found.status == "estimate":
             found.write(output, force=force)
@@ -147,18 +151,6 @@ def _answers(outcomes: Iterable[Outcome[Answer | Failure]]) -> Answers:
         one.value if one.value is not None else Failure(f"error: {fault}" if fault else "", EXIT_FAULT)
         for one, fault in zip(found, faults, strict=True)
     ]
-
-
-@contextmanager
-def _printed_if_interrupted(maps: tuple[Path, ...], *, as_json: bool, verbose: bool) -> Iterator[None]:
-    """On Ctrl-C print the finished answers, and pass the interruption on."""
-    try:
-        yield
-    except BatchInterrupted as stop:
-        done = {one.key for one in stop.outcomes}
-        finished = [path for path in maps if str(path) in done]
-        _print(finished, _answers(stop.outcomes), as_json=as_json, verbose=verbose, listed=True)
-        raise
 
 
 def _print(maps: Sequence[Path], answers: Answers, *, as_json: bool, verbose: bool, listed: bool) -> None:

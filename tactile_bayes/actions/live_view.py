@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import multiprocessing
 import os
 import shutil
 import signal
@@ -16,7 +15,7 @@ import sys
 import textwrap
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from functools import cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -24,7 +23,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.batch import prepare_worker
+from tactile_bayes.batch import LocalWorkers
 from tactile_bayes.declarations import from_plain, replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.instrument import calibration_document, head_document
@@ -97,36 +96,24 @@ class Estimator:
 
     def __init__(self, calibration: str | None) -> None:
         self._calibration = calibration
-        self._pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"), initializer=_prepare)
-        self._running: Future[LiveAnswer] | None = self._pool.submit(LiveAnswer)
-        self._begun = time.monotonic()
+        self._process = LocalWorkers(1)
+        self._running: Future[LiveAnswer] | None = self._process.submit(LiveAnswer)
         self.answer = LiveAnswer()
         self.done = 0
-        self.seconds = 0.0
 
     def look(self, tactile_map: TactileMap | None) -> None:
         """Take the answer if it has come, and start the next estimate."""
         if self._running is not None and self._running.done():
-            with contextlib.suppress(Exception):  # the estimate's process died: the view goes on without
+            with contextlib.suppress(Exception):  # the estimate's process died: the next one has another
                 answer = self._running.result()
                 self.answer, self.done = answer if answer.text else self.answer, self.done + 1
-            self.seconds, self._running = time.monotonic() - self._begun, None
+            self._running = None
         if self._running is None and tactile_map is not None:
-            self._begun = time.monotonic()
-            with contextlib.suppress(RuntimeError):  # a broken pool takes no work
-                self._running = self._pool.submit(live_estimate, tactile_map, self._calibration)
+            self._running = self._process.submit(live_estimate, tactile_map, self._calibration)
 
     def close(self) -> None:
         """End the process, also during an estimate."""
-        for child in multiprocessing.active_children():
-            child.terminate()
-        # waited for: the interpreter's own end would meet a pool that is half closed
-        self._pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _prepare() -> None:
-    """Prepare the process; it stands here because its process then loads this module before the first map comes."""
-    prepare_worker()
+        self._process.stop()
 
 
 class Turn:

@@ -20,7 +20,7 @@ import click
 import numpy as np
 
 from tactile_bayes.actions.live_view import KEYS, can_redraw, live_view
-from tactile_bayes.api.arguments import PathLike, door, path_of, plain, takes
+from tactile_bayes.api.arguments import PathLike, path_of, plain, takes
 from tactile_bayes.commands.options import also_read
 from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import EXIT_DONE, EXIT_INTERRUPTED, DeviceError, UsageError, check_number
@@ -383,7 +383,6 @@ _PATHS = ("like", "head_geometry", "array_calibration", "landmarks")
 _NAMED = ("output", "head_url", "duration_s", "tracker_url", "session_file")  #: Keywords of their own.
 
 
-@door
 @takes(RecordOptions, without=_NAMED)
 def record(
     output: PathLike,

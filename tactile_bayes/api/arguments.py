@@ -74,7 +74,7 @@ def door(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
 def takes(
     *records: type[Record], without: Collection[str] = ()
 ) -> Callable[[Callable[_Given, _Returned]], Callable[_Given, _Returned]]:
-    """A function whose further keywords are the fields of these records, and no others.
+    """A `door` whose further keywords are the fields of these records, and no others.
 
     Help and completion show each with its default. A keyword that was left out is not handed on: the record that the
     function makes of them has the default.
@@ -84,14 +84,14 @@ def takes(
     def made(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
         shown = inspect.signature(function).parameters
         own = [one for one in shown.values() if one.kind is not one.VAR_KEYWORD]
-        known = [*(one.name for one in own), *fields]
+        known, entered = [*(one.name for one in own), *fields], door(function)
 
         @wraps(function)
         def called(*args: _Given.args, **keywords: _Given.kwargs) -> _Returned:
             for name in keywords:
                 if name not in known:
                     raise TypeError(f"{function.__name__} has no keyword {name!r}; {meant(name, known)}")
-            return function(*args, **keywords)
+            return entered(*args, **keywords)
 
         more = (inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=fields[name]) for name in fields)
         called.__signature__ = inspect.Signature([*own, *more])  # type: ignore[attr-defined]

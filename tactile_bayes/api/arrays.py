@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, door, path_of, plain, takes
+from tactile_bayes.api.arguments import PathLike, path_of, plain, takes
 from tactile_bayes.api.maps import scan_given
 from tactile_bayes.declarations import EXACT, replace, to_plain
 from tactile_bayes.errors import UsageError
@@ -25,7 +25,6 @@ from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, Sca
 _HEAD_SCHEMA = "tactile-bayes/head/1"
 
 
-@door
 @takes(Stated)
 def scan(
     frames: Any,
@@ -86,7 +85,7 @@ def scan(
         made = imports.combined([Source({"frames": _array(frames), **times}), *beside], given)
     for note in made.notes:
         if note.startswith("CAUTION"):
-            warnings.warn(note, stacklevel=3)
+            warnings.warn(note, stacklevel=4)
     return corrected(with_session(made.scan, path_of(session)), correct)
 
 

@@ -354,7 +354,6 @@ def _scans(answers: Sequence[Answer]) -> list[Mapping[str, str]]:
 _RECORDED = ("size_calibration", "method", "interval", "scene", "between_map_sd", "repeatability")
 
 
-@door
 @takes(Settings, without=["settings_file"])
 def compare(
     first: Any,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import door, path_of, plain, sequence_of, takes
+from tactile_bayes.api.arguments import path_of, plain, sequence_of, takes
 from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.maps import Map, map_of
 from tactile_bayes.api.pooled import PooledSize, pool_estimates
@@ -46,7 +46,6 @@ def _properties(given: Any) -> tuple[tuple[str, float], ...]:
     return tuple((str(name), plain(value)) for name, value in pairs)
 
 
-@door
 @takes(Settings, without=["settings_file"])
 def estimate(tactile_map: Any, *, progress: Callable[[int, int], None] | None = None, **settings: Any) -> SizeEstimate:
     """Estimate a lump's size from one map.
@@ -90,7 +89,6 @@ def estimate(tactile_map: Any, *, progress: Callable[[int, int], None] | None = 
     return replace(found, name="" if given.path is None else given.path.stem)
 
 
-@door
 @takes(Settings, without=["settings_file"])
 def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
     """Estimate one size from several maps of one mass, whose spread is learned.

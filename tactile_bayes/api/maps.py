@@ -152,7 +152,6 @@ def read_map(path: PathLike) -> Map:
     return Map(tactile_map, source, scans=scans)
 
 
-@door
 @takes(MapOptions)
 def build_map(
     scans: Any, *, max_pose_gap_ms: float = MAX_POSE_GAP_MS, progress: Progress = untold, **options: Any
@@ -270,7 +269,6 @@ def demo_map() -> Map:
     return build_map(_DEMO)
 
 
-@door
 @takes(GridOptions)
 def map_of(given: Any, **stated: Any) -> Map:
     """Make a map of values in rows and columns, for `estimate`.

@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from tactile_bayes.api.arguments import PathLike, door, path_of, takes
+from tactile_bayes.api.arguments import PathLike, path_of, takes
 from tactile_bayes.api.estimates import estimated, listed, settings_of
 from tactile_bayes.api.estimating import estimate_file
 from tactile_bayes.api.maps import Map
@@ -101,7 +101,6 @@ def _from_estimate(source: Path, path: Path | None) -> Exam:
 # --- The page of an exam from Python.
 
 
-@door
 @takes(Settings, without=["settings_file"])
 def exam_report(
     files: Any,
@@ -186,7 +185,6 @@ class ExportedFiles(Record):
     notes: tuple[str, ...] = ()
 
 
-@door
 @takes(IdentityOptions)
 def export(
     files: Any = (),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, door, output_path, plain, table_of, takes
+from tactile_bayes.api.arguments import PathLike, output_path, plain, table_of, takes
 from tactile_bayes.api.estimating import estimate_file
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import pooling_shape
@@ -430,7 +430,6 @@ def _check_head(rows: Table, calibration: BodyCalibration) -> None:
 # --- From Python.
 
 
-@door
 @takes(LearnOptions)
 def calibrate_size(
     table: PathLike | pandas.DataFrame,

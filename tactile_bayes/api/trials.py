@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, Told, door, path_of, plain, sequence_of, table_of, takes
+from tactile_bayes.api.arguments import PathLike, Told, path_of, plain, sequence_of, table_of, takes
 from tactile_bayes.batch import open_executor, run_batch
 from tactile_bayes.declarations import EXACT, Record, as_dict, names_of, replace, to_plain
 from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
@@ -185,7 +185,6 @@ def read_excision(excision: Path | Sheet, columns: Path | None) -> Table:
     return read_wide_excision(excision, mapping, mapping.excision)
 
 
-@door
 @takes(TrialSettings)
 def validate(
     trial: PathLike | pandas.DataFrame,
@@ -299,7 +298,6 @@ def read_pilot(pilot: Path | Sheet | None, excision: Path | Sheet | None, agains
     return Pilot(load_trial(pilot, excision, None), pilot.name if isinstance(pilot, Sheet) else pilot)
 
 
-@door
 @takes(PlanOptions, PlanErrors)
 def plan(
     *,

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from tactile_bayes.api.arguments import PathLike, Told, door, path_of, plain, required_path, takes
+from tactile_bayes.api.arguments import PathLike, Told, path_of, plain, required_path, takes
 from tactile_bayes.api.estimates import settings_of
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import open_executor
@@ -76,7 +76,6 @@ class CampaignResult(Told, eq=False):
         return f"<CampaignResult of {len(self.campaign.exams)} exams: {counts}>"
 
 
-@door
 @takes(CampaignOptions, Settings, without=["settings_file", "repeatability"])
 def campaign(
     exams: PathLike,
@@ -142,10 +141,7 @@ def run_campaign(
     for path in (output / name for name in report.WRITTEN):
         if any(one is not None and same_file(path, one) for one in used):
             raise UsageError(f"{path} is an input of this command; choose another name for the output")
-    if settings.columns is not None and settings.excision is None:
-        raise UsageError("--columns is the layout of the excision table; give --excision too")
-    measured = None if settings.excision is None else report.Excision(settings.excision, settings.columns)
-    report.check_inputs(table, measured, settings.protocol)
+    report.check_inputs(table, settings)
     with (
         open_campaign(output, dry=settings.dry_run) as store,
         open_executor(workers=settings.workers, cluster=None if settings.dry_run else settings.scheduler) as executor,
@@ -156,7 +152,7 @@ def run_campaign(
         if settings.dry_run:
             return CampaignResult(run, output, None)
         left = tidy(place, table, run.found.results, unread=run.unread)
-        written = report.write_outputs(run, measured, settings.protocol, unlisted=left)
+        written = report.write_outputs(run, unlisted=left)
         if settings.copy_to:
             report.copy_outputs(place, settings.copy_to)
     return CampaignResult(run, output, written)

@@ -7,6 +7,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
 from datetime import date
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,7 +22,7 @@ from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.manifest_csv import JOURNAL, SAME_IN_SCANS, Exam, natural
 from tactile_bayes.files.map_nc import read_map, read_map_and_scans
 from tactile_bayes.files.reading import check_address, fetched, files_below, is_address
-from tactile_bayes.files.reports import EstimateReport, Place
+from tactile_bayes.files.reports import Place
 from tactile_bayes.files.scan_mcap import provenance_of, scan_records
 from tactile_bayes.findings import Finding
 from tactile_bayes.mapping.map import TactileMap
@@ -145,82 +146,74 @@ def _told(path: Path, name: str, pattern: NamePattern | None) -> Said:
 
 # --- Files of a folder that may be exams, and which of them are the same exam twice.
 
+
+class Found(Record):
+    """Rows for exams.csv, and what somebody should know of the folder."""
+
+    rows: list[dict[str, Any]] = field(default_factory=list)  #: Of files that the table does not list yet.
+    skipped: list[str] = field(default_factory=list)  #: Files that give none, with the reason.
+    spelled: list[str] = field(default_factory=list)
+    """Codes that a file writes in other capitals than the table, in words."""
+    gone: list[str] = field(default_factory=list)  #: Files that the table lists and that are not there.
+    others: Counter[str] = field(default_factory=Counter)
+    """How many files are no exams by their names, by the ends of these."""
+
+
 _ASIDE: Final = (".", "~$")  #: Names of what systems and spreadsheets leave beside files begin so.
 
 
-class FolderFiles:
-    """Files of a folder of this computer and of those below it.
+def _files_of(folder: Path, table: Path, found: Found) -> dict[str, Path]:
+    """Files of a folder of this computer and of those below it that may be exams, in a fixed order.
 
     Folders that a campaign wrote are passed over, and names are paths from the table's folder, which must hold the
-    folder (else a `UsageError`). `paths` are of files that may be exams, in a fixed order; `others` counts the other
-    files by the ends of their names; `closed` names folders that cannot be read, with the reason.
+    folder (else a `UsageError`). Other files are counted, and folders that cannot be read are noted.
     """
+    if not folder.is_dir():
+        raise UsageError(f"{folder} is not a directory; give the folder of the scans")
+    base, own = Path(os.path.realpath(table.parent)), Path(os.path.realpath(table))
+    if not Path(os.path.realpath(folder)).is_relative_to(base):
+        way_out = "write the table beside the scans"
+        raise UsageError(f"{folder} is not inside {table.parent}, the table's folder; {way_out}")
+    paths: dict[str, Path] = {}
+    for path in _walk(folder, found.skipped):
+        if path.name.lower().endswith(_ENDINGS):
+            paths[os.path.relpath(os.path.realpath(path.parent) + os.sep + path.name, base)] = path
+        elif Path(os.path.realpath(path)) != own:
+            found.others[path.suffix.lower() or "no ending"] += 1
+    return paths
 
-    def __init__(self, folder: Path, table: Path) -> None:
-        if not folder.is_dir():
-            raise UsageError(f"{folder} is not a directory; give the folder of the scans")
-        base = Path(os.path.realpath(table.parent))
-        if not Path(os.path.realpath(folder)).is_relative_to(base):
-            way_out = "write the table beside the scans"
-            raise UsageError(f"{folder} is not inside {table.parent}, the table's folder; {way_out}")
-        self.paths: dict[str, Path] = {}
-        self.others: Counter[str] = Counter()
-        self.closed: list[str] = []
-        self._digests: dict[str, str] = {}
-        own = Path(os.path.realpath(table))
-        for path in _walk(folder, self.closed):
-            if path.name.lower().endswith(_ENDINGS):
-                name = os.path.relpath(os.path.realpath(path.parent) + os.sep + path.name, base)
-                self.paths[name] = path
-            elif Path(os.path.realpath(path)) != own:
-                self.others[path.suffix.lower() or "no ending"] += 1
 
-    def repeated(self, said: Mapping[str, Said], listed: Collection[str]) -> dict[str, str]:
-        """Names of files that are no further exam, each with the reason.
+def _repeated(paths: Mapping[str, Path], said: Mapping[str, Said], listed: Collection[str]) -> dict[str, str]:
+    """Names of files that are no further exam, each with the reason; `said` are those that can be read.
 
-        Of files of the same bytes the one that is listed stays, else that of the shortest name. Of a scan and its map,
-        and of a scan and the arrays that it was imported from, the scan stays, unless the other is listed.
-        """
-        found: dict[str, str] = {}
-        for names in self._alike(said):
-            first, *copies = sorted(names, key=lambda name: (name not in listed, len(name), name))
-            found |= {name: f"holds the same bytes as {first}" for name in copies if name not in listed}
-        for made, original in self._made_of({name: one for name, one in said.items() if name not in found}):
-            arrays = original.lower().endswith(ARRAYS)  # which say less of the exam than the scan that they became
-            first, second = (made, original) if arrays else (original, made)
-            if second in listed and first not in listed:
-                first, second = second, first
-            if second not in listed:
-                words = "was made from" if second == made else "was made into"
-                found.setdefault(second, f"{words} {first}, which is an exam")
-        return found
-
-    def _alike(self, said: Mapping[str, Said]) -> Iterator[list[str]]:
-        """Names of readable files of the same bytes."""
-        of_size: dict[int, list[str]] = defaultdict(list)
-        for name in said:
-            of_size[self.paths[name].stat().st_size].append(name)
-        for names in of_size.values():
-            same: dict[str, list[str]] = defaultdict(list)
-            for name in names if len(names) > 1 else ():
-                same[self._digest(name)].append(name)
-            yield from (alike for alike in same.values() if len(alike) > 1)
-
-    def _made_of(self, said: Mapping[str, Said]) -> Iterator[tuple[str, str]]:
-        """Maps and imported scans, each with the name of a file that it was made from."""
-        made = {name: one.sources for name, one in said.items() if one.sources}
-        if not made:
-            return
-        by_digest = {self._digest(name): name for name in said if not name.lower().endswith(MAP)}
-        for name, sources in made.items():
-            original = next((by_digest[digest] for digest in sorted(sources) if digest in by_digest), None)
-            if original is not None and original != name:
-                yield name, original
-
-    def _digest(self, name: str) -> str:
-        if name not in self._digests:
-            self._digests[name] = sha256(self.paths[name])
-        return self._digests[name]
+    Of files of the same bytes the one that is listed stays, else that of the shortest name. Of a scan and its map, and
+    of a scan and the arrays that it was imported from, the scan stays, unless the other is listed.
+    """
+    digest_of = cache(lambda name: sha256(paths[name]))
+    of_size, alike = defaultdict[int, list[str]](list), defaultdict[str, list[str]](list)
+    for name in said:
+        of_size[paths[name].stat().st_size].append(name)
+    for name in (name for names in of_size.values() if len(names) > 1 for name in names):
+        alike[digest_of(name)].append(name)
+    found: dict[str, str] = {}
+    for names in alike.values():
+        first, *copies = sorted(names, key=lambda name: (name not in listed, len(name), name))
+        found |= {name: f"holds the same bytes as {first}" for name in copies if name not in listed}
+    left = {name: one.sources for name, one in said.items() if name not in found}
+    scans = [name for name in left if not name.lower().endswith(MAP)] if any(left.values()) else []
+    by_digest = {digest_of(name): name for name in scans}
+    for made, sources in left.items():
+        original = next((by_digest[digest] for digest in sorted(sources) if digest in by_digest), made)
+        if original == made:
+            continue
+        arrays = original.lower().endswith(ARRAYS)  # which say less of the exam than the scan that they became
+        first, second = (made, original) if arrays else (original, made)
+        if second in listed and first not in listed:
+            first, second = second, first
+        if second not in listed:
+            words = "was made from" if second == made else "was made into"
+            found.setdefault(second, f"{words} {first}, which is an exam")
+    return found
 
 
 def _walk(folder: Path, closed: list[str]) -> Iterator[Path]:
@@ -246,18 +239,6 @@ _DEFAULTS: Final = {"patient": "", "visit": "1", "mass": "1", "side": ""}
 _CODES: Final = ("patient", "visit", "mass")
 
 
-class Found(Record):
-    """Rows for exams.csv, and what somebody should know of the folder."""
-
-    rows: list[dict[str, Any]] = field(default_factory=list)  #: Of files that the table does not list yet.
-    skipped: list[str] = field(default_factory=list)  #: Files that give none, with the reason.
-    spelled: list[str] = field(default_factory=list)
-    """Codes that a file writes in other capitals than the table, in words."""
-    gone: list[str] = field(default_factory=list)  #: Files that the table lists and that are not there.
-    others: Mapping[str, int] = field(default_factory=dict)
-    """How many files are no exams by their names, by the ends of these."""
-
-
 def find_exams(
     folder: Path | str, table: Path, *, listed: Sequence[Mapping[str, str]] = (), names: str | None = None
 ) -> Found:
@@ -280,16 +261,15 @@ def find_exams(
 
 
 def _local(folder: Path, table: Path, known: Mapping[str, Mapping[str, str]], pattern: NamePattern | None) -> Found:
-    files = FolderFiles(folder, table)
-    said: dict[str, Said] = {}
-    found = Found(skipped=files.closed, others=files.others)
-    for name, path in files.paths.items():
+    said, found = dict[str, Said](), Found()
+    paths = _files_of(folder, table, found)
+    for name, path in paths.items():
         try:
             said[name] = _told(path, name, None if name in known else pattern)
         except BadDataError as error:
             if name not in known:
                 found.skipped.append(f"{name}: {error.what}")
-    repeated = files.repeated(said, known)
+    repeated = _repeated(paths, said, known)
     found.skipped.extend(f"{name}: {reason}" for name, reason in repeated.items())
     new = (name for name in said if name not in repeated and name not in known)
     found.rows.extend({"file": name, **_DEFAULTS, **said[name].facts} for name in new)
@@ -457,11 +437,14 @@ def nearest(wanted: Mapping[str, tuple[float, float]], place: tuple[float, float
     return first if away[first] <= most_mm else ""
 
 
-def unnamed(reports: Sequence[EstimateReport]) -> list[Finding]:
-    """Masses of one scan that no row names; the reports are those of all rows of the scan."""
-    centres = [one.centre_mm for report in reports for one in report.masses if one.reported]
+MassPlace = tuple[Place, bool]  #: Where a mass lies on its map, and whether it is the reported one.
+
+
+def unnamed(masses: Sequence[Sequence[MassPlace]]) -> list[Finding]:
+    """Masses of one scan that no row names; `masses` are those of each row of the scan."""
+    centres = [at for of_row in masses for at, reported in of_row if reported]
     found: list[Place] = []
-    for at in (one.centre_mm for one in reports[0].masses):
+    for at, _ in masses[0]:
         if all(np.hypot(at.x - one.x, at.y - one.y) > SAME_MM for one in [*centres, *found]):
             found.append(at)
     return [

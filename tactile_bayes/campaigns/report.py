@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from datetime import date
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from tactile_bayes import __version__
 from tactile_bayes.api.trials import analyse, load_trial, read_excision
-from tactile_bayes.campaigns.exams import grown_masses, unnamed, visit_dates
+from tactile_bayes.campaigns.exams import MassPlace, grown_masses, unnamed, visit_dates
 from tactile_bayes.campaigns.run import Campaign
+from tactile_bayes.campaigns.steps import CampaignSettings
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError
 from tactile_bayes.files import manifest_csv as layout
@@ -21,7 +23,7 @@ from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.reading import IMAGE_BYTES, put, read_bytes
 from tactile_bayes.files.reports import EstimateReport, PooledReport, centre_of
 from tactile_bayes.files.tables import Table
-from tactile_bayes.findings import Finding, Verdict, by_weight, capital, finding_lines, verdict
+from tactile_bayes.findings import Finding, by_weight, capital, finding_lines, verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.options import TrialSettings
 from tactile_bayes.report.campaign_page import ExamEntry, MassRow, VisitEntry, campaign_html, worst
@@ -41,51 +43,47 @@ _TRIAL_COLUMNS: Final = (
 _SIZES: Final = {
     "size_mm": "median", "sd_mm": "sd", "low_mm": "low", "high_mm": "high", "probability": "probability",
 }  # fmt: skip
-_OF_AN_ESTIMATE: Final = (
-    "smallest_lump", "d_x_mm", "d_y_mm", "amplitude", "sigma_x_mm", "sigma_y_mm", "background", "noise_sd",
-    "supposing", "centre_patient_mm", "position", "angle_deg", "variance_share", "scene",
-    "prior_sensitivity",
-)  # fmt: skip
-_OF_A_MASS: Final = ("amplitude", "max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm", "angle_deg", "another_exam")
-"""`_OF_AN_ESTIMATE`, `_OF_A_MASS`: What no table shows."""
 
 
 class Row(Record, eq=False):
-    """One exam as the tables and the index show it."""
+    """One exam as the tables and the index show it: of its report this alone stays in memory."""
 
     exam: Exam  #: Of exams.csv.
-    report: EstimateReport | None
-    """The estimate, by the campaign's repeatability where it has one; None where a step failed."""
-    step: str = ""
-    fault: str = ""
-    """`step`, `fault`: Which step failed and why; empty where none did."""
+    status: str
+    """As the trial table has it: an exam without an estimate looked for the mass in vain, others were not done."""
+    reason: str = ""  #: Why there is no size; empty where there is one.
+    on_paper: str = ""  #: The same as the exam's page says it.
+    failed: bool = False  #: Whether a step failed, for the reason.
+    size: Quantity | None = None  #: Largest size with the interval of the tables; None without one.
+    leading: Quantity | None = None  #: The same with the interval that pages lead with.
+    smallest_mm: float | None = None
+    detected_probability: float | None = None
+    centre_mm: tuple[float, float] | None = None
+    masses: tuple[MassPlace, ...] = ()  #: All masses of its map.
     scans: tuple[Mapping[str, str], ...] = ()
     synthetic: bool | None = None
     """`scans`, `synthetic`: Of the file: digests and facts, whether it is simulated (None: unknown)."""
     findings: tuple[Finding, ...] = ()
     """What speaks against the exam: of its estimate, of the pooled size of its mass, of the table."""
 
-    @property
-    def size(self) -> Quantity | None:
-        """Largest size with the interval of the tables; None without one."""
-        return None if self.report is None else self.report.max_size_mm
-
-    @property
-    def reason(self) -> str:
-        """Why there is no size; empty where there is one."""
-        if self.report is None:
-            return f"{self.step} failed: {self.fault}"
-        return "" if self.size is not None else self.report.reason
-
-    @property
-    def status(self) -> str:
-        """As the trial table has it: an exam without an estimate looked for the mass in vain, others were not done."""
-        return _status(self.report)
-
-    @property
-    def verdict(self) -> Verdict:
-        """Sound, doubtful or no answer."""
-        return verdict(self.findings, answered=self.size is not None)
+    @classmethod
+    def of(cls, exam: Exam, report: EstimateReport, **facts: Any) -> Row:
+        """An exam with its estimate, by the campaign's repeatability where it has one; `facts` are of its file."""
+        size, smallest = report.max_size_mm, report.min_size_mm
+        return cls(
+            exam,
+            _status(report),
+            "" if size is not None else report.reason,
+            "" if size is not None else reason_on_paper(report),
+            size=size,
+            leading=report.leading.max_size_mm,
+            smallest_mm=None if smallest is None else smallest.median,
+            detected_probability=report.detected_probability,
+            centre_mm=centre_of(report.centre_mm),
+            masses=tuple((one.centre_mm, one.reported) for one in report.masses),
+            findings=report.findings,
+            **facts,
+        )
 
 
 def _status(report: EstimateReport | PooledReport | None) -> str:
@@ -99,16 +97,18 @@ def _status(report: EstimateReport | PooledReport | None) -> str:
 
 def exam_rows(campaign: Campaign, pooled: Mapping[str, PooledReport]) -> list[Row]:
     """Every exam of the table, in its order; `pooled` are the masses by their names."""
-    together = _of_pooled(pooled.values())
-    rows = [_row(campaign, exam, together.get(exam.name, ())) for exam in campaign.exams]
-    of_scan: dict[Path, list[EstimateReport]] = defaultdict(list)
+    together, rows = _of_pooled(pooled.values()), [_row(campaign, exam) for exam in campaign.exams]
+    of_scan: dict[Path, list[Row]] = defaultdict(list)
     for row in rows:
-        of_scan[row.exam.path] += [] if row.report is None else [row.report]
-    more = {path: unnamed(reports) for path, reports in of_scan.items() if reports}
-    return [
-        row if row.report is None else replace(row, findings=by_weight((*row.findings, *more[row.exam.path])))
-        for row in rows
-    ]
+        if not row.failed:
+            of_scan[row.exam.path].append(row)
+    more = {path: unnamed([row.masses for row in some]) for path, some in of_scan.items()}
+    told = {
+        row.exam.name: (*row.findings, *together.get(row.exam.name, ()), *more[row.exam.path])
+        for some in of_scan.values()
+        for row in some
+    }
+    return [replace(row, findings=by_weight(told.get(row.exam.name, ()))) for row in rows]
 
 
 def _of_pooled(pooled: Iterable[PooledReport]) -> dict[str, tuple[Finding, ...]]:
@@ -125,22 +125,16 @@ def _of_pooled(pooled: Iterable[PooledReport]) -> dict[str, tuple[Finding, ...]]
     }
 
 
-def _row(campaign: Campaign, exam: Exam, together: tuple[Finding, ...]) -> Row:
+def _row(campaign: Campaign, exam: Exam) -> Row:
     fault = campaign.found.faults.get(exam.name)
     mapped = campaign.found.of("map", exam.name) or {}
     facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "synthetic": mapped.get("synthetic")}
     if fault is not None and fault.step not in ("figures", "page"):
-        return Row(exam, None, fault.step, fault.reason, **facts)
+        reason = f"{fault.step} failed: {fault.reason}"
+        return Row(exam, _status(None), reason, reason, failed=True, **facts)
     by_site = layout.SIZED in (campaign.found.of("size", exam.name) or {"files": ()})["files"]
-    report = read_record(
-        campaign.folder / layout.EXAMS / exam.name / (layout.SIZED if by_site else layout.ESTIMATE), EstimateReport
-    )
-    # what tables and pages show: the rest of a report is a hundred times as much
-    masses = tuple(replace(one, **dict.fromkeys(_OF_A_MASS)) for one in report.masses)
-    rest: dict[str, Any] = {"candidates": (), "other_rises": (), "touching": (), "left_out": (), "prior": {}}
-    rest |= dict.fromkeys(_OF_AN_ESTIMATE)
-    shown = replace(report, masses=masses, diagnostics={}, provenance={}, **rest)
-    return Row(exam, shown, findings=(*report.findings, *together), **facts)
+    place = campaign.folder / layout.EXAMS / exam.name / (layout.SIZED if by_site else layout.ESTIMATE)
+    return Row.of(exam, read_record(place, EstimateReport), **facts)
 
 
 def pooled_reports(campaign: Campaign) -> dict[str, PooledReport]:
@@ -151,10 +145,7 @@ def pooled_reports(campaign: Campaign) -> dict[str, PooledReport]:
 
 def done_line(row: Row) -> dict[str, object]:
     """An exam in ``exams_done.csv``: with an estimate, or with the reason for none."""
-    report = row.report
-    assert report is not None
-    x_mm, y_mm = centre_of(report.centre_mm) or (None, None)
-    smallest = report.min_size_mm
+    x_mm, y_mm = row.centre_mm or (None, None)
     return {
         **_names(row.exam),
         "side": row.exam.side,
@@ -164,11 +155,11 @@ def done_line(row: Row) -> dict[str, object]:
         "status": row.status,
         "reason": row.reason or None,
         **_figures(row.size, _SIZES),
-        "smallest_mm": None if smallest is None else smallest.median,
-        "detected_probability": report.detected_probability,
+        "smallest_mm": row.smallest_mm,
+        "detected_probability": row.detected_probability,
         "centre_x_mm": x_mm,
         "centre_y_mm": y_mm,
-        "verdict": row.verdict,
+        "verdict": verdict(row.findings, answered=row.size is not None),
         "findings": " ".join(finding_lines(row.findings)) or None,
         "synthetic": row.synthetic,
     }
@@ -205,8 +196,7 @@ def trial_lines(
     """
     taken = [row for row in rows if masses is None or (row.exam.patient, row.exam.mass) in masses]
     readings = [
-        _reading(row.exam, TACTILE, row.report, row.reason, reader=row.exam.reader, synthetic=row.synthetic)
-        for row in taken
+        _reading(row.exam, TACTILE, row.status, row.size, row.reason, row.synthetic, row.exam.reader) for row in taken
     ]
     if pooled:
         visits: dict[str, list[Row]] = defaultdict(list)
@@ -224,31 +214,32 @@ def trial_lines(
 def _together(campaign: Campaign, rows: Sequence[Row], report: PooledReport | None) -> dict[str, object]:
     """The reading of a mass at a visit."""
     exam = rows[-1].exam
-    fault = campaign.found.faults.get(exam.of_mass)
-    reason = "every exam failed" if fault is None else f"{fault.step} failed: {fault.reason}"
     told = [row.synthetic for row in rows if row.synthetic is not None]  # a failed exam does not say
     synthetic = any(told) if told else None
-    reading = _reading(exam, POOLED_MODALITY, report, reason if report is None else report.reason, synthetic=synthetic)
-    silent = reading["status"] == "not_detected" and all(row.status == "not_done" for row in rows)
-    return reading | {"status": "not_done"} if silent else reading
+    if report is not None:
+        silent = all(row.status == "not_done" for row in rows)
+        status = "not_done" if silent and report.max_size_mm is None else _status(report)
+        return _reading(exam, POOLED_MODALITY, status, report.max_size_mm, report.reason, synthetic)
+    fault = campaign.found.faults.get(exam.of_mass)
+    reason = "every exam failed" if fault is None else f"{fault.step} failed: {fault.reason}"
+    return _reading(exam, POOLED_MODALITY, _status(None), None, reason, synthetic)
 
 
 def _reading(
     exam: Exam,
     modality: str,
-    report: EstimateReport | PooledReport | None,
+    status: str,
+    size: Quantity | None,
     reason: str,
-    *,
     synthetic: bool | None,
     reader: str | None = None,
 ) -> dict[str, object]:
-    status = _status(report)
     return {
         "patient": exam.patient,
         "mass": exam.mass,
         "modality": modality,
         "status": status,
-        **_figures(None if report is None else report.max_size_mm, _SIZES),
+        **_figures(size, _SIZES),
         "reader": reader,
         "visit": exam.visit,
         "date": exam.day,
@@ -305,22 +296,6 @@ _MOST_ROWS: Final = 5_000  #: More masses than a browser shows at ease.
 _LINKS: Final = (layout.MAP_FIGURE, layout.SIZE_FIGURE, layout.SIZED_FIGURE)
 
 
-class Excision(Record):
-    """Where the sizes after excision are."""
-
-    path: Path  #: Of the table.
-    columns: Path | None = None  #: The mapping of a wide table; None for a tidy one.
-
-    def table(self) -> Table:
-        """Read and check the table."""
-        return read_excision(self.path, self.columns)
-
-    def masses(self) -> set[tuple[str, str]]:
-        """Patient and mass of each row."""
-        columns = self.table().columns
-        return set(zip(columns["patient"], columns["mass"], strict=True))
-
-
 class Written(Record):
     """What was written, in words."""
 
@@ -330,18 +305,16 @@ class Written(Record):
     report: str  #: The trial report as text; empty where there is none.
 
 
-def write_outputs(
-    campaign: Campaign, excision: Excision | None, protocol: Path | None = None, *, unlisted: Sequence[str] = ()
-) -> Written:
+def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Written:
     """Write tables, the index and, where excision sizes are given, the trial's report.
 
     `unlisted` are folders of exams that the table does not list.
     """
     folder, growth, pooled = campaign.folder, growth_rows(campaign), pooled_reports(campaign)
-    rows = exam_rows(campaign, pooled)
-    masses = None if excision is None else excision.masses()
+    rows, excised = exam_rows(campaign, pooled), _excised(campaign.settings)
+    masses = None if excised is None else set(_masses_of(excised))
     tables = {
-        layout.DONE: [done_line(row) for row in rows if row.report is not None],
+        layout.DONE: [done_line(row) for row in rows if not row.failed],
         layout.FAILURES: failure_lines(campaign, rows),
         layout.TRIAL: trial_lines(campaign, rows, pooled, masses),
         **({layout.GROWN: [grown_line(one) for one in growth]} if growth else {}),
@@ -349,13 +322,13 @@ def write_outputs(
     for name, lines in tables.items():
         columns = _TRIAL_COLUMNS if name == layout.TRIAL else layout.columns_of(Path(name).stem)
         write_text(folder / name, layout.table_text(lines, columns), force=True)
-    report, fault = ("", "") if excision is None else _write_report(folder, excision, protocol, growth)
+    report, fault = ("", "") if excised is None else _write_report(folder, campaign.settings, growth)
     for name in (*(() if report else (REPORT, PAGE)), *(() if growth else (layout.GROWN,))):
         (folder / name).unlink(missing_ok=True)
     links = {name: name for name in tables}
     links |= {"trial report": PAGE} if report else {}
     links |= {layout.REPEATABILITY: layout.REPEATABILITY} if campaign.repeatability else {}
-    sized, failed = sum(row.size is not None for row in rows), sum(row.report is None for row in rows)
+    sized, failed = sum(row.size is not None for row in rows), sum(row.failed for row in rows)
     counts = f"{sized} sized, {len(rows) - sized - failed} without a size, {failed} failed"
     write_text(folder / INDEX, _page(campaign, rows, pooled, growth, counts=counts, links=links), force=True)
     left_out = set() if masses is None else {(row.exam.patient, row.exam.mass) for row in rows} - masses
@@ -397,25 +370,41 @@ def copy_outputs(folder: Path, address: str) -> None:
             put(folder / name, f"{address}/{name}")
 
 
-def check_inputs(exams: Sequence[Exam], excision: Excision | None, protocol: Path | None) -> None:
+def check_inputs(exams: Sequence[Exam], settings: CampaignSettings) -> None:
     """Read the table of excision sizes and the protocol, so that a fault in them costs no work.
 
-    Codes of patients and masses must be spelled as those of the exams; other patients and masses may be there.
+    Codes of patients and masses must be spelled as those of the exams; other patients and masses may be there. A mass
+    that was excised before every exam is refused.
     """
-    if protocol is not None and excision is None:
-        raise UsageError("--protocol is for the trial's report; give --excision too")
-    if excision is not None:
-        table = excision.table()
+    if settings.excision is None:
+        for option, what in (
+            ("columns", "is the layout of the excision table"),
+            ("protocol", "is for the trial's report"),
+        ):
+            if getattr(settings, option) is not None:
+                raise UsageError(f"--{option} {what}; give --excision too")
+    table = _excised(settings)
+    if table is not None:
         _check_spelling(table, exams)
-        _check_dates(table, exams)
-    if protocol is not None:
-        _trial_settings(protocol)
+        dates = dict(zip(_masses_of(table), table.columns["date"], strict=True))
+        at_excision([exam.as_reading for exam in exams], dates, fault=partial(_fault_of_exam, exams))
+    _trial_settings(settings.protocol)
+
+
+def _excised(settings: CampaignSettings) -> Table | None:
+    """Sizes after excision, read and checked; None without any."""
+    return None if settings.excision is None else read_excision(settings.excision, settings.columns)
+
+
+def _masses_of(table: Table) -> Iterator[tuple[str, str]]:
+    """Patient and mass of each row."""
+    return zip(table.columns["patient"], table.columns["mass"], strict=True)
 
 
 def _check_spelling(table: Table, exams: Iterable[Exam]) -> None:
     """Refuse a row that is of a mass of the exams but for capitals: the mass would be left out of the trial."""
     known = {(exam.patient.casefold(), exam.mass.casefold()): exam for exam in exams}
-    for row, (patient, mass) in enumerate(zip(table.columns["patient"], table.columns["mass"], strict=True)):
+    for row, (patient, mass) in enumerate(_masses_of(table)):
         exam = known.get((patient.casefold(), mass.casefold()))
         if exam is None:
             continue
@@ -425,16 +414,8 @@ def _check_spelling(table: Table, exams: Iterable[Exam]) -> None:
                 raise table.error(row, column, what, way_out="write it one way in both tables")
 
 
-def _check_dates(table: Table, exams: Sequence[Exam]) -> None:
-    """Refuse a mass that was excised before every exam."""
-    columns = table.columns
-    keys = zip(columns["patient"], columns["mass"], strict=True)
-
-    def fault(row: int, column: str, what: str, /, *, way_out: str) -> BadDataError:
-        return BadDataError(f"table of exams, line {exams[row].line}, column {column}: {what}", way_out=way_out)
-
-    excised_on = dict(zip(keys, columns["date"], strict=True))
-    at_excision([exam.as_reading for exam in exams], excised_on, fault=fault)
+def _fault_of_exam(exams: Sequence[Exam], row: int, column: str, what: str, /, *, way_out: str) -> BadDataError:
+    return BadDataError(f"table of exams, line {exams[row].line}, column {column}: {what}", way_out=way_out)
 
 
 def _trial_settings(protocol: Path | None) -> tuple[TrialSettings, str | None]:
@@ -445,12 +426,13 @@ def _trial_settings(protocol: Path | None) -> tuple[TrialSettings, str | None]:
     return TrialSettings(**fixed), title
 
 
-def _write_report(folder: Path, excision: Excision, protocol: Path | None, growth: Sequence[Growth]) -> tuple[str, str]:
+def _write_report(folder: Path, asked: CampaignSettings, growth: Sequence[Growth]) -> tuple[str, str]:
     """Write what `validate` writes for the trial table; returns its text, or why there is none."""
-    settings, title = _trial_settings(protocol)
+    settings, title = _trial_settings(asked.protocol)
+    assert asked.excision is not None
     try:
-        inputs = load_trial(folder / layout.TRIAL, excision.path, excision.columns, tidy_trial=True)
-        found = analyse(inputs, settings, protocol=protocol, title=title)
+        inputs = load_trial(folder / layout.TRIAL, asked.excision, asked.columns, tidy_trial=True)
+        found = analyse(inputs, settings, protocol=asked.protocol, title=title)
     except BadDataError as error:
         return "", error.what
     found.write_json(folder / REPORT, force=True)
@@ -505,13 +487,8 @@ def _visit(
         used = sum(one.status == "estimate" for one in report.maps)
         return VisitEntry(words, exams, size, used if len(rows) > 1 else 0, "" if size else report.reason)
     size = exams[0].size if len(exams) == 1 else None
-    reasons = dict.fromkeys(map(_why, rows))
+    reasons = dict.fromkeys(row.on_paper for row in rows)
     return VisitEntry(words, exams, size, why="" if size else "; ".join(filter(None, reasons)) or "not pooled")
-
-
-def _why(row: Row) -> str:
-    """Why an exam has no size, as its page says it; empty where it has one."""
-    return row.reason if row.report is None or row.size is not None else reason_on_paper(row.report)
 
 
 def _exam(campaign: Campaign, row: Row, *, inline: bool) -> ExamEntry:
@@ -520,22 +497,21 @@ def _exam(campaign: Campaign, row: Row, *, inline: bool) -> ExamEntry:
         name
         for step in ("map", "estimate", "figures", "size", "page")
         for name in (campaign.found.of(step, exam.name) or {"files": ()})["files"]
-        if row.report is not None
+        if not row.failed
     }
     picture: bytes | str | None = f"{folder}/{layout.THUMBNAIL}" if layout.THUMBNAIL in made else None
     if inline and isinstance(picture, str):
         picture = read_bytes(campaign.folder / picture, most=IMAGE_BYTES)
-    size = None if row.report is None else row.report.leading.max_size_mm
     reader = f", {exam.reader}" if exam.reader else ""
     return ExamEntry(
         f"visit {exam.visit}, exam {exam.replicate}{reader}",
-        _why(row),
-        size,
+        row.on_paper,
+        row.leading,
         row.findings,
         picture,
         f"{folder}/{layout.EXAM_PAGE}" if layout.EXAM_PAGE in made else "",
         {name: f"{folder}/{name}" for name in _LINKS if name in made},
-        failed=row.report is None,
+        failed=row.failed,
     )
 
 

@@ -40,8 +40,6 @@ from tactile_bayes.report.growth_page import Course
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.pooling import Repeatability
 
-# --- Stages of a campaign: one step for many exams or masses, from the journal where it is done, otherwise run.
-
 FEW: Final = 5  #: So many exams are named in a line.
 
 
@@ -66,95 +64,6 @@ class CampaignState(Record, eq=False):
     def of(self, step: str, name: str) -> steps.Result | None:
         """Result of a step of an exam or mass; None where there is none."""
         return self.results[step].get(name)
-
-
-class Stages:
-    """Runs steps, or plans them.
-
-    `needed` counts by step how many are still to be run or found done, as far as is known; `tell` is called with the
-    steps of this run that are done, and those it does altogether.
-    """
-
-    def __init__(self, *, store: BatchStore | None, executor: Executor | None = None, dry: bool = False) -> None:
-        values = {} if store is None else store.values
-        results = {step: StepResults(values) for step in steps.FILES}
-        self.found = CampaignState(results)
-        self.needed: Counter[str] = Counter()
-        self.tell: Progress = untold
-        self._store, self._executor, self._dry = store, executor, dry
-        self._done = 0
-
-    def run(self, step: str, tasks: Sequence[steps.Task], *, without: int = 0) -> None:
-        """Run one step for those that need it.
-
-        `without` is how many more have no inputs: in a plan they will need the step, in a run they failed before it.
-        """
-        kept = self._kept(tasks)
-        for task in kept:
-            self.found.results[step].data[task.name] = task.key
-        done = {task.key for task in kept}
-        missing = [task for task in tasks if task.key not in done]
-        self.found.kept[step] += len(kept)
-        self.found.todo[step] += len(missing) + (without if self._dry else 0)
-        self.found.names[step] += [task.name for task in missing[: FEW - len(self.found.names[step])]]
-        self.needed[step] -= len(kept) + without
-        if self._dry:
-            return
-        for task, outcome in zip(missing, self._run(step, missing), strict=True):
-            if outcome.value is not None:
-                self.found.results[step].data[task.name] = task.key
-            elif outcome.error == CLUSTER_LOST:
-                raise TactileBayesError(f"{CLUSTER_LOST}; what is done is kept")
-            else:
-                self.found.faults[task.name] = Fault(step, outcome.error)
-
-    def _run(self, step: str, tasks: Sequence[steps.Task]) -> list[Outcome[steps.Result]]:
-        before, total = self._done, self._done + self.needed.total()
-
-        def tell(done: int, _total: int) -> None:
-            self.tell(before + done, total)
-
-        try:
-            outcomes = run_batch(
-                steps.run_step, tasks, key=attrgetter("key"), executor=self._executor, store=self._store, progress=tell
-            )
-        except BatchInterrupted as stop:
-            path = None if self._store is None else self._store.path
-            raise BatchInterrupted(stop.outcomes, total=total, store=path, before=before) from None
-        self._done += len(tasks)
-        self.needed[step] -= len(tasks)
-        return outcomes
-
-    def _kept(self, tasks: Sequence[steps.Task]) -> list[steps.Task]:
-        """Tasks done by earlier runs whose files are still what they were; the results of others are forgotten."""
-        if self._store is None:
-            return []
-        values = self._store.values
-        known = [task for task in tasks if task.key in values]
-        for task in known:
-            if not unchanged(task.folder, values[task.key]):
-                del values[task.key]
-        return [task for task in known if task.key in values]
-
-
-def steps_needed(
-    exams: int, masses: int, *, settings: steps.CampaignSettings, learns: bool, compared: int = 0
-) -> dict[str, int]:
-    """Steps that so many exams and masses take, done or not.
-
-    `masses` are to be pooled, `compared` between visits; where the repeats may teach the spread between exams
-    (`learns`), every exam gets its size by it.
-    """
-    needed = {
-        "map": exams,
-        "estimate": exams,
-        "figures": exams * settings.figures,
-        "page": exams,
-        "pool": masses,
-        "compare": compared,
-    }
-    needed |= {"repeatability": 1, "size": exams} if learns else {}
-    return {**needed, "copy": (2 * exams + masses + compared) * bool(settings.copy_to)}
 
 
 Bar = Callable[[str], AbstractContextManager[Progress]]
@@ -182,8 +91,8 @@ class Campaign:
         bar: Bar | None = None,
     ) -> None:
         self.exams, self.folder, self.settings = exams, folder, settings
-        self._stages = Stages(store=store, executor=executor, dry=dry)
-        self.found: CampaignState = self._stages.found
+        values = {} if store is None else store.values
+        self.found = CampaignState({step: StepResults(values) for step in steps.FILES})
         self.not_pooled = ""  # why no mass is; empty where masses are
         self.not_compared = ""  # the same of visits; empty too where no mass has several
         self.unread: set[str] = set()  # names of the exams whose file could not be read
@@ -192,6 +101,9 @@ class Campaign:
         self._sizes_unknown = False
         self._store, self._executor, self._dry = store, executor, dry
         self._bar: Bar = (lambda _label: nullcontext(untold)) if bar is None else bar
+        self._tell: Progress = untold
+        self._needed: Counter[str] = Counter()  # by step, still to be run or found done, as far as is known
+        self._done = 0  # steps of this run
         self._block = max(_BLOCK, _AHEAD_IN_BLOCK * int(getattr(executor, "ahead", 0)))
         self._breasts = Breasts(exams)
         self._recordings = Alike(self._breasts, "recording")
@@ -212,10 +124,8 @@ class Campaign:
         masses = 0 if self.not_pooled else len({exam.of_mass for exam in sound})
         learns = steps.taught_by(sound, self.settings) >= steps.FEWEST_MASSES
         grown = 0 if self.not_compared else len(grown_masses(sound))
-        self._stages.needed.update(
-            steps_needed(len(sound), masses, settings=self.settings, learns=learns, compared=grown)
-        )
-        with self._bar("steps") as self._stages.tell:
+        self._needed.update(self._steps(len(sound), masses, learns=learns, compared=grown))
+        with self._bar("steps") as self._tell:
             for block in _blocks_of_patients(sound, self._block):
                 self._size(block)
             sound = [exam for exam in sound if exam.name not in self._repeated]
@@ -223,11 +133,68 @@ class Campaign:
             self._make_pages(sound)
             if masses:
                 spared = masses - len({exam.of_mass for exam in sound})
-                self._stages.needed.subtract(steps_needed(0, spared, settings=self.settings, learns=False))
+                self._needed.subtract(self._steps(0, spared))
                 self._pool(sound)
             if grown:
                 self._compare(sound)
         return self.found
+
+    def _steps(self, exams: int, masses: int, *, learns: bool = False, compared: int = 0) -> dict[str, int]:
+        """Steps that so many exams and masses take, done or not.
+
+        `masses` are to be pooled, `compared` between visits; where the repeats may teach the spread between exams
+        (`learns`), every exam gets its size by it.
+        """
+        needed = {"map": exams, "estimate": exams, "figures": exams * self.settings.figures, "page": exams}
+        needed |= {"pool": masses, "compare": compared}
+        needed |= {"repeatability": 1, "size": exams} if learns else {}
+        return {**needed, "copy": (2 * exams + masses + compared) * bool(self.settings.copy_to)}
+
+    def _run(self, step: str, tasks: Sequence[steps.Task], *, of: int) -> None:
+        """Run one step for those that need it, or plan it.
+
+        Of so many exams or masses those without a task have no inputs: in a plan they will need the step, in a run they
+        failed before it. Results of earlier runs are kept where their files are still what they were, else forgotten.
+        """
+        kept, values = list[steps.Task](), {} if self._store is None else self._store.values
+        for task in tasks:
+            if task.key in values and unchanged(task.folder, values[task.key]):
+                kept.append(task)
+                self.found.results[step].data[task.name] = task.key
+            elif task.key in values:
+                del values[task.key]
+        done, without = {task.key for task in kept}, of - len(tasks)
+        missing = [task for task in tasks if task.key not in done]
+        self.found.kept[step] += len(kept)
+        self.found.todo[step] += len(missing) + (without if self._dry else 0)
+        self.found.names[step] += [task.name for task in missing[: FEW - len(self.found.names[step])]]
+        self._needed[step] -= len(kept) + without
+        if self._dry:
+            return
+        for task, outcome in zip(missing, self._outcomes(missing), strict=True):
+            if outcome.value is not None:
+                self.found.results[step].data[task.name] = task.key
+            elif outcome.error == CLUSTER_LOST:
+                raise TactileBayesError(f"{CLUSTER_LOST}; what is done is kept")
+            else:
+                self.found.faults[task.name] = Fault(step, outcome.error)
+        self._done += len(missing)
+        self._needed[step] -= len(missing)
+
+    def _outcomes(self, tasks: Sequence[steps.Task]) -> list[Outcome[steps.Result]]:
+        before, total = self._done, self._done + self._needed.total()
+        try:
+            return run_batch(
+                steps.run_step,
+                tasks,
+                key=attrgetter("key"),
+                executor=self._executor,
+                store=self._store,
+                progress=lambda done, _total: self._tell(before + done, total),
+            )
+        except BatchInterrupted as stop:
+            path = None if self._store is None else self._store.path
+            raise BatchInterrupted(stop.outcomes, total=total, store=path, before=before) from None
 
     def _read_sources(self) -> None:
         """Digests of all files: two exams of one file are found before any is mapped."""
@@ -247,15 +214,14 @@ class Campaign:
     def _size(self, exams: Sequence[Exam]) -> None:
         """Maps, estimates and figures of some exams."""
         known = [exam for exam in exams if exam.path in self._digests]  # a plan fetches nothing from a store
-        self._stages.run("map", [self._map_task(exam) for exam in known], without=len(exams) - len(known))
+        self._run("map", [self._map_task(exam) for exam in known], of=len(exams))
         exams = self._recorded_once(exams)
         mapped = [exam for exam in exams if exam.name in self.found.results["map"]]
         mapped = mapped if self._dry else self._placed(mapped)
-        unmapped = len(exams) - len(mapped)
-        self._stages.run("estimate", [self._estimate_task(exam, "estimate") for exam in mapped], without=unmapped)
+        self._run("estimate", [self._estimate_task(exam, "estimate") for exam in mapped], of=len(exams))
         if self.settings.figures:
             tasks = [self._estimate_task(exam, "figures") for exam in self._estimated(mapped)]
-            self._stages.run("figures", tasks, without=len(exams) - len(tasks))
+            self._run("figures", tasks, of=len(exams))
         self._copy(EXAMS, [exam.name for exam in exams], made_by=("map", "estimate", "figures"))
 
     def _estimated(self, exams: Sequence[Exam]) -> list[Exam]:
@@ -271,8 +237,8 @@ class Campaign:
             self.found.faults[name] = Fault("map", reason)
         self._repeated |= faults.keys()
         left = [exam for exam in exams if exam.name not in faults]
-        spared = steps_needed(len(exams) - len(left), 0, settings=self.settings, learns=False)
-        self._stages.needed.subtract({step: count for step, count in spared.items() if step != "map"})
+        spared = self._steps(len(exams) - len(left), 0)
+        self._needed.subtract({step: count for step, count in spared.items() if step != "map"})
         return left
 
     def _copy(self, kind: str, names: Sequence[str], *, made_by: Sequence[str]) -> None:
@@ -280,7 +246,7 @@ class Campaign:
         if self.settings.copy_to:
             results = [self.found.results[step] for step in made_by]
             tasks = steps.copy_tasks(self.folder / kind, names, results, to=f"{self.settings.copy_to}/{kind}")
-            self._stages.run("copy", tasks, without=len(names) - len(tasks))
+            self._run("copy", tasks, of=len(names))
 
     def _folder_of(self, exam: Exam) -> Path:
         return self.folder / EXAMS / exam.name
@@ -348,7 +314,7 @@ class Campaign:
 
     def _learn_repeatability(self, sound: Sequence[Exam]) -> None:
         """Learn the spread between exams from the repeats, and size every exam by it from what its estimate left."""
-        estimated, needed = self._estimated(sound), self._stages.needed
+        estimated, needed = self._estimated(sound), self._needed
         masses = steps.taught_by(sound if self._dry else estimated, self.settings)
         if masses < steps.FEWEST_MASSES:
             if masses:
@@ -358,11 +324,11 @@ class Campaign:
             return
         complete = not self._dry or len(estimated) == len(sound)
         tasks = [self._repeatability_task(estimated)] if complete else []
-        self._stages.run("repeatability", tasks, without=int(not complete))
+        self._run("repeatability", tasks, of=1)
         result = self.found.of("repeatability", SITE)
         if result is None and self._dry:
             self._sizes_unknown = True
-            self._stages.run("size", [], without=len(sound))
+            self._run("size", [], of=len(sound))
             return
         if result is None:
             fault = self.found.faults.pop(SITE, None)
@@ -375,13 +341,13 @@ class Campaign:
         needed["size"] = len(again)
         for block in _blocks(again, self._block):
             tasks = [task for exam in block if (task := self._size_task(exam)) is not None]
-            self._stages.run("size", tasks, without=0 if self._dry else len(block) - len(tasks))
+            self._run("size", tasks, of=len(tasks) if self._dry else len(block))
 
     def _make_pages(self, sound: Sequence[Exam]) -> None:
         """The page of every exam that was estimated, with its size by the repeatability where it has one."""
         for block in _blocks(sound, self._block):
             known = [] if self._sizes_unknown else self._estimated(block)
-            self._stages.run("page", [self._page_task(exam) for exam in known], without=len(block) - len(known))
+            self._run("page", [self._page_task(exam) for exam in known], of=len(block))
             self._copy(EXAMS, [exam.name for exam in block], made_by=("size", "page"))
 
     def _page_task(self, exam: Exam) -> steps.Task:
@@ -444,11 +410,10 @@ class Campaign:
         """Run a step for the masses that have what it needs, out of so many."""
         known = {} if self._sizes_unknown else found
         for names in _blocks(list(known), self._block):
-            self._stages.run(step, [task_of(name, known[name]) for name in names])
+            self._run(step, [task_of(name, known[name]) for name in names], of=len(names))
             self._copy(kind, names, made_by=(step,))
-        self._stages.run(step, [], without=masses - len(known))
-        if self.settings.copy_to:
-            self._stages.run("copy", [], without=masses - len(known))
+        for one in (step, "copy") if self.settings.copy_to else (step,):
+            self._run(one, [], of=masses - len(known))
 
     def _not_over_bodies(self) -> str:
         """Which calibration cannot size several maps together; empty for none."""

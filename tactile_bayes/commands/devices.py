@@ -6,19 +6,18 @@ from typing import get_args
 
 import click
 
-from tactile_bayes.commands.options import FORCE, SPEED, FilePath, FiniteRange, command, live_options, output, takes
+from tactile_bayes.commands.options import FORCE, SPEED, FilePath, FiniteRange, command, output, takes
 from tactile_bayes.declarations import names_of
 from tactile_bayes.options import FaultOptions, RecordOptions
 from tactile_bayes.presets import TrackerProtocol
 
-_RECORDING = names_of(RecordOptions)[2:-4]  #: Between the output with the head's port and the options of the live view.
+_RECORDING = names_of(RecordOptions)[2:-1]  #: Between the output with the head's port and `FORCE`.
 
 
 @command("record", "record.record_action")
 @output("SCAN.mcap", "MCAP", "Scan file to write.", required=True)
 @click.option("--head", "head_url", required=True, metavar="URL", help="Port of the scan head.")
 @takes(RecordOptions, *_RECORDING)
-@live_options
 @FORCE
 def record_command() -> None:
     """Record a scan head and a tracker.
@@ -78,11 +77,9 @@ def emulate_command() -> None:
 @click.option(
     "--pivot", "pivot_url", metavar="URL", help="Check for inverse rotations: turn this tracker about a fixed point."
 )
-@click.option(
-    "--tracker-protocol",
-    type=click.Choice(PROTOCOLS),
-    default="fastrak",
-    show_default=True,
+@takes(
+    RecordOptions,
+    "tracker_protocol",
     metavar="PROTOCOL",
     help=f"Protocol of the tracker to rotate: {', '.join(PROTOCOLS)}.",
 )
@@ -105,13 +102,10 @@ def devices_command() -> None:
     """
 
 
-_FILE = FilePath()
-
-
 @command("replay", "devices.replay_action")
-@click.argument("scan", metavar="SCAN.mcap", type=_FILE)
+@click.argument("scan", metavar="SCAN.mcap", type=FilePath())
 @output("OUT.mcap", "MCAP", "Save what is recorded.")
-@live_options
+@takes(RecordOptions, "live", "serve", "size_calibration")
 @SPEED
 @FORCE
 def replay_command() -> None:

@@ -322,22 +322,6 @@ SPEED = number("--speed", FiniteRange(0.01, 100.0), 1.0, "Playback speed; 1 is r
 WORKERS = number("--workers", click.IntRange(min=0), 1, "Number of worker processes.")
 
 
-def live_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """``--live``, ``--serve`` and ``--size-calibration``: the live view of a recording."""
-    live = click.option("--live", is_flag=True, help="Draw the map on the terminal while it grows.")
-    serve = click.option(
-        "--serve", metavar="HOST:PORT", help="Show the map in a browser on this computer, with a tone for the pressure."
-    )
-    size_calibration = click.option(
-        "--size-calibration",
-        default="solid-mean",
-        show_default=True,
-        metavar="solid-mean|plane-strain|none|SIZE.json",
-        help="Size calibration of the live view, whose frames are divided by their means.",
-    )
-    return live(serve(size_calibration(command)))
-
-
 def scheduler_option(what: str) -> Decorator:
     """``--scheduler``; `what` names the work that is sent to it."""
     return click.option("--scheduler", metavar="ADDRESS", help=f"Send {what} to a dask scheduler (extra [cluster]).")

@@ -342,7 +342,7 @@ def test_half_a_place_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("code", "status"), [("cannot_show", "not_done"), ("undetected", "not_detected")])
 def test_an_exam_that_cannot_show_a_lump_was_not_done(code: str, status: str) -> None:
     """Not held against the modality; the control is a map that could have shown a lump."""
-    row = Row(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), estimate_report(reason_code=code))
+    row = Row.of(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), estimate_report(reason_code=code))
     assert row.status == status
     without_faults: Any = SimpleNamespace(found=SimpleNamespace(faults={}))
     together = {row.exam.of_mass: pooled_report(reason="no size", maps=())}

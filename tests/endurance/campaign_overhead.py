@@ -59,7 +59,7 @@ def client(out: Path, exams: int) -> None:
         table = [_exam(number) for number in range(exams)]
     with tempfile.TemporaryDirectory() as place, ExitStack() as stack:
         for module, name, fake in (
-            (campaigns, "run_step", step),
+            (campaigns.steps, "run_step", step),
             (campaigns, "read_sources", sources),
             (campaigns, "unchanged", lambda *_: True),
             (campaign_report, "read_record", lambda _path, kind: read_record(estimate, kind)),
@@ -77,7 +77,7 @@ def client(out: Path, exams: int) -> None:
             run = campaigns.Campaign(table, folder, CampaignSettings(own_repeatability=False), store=store)
             run.run()
             stack.enter_context(mock.patch.object(campaign_report, "_MOST_INLINE", 0))
-            campaign_report.write_outputs(run, None)
+            campaign_report.write_outputs(run)
         for name in campaign_report.WRITTEN:
             if (folder / name).exists():
                 print(f"{name}: {(folder / name).stat().st_size / 1e6:.1f} MB")

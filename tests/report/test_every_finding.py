@@ -183,8 +183,8 @@ def dicom(made: Made, name: str) -> str:
 
 
 def campaign_row(made: Made) -> str:
-    row = Row(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), made.answer.report, scans=SCANS, findings=made.findings)
-    cells = done_line(row)
+    row = Row.of(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), made.answer.report, scans=SCANS)
+    cells = done_line(replace(row, findings=made.findings))
     return f"{cells['verdict']} {cells['findings'] or ''}"
 
 
