@@ -336,7 +336,7 @@ def _run(
     finished: SimpleQueue[Future[Outcome[Result]]] = SimpleQueue()
 
     def submit(work: tuple[str, Item]) -> None:
-        future = executor.submit(_attempt, function, *work)
+        future = executor.submit(_attempt, function, work[0], work[1])
         waiting[future] = work
         future.add_done_callback(finished.put)
 

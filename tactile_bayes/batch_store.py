@@ -24,7 +24,6 @@ from tactile_bayes.errors import BadDataError, UsageError
 
 STORE_SCHEMA: Final = "tactile-bayes.batch/2"
 _FLUSHED_EVERY_S: Final = 5.0  #: Lines reach the disk at least this often: what a loss of power may cost.
-_READ_BYTES: Final = 4096
 
 
 class StoredValues(UserDict[str, Any]):
@@ -39,7 +38,9 @@ class StoredValues(UserDict[str, Any]):
         self._descriptor, self._decode = descriptor, decode
 
     def __getitem__(self, name: str) -> Any:
-        return self._decode(_unsealed(_line_at(self._descriptor, self.data[name]))["value"])
+        with open(self._descriptor, "rb", closefd=False) as file:  # what is written goes to the end all the same
+            file.seek(self.data[name])
+            return self._decode(_unsealed(file.readline()[:-1].decode())["value"])
 
 
 class BatchStore:
@@ -175,17 +176,6 @@ def _lock(descriptor: int, path: Path, *, shared: bool) -> None:
         fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except BlockingIOError:
         raise UsageError(f"{path} is in use by another run; wait for it or choose another name") from None
-
-
-def _line_at(descriptor: int, offset: int) -> str:
-    """Text of the line that begins at a place of a file, without its end."""
-    found = b""
-    while not (end := found.find(b"\n") + 1):
-        more = os.pread(descriptor, _READ_BYTES, offset + len(found))
-        if not more:
-            raise ValueError("the line has no end")
-        found += more
-    return found[: end - 1].decode()
 
 
 def _sealed(text: str) -> str:

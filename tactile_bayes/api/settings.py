@@ -141,18 +141,8 @@ def times_of(days: Sequence[float] | None, dates: Sequence[str] | None) -> tuple
     """Time of each visit in days, the first at 0, from the later ones' days or from all dates; None for neither."""
     if days is not None and dates is not None:
         raise UsageError("days and dates both say when the visits were; give one of them")
-    if dates is not None:
-        return days_of_dates(dates)
-    return None if days is None else (0.0, *days)
-
-
-def dates_of(text: str | None) -> tuple[str, ...]:
-    """Dates from a list with commas, such as 2026-01-15,2026-04-20; none of no text."""
-    return () if text is None else tuple(one.strip() for one in text.split(","))
-
-
-def days_of_dates(dates: Sequence[str]) -> tuple[float, ...]:
-    """Days from the first of some dates, such as 2026-03-01."""
+    if dates is None:
+        return None if days is None else (0.0, *days)
     found = []
     for text in dates:
         try:
@@ -160,3 +150,8 @@ def days_of_dates(dates: Sequence[str]) -> tuple[float, ...]:
         except ValueError:
             raise UsageError(f"{str(text).strip()!r} is no date; give year-month-day, such as 2026-03-01") from None
     return tuple(float((one - found[0]).days) for one in found)
+
+
+def dates_of(text: str | None) -> tuple[str, ...]:
+    """Dates from a list with commas, such as 2026-01-15,2026-04-20; none of no text."""
+    return () if text is None else tuple(one.strip() for one in text.split(","))

@@ -6,6 +6,7 @@ import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from datetime import date
 from functools import cache
 from pathlib import Path
@@ -48,7 +49,6 @@ class Said(Record):
 
 def said_by(path: Path, name: str) -> Said:
     """What a scan, arrays of a scan or a map say of the exam: facts on which all scans of the file agree."""
-    check_name(name)
     if name.lower().endswith(ARRAYS):
         return Said()
     if name.lower().endswith(MAP):
@@ -248,8 +248,21 @@ def find_exams(
     already; paths are written from the table's folder; `names`: see `NamePattern`.
     """
     known = {row["file"] if is_address(row["file"]) else os.path.normpath(row["file"]): row for row in listed}
-    pattern = None if names is None else NamePattern(names)
-    found = _stored(folder, known, pattern) if isinstance(folder, str) else _local(folder, table, known, pattern)
+    pattern, found, said = None if names is None else NamePattern(names), Found(), dict[str, Said]()
+    paths = {} if isinstance(folder, str) else _files_of(folder, table, found)
+    stored = files_below(check_address(folder), *SCANS) if isinstance(folder, str) else ()
+    for name in (*paths, *(one for one in stored if one not in known)):
+        try:
+            check_name(name)
+            with nullcontext(paths[name]) if name in paths else fetched(name) as path:
+                said[name] = _told(path, name, None if name in known else pattern)
+        except BadDataError as error:
+            if name not in known:
+                found.skipped.append(f"{name}: {error.what}")
+    repeated = _repeated(paths, said, known) if paths else {}
+    found.skipped.extend(f"{name}: {reason}" for name, reason in repeated.items())
+    new = (name for name in said if name not in repeated and name not in known)
+    found.rows.extend({"file": name, **_DEFAULTS, **said[name].facts} for name in new)
     found.spelled.extend(_spell_as(listed, found.rows))
     found.rows.sort(
         key=lambda row: (natural(row["patient"].casefold()), natural(row["visit"]), row["mass"], row["file"])
@@ -257,37 +270,6 @@ def find_exams(
     _number(found.rows, listed)
     gone = (name for name in known if not is_address(name) and not os.path.lexists(table.parent / name))
     found.gone.extend(known[name]["file"] for name in gone)
-    return found
-
-
-def _local(folder: Path, table: Path, known: Mapping[str, Mapping[str, str]], pattern: NamePattern | None) -> Found:
-    said, found = dict[str, Said](), Found()
-    paths = _files_of(folder, table, found)
-    for name, path in paths.items():
-        try:
-            said[name] = _told(path, name, None if name in known else pattern)
-        except BadDataError as error:
-            if name not in known:
-                found.skipped.append(f"{name}: {error.what}")
-    repeated = _repeated(paths, said, known)
-    found.skipped.extend(f"{name}: {reason}" for name, reason in repeated.items())
-    new = (name for name in said if name not in repeated and name not in known)
-    found.rows.extend({"file": name, **_DEFAULTS, **said[name].facts} for name in new)
-    return found
-
-
-def _stored(address: str, known: Mapping[str, Mapping[str, str]], pattern: NamePattern | None) -> Found:
-    """Scans in an object store, each named by its address."""
-    found = Found()
-    for one in (name for name in files_below(check_address(address), *SCANS) if name not in known):
-        try:
-            check_name(one)
-            with fetched(one) as copy:
-                facts = _told(copy, one, pattern).facts
-        except BadDataError as error:
-            found.skipped.append(f"{one}: {error.what}")
-        else:
-            found.rows.append({"file": one, **_DEFAULTS, **facts})
     return found
 
 

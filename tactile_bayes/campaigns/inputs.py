@@ -9,7 +9,7 @@ import time
 from collections import UserDict, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from operator import attrgetter
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -162,31 +162,29 @@ class Sources(Record):
     faults: dict[Path, str]  #: Why a file cannot be read, by path.
 
 
-class _Source(Record):
-    path: Path
-    key: str
-    address: str
-    settled: bool  #: Whether its times can be trusted: it was not changed a moment ago.
+def _key_of(exam: Exam) -> tuple[str, bool]:
+    """Name that the digest of the exam's file has in the journal, and whether it tells the content from a later one.
 
-    @classmethod
-    def of(cls, exam: Exam) -> _Source:
-        """The exam's file, with a key that tells its content from a later one; a store's tag needs no time."""
-        try:
-            if exam.address:
-                said, changed = version_of(exam.address), 0.0
-            else:
-                known = exam.path.stat()
-                said, changed = stamp(exam.path), max(known.st_mtime, known.st_ctime)
-        except (OSError, BadDataError):
-            return cls(exam.path, exam.file, exam.address, settled=False)
-        key = f"{READ} {exam.file} {hashlib.sha256(said.encode()).hexdigest()[:32]}"
-        return cls(exam.path, key, exam.address, changed < time.time() - _SETTLED_S)
+    It does not where the file was changed a moment ago, or cannot be looked at; a store's tag needs no time.
+    """
+    try:
+        if exam.address:
+            said, changed = version_of(exam.address), 0.0
+        else:
+            known = exam.path.stat()
+            said, changed = stamp(exam.path), max(known.st_mtime, known.st_ctime)
+    except (OSError, BadDataError):
+        return exam.file, False
+    key = f"{READ} {exam.file} {hashlib.sha256(said.encode()).hexdigest()[:32]}"
+    return key, changed < time.time() - _SETTLED_S
 
-    def read(self) -> dict[str, Any]:
-        """The file's digest, and how long it took."""
-        begun = time.perf_counter()
-        digest = sha256_of(self.address) if self.address else sha256(self.path)
-        return {"sha256": digest, "seconds": round(time.perf_counter() - begun, 6)}
+
+def _read(file: tuple[str, Path, str]) -> dict[str, Any]:
+    """The digest of a file (its key, its path, and its address in an object store), and how long it took."""
+    _, path, address = file
+    begun = time.perf_counter()
+    digest = sha256_of(address) if address else sha256(path)
+    return {"sha256": digest, "seconds": round(time.perf_counter() - begun, 6)}
 
 
 def read_sources(
@@ -202,22 +200,24 @@ def read_sources(
     New digests go into the journal (`keep`), or else files in object stores that are not known are passed over. A lost
     cluster is a `TactileBayesError`.
     """
-    sources = [_Source.of(exam) for exam in {exam.path: exam for exam in exams}.values()]
+    files = {exam.path: (exam, *_key_of(exam)) for exam in {exam.path: exam for exam in exams}.values()}
     values: Mapping[str, Any] = {} if store is None else store.values
-    found = Sources({one.path: values[one.key]["sha256"] for one in sources if one.settled and one.key in values}, {})
-    for settled, kept in ((True, store if keep else None), (False, None)):
-        unknown = [one for one in sources if one.settled == settled and one.path not in found.digests]
-        waiting = [one for one in unknown if keep or not one.address]
-        outcomes = run_batch(
-            _Source.read, waiting, key=attrgetter("key"), executor=executor, store=kept, progress=progress
-        )
-        for one, outcome in zip(waiting, outcomes, strict=True):
+    known = {path: values[key]["sha256"] for path, (_, key, settled) in files.items() if settled and key in values}
+    found = Sources(known, {})
+    for settles, kept in ((True, store if keep else None), (False, None)):
+        waiting = [
+            (key, path, exam.address)
+            for path, (exam, key, settled) in files.items()
+            if settled == settles and path not in known and (keep or not exam.address)
+        ]
+        outcomes = run_batch(_read, waiting, key=itemgetter(0), executor=executor, store=kept, progress=progress)
+        for (_, path, address), outcome in zip(waiting, outcomes, strict=True):
             if outcome.value is not None:
-                found.digests[one.path] = outcome.value["sha256"]
+                found.digests[path] = outcome.value["sha256"]
             elif outcome.error == CLUSTER_LOST:
                 raise TactileBayesError(f"{CLUSTER_LOST}; what is done is kept")
             else:
-                found.faults[one.path] = outcome.error.removeprefix(f"{one.address or one.path}: ")
+                found.faults[path] = outcome.error.removeprefix(f"{address or path}: ")
     return found
 
 
