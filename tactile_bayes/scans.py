@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import Meta, Record, field, settle, to_plain
+from tactile_bayes.declarations import Meta, Record, field, settle
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray, check_rigid
@@ -108,10 +108,6 @@ class HeadShape(Record):
         parts += [f"{self.uneven_mm:g} mm off its arcs"] if self.uneven_mm >= UNEVEN_MM else []
         parts += [f"rim {self.rim_mm:g} mm"] if self.rim_mm is not None else []
         return ", ".join(parts)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain data for files."""
-        return dict(to_plain(self, digits=17))
 
 
 DEFAULT_HEAD: Final = HeadShape(HEAD_ROWS, HEAD_COLUMNS, HEAD_PITCH_MM, HEAD_RADIUS_MM)

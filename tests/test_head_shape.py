@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_bayes.declarations import from_plain
+from tactile_bayes.declarations import as_dict, from_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.scene import Head
 from tactile_bayes.geometry import FloatArray
@@ -85,7 +85,7 @@ def test_shoulders_in_the_array_are_another_head() -> None:
 
 def test_a_head_survives_its_file_and_nonsense_does_not() -> None:
     shape = HeadShape(12, 12, 2.0, None, rim_mm=3.0)
-    assert from_plain(HeadShape, shape.as_dict()) == shape
+    assert from_plain(HeadShape, as_dict(shape)) == shape
     for name, value in (
         ("rows", 0),
         ("rows", 1.5),
@@ -95,6 +95,6 @@ def test_a_head_survives_its_file_and_nonsense_does_not() -> None:
         ("radius_mm", "x"),
     ):
         with pytest.raises(BadDataError, match=f"head.{name} is"):
-            from_plain(HeadShape, {**shape.as_dict(), name: value}, where="head")
+            from_plain(HeadShape, {**as_dict(shape), name: value}, where="head")
     with pytest.raises(BadDataError, match=r"head\.raduis is not known"):
-        from_plain(HeadShape, {**shape.as_dict(), "raduis": 3}, where="head")
+        from_plain(HeadShape, {**as_dict(shape), "raduis": 3}, where="head")

@@ -97,32 +97,6 @@ def prepare_figures(folder: Path, *, model: str, force: bool) -> list[Path]:
     return paths
 
 
-def draw_figures(
-    rows: list[paper.StudyRow],
-    settings: paper.StudySettings | SolidSettings,
-    paths: list[Path],
-    *,
-    seat: float,
-    phantom: tuple[float, float] | None,
-    frames: list[MeasuredFrame],
-    force: bool,
-) -> list[str]:
-    """Draw figures 5 to 8 of the paper; say where they are and what was found for them.
-
-    The seat is of the lumps that are drawn and not in the table; without a phantom and its frames figure 6 shows the
-    paper's.
-    """
-    folder = paths[0].parent
-    if isinstance(settings, SolidSettings):
-        solid_figures(rows, settings, paths, seat=seat, force=force)
-        return [f"figures 5 to 8 are in {folder}"]
-    d, h = phantom or PHANTOMS["phantom 12.5 mm"]
-    compared = compare_frames(frames, d_mm=d, depth_ratio=h, seat=seat, settings=settings) if frames else []
-    found = study_figures(rows, settings, paths, seat=seat, phantom=(d, h), measured=compared, force=force)
-    where = f"figures 5 to 8 and the frames of four lumps are in {folder}"
-    return [lookalikes_text(found), *frames_text(compared), where]
-
-
 _GRID_SCHEMA = "study_grid.table.json"
 RECIPE = ("normalise", "background", "fit_radius_mm", "noise", "flat_field")
 """Columns that say how the maps of a table were made and fitted; `calibrate size` refuses what contradicts them."""
@@ -158,10 +132,18 @@ def study_action(
         write_text(output, table_text(rows), force=force)
         unfinished(output).unlink(missing_ok=True)
     click.echo(study_text(rows), err=output is None)
-    if paths:
-        for line in draw_figures(rows, settings, paths, seat=chosen, phantom=phantom, frames=frames, force=force):
-            click.echo(line, err=output is None)
-    click.echo(RESEARCH_USE, err=output is None)
+    told = [RESEARCH_USE]
+    if paths and isinstance(settings, SolidSettings):
+        solid_figures(rows, settings, paths, seat=chosen, force=force)
+        told.insert(0, f"figures 5 to 8 are in {figures}")
+    elif paths and isinstance(settings, paper.StudySettings):
+        d, h = phantom or PHANTOMS["phantom 12.5 mm"]  # without a phantom and its frames figure 6 shows the paper's
+        compared = compare_frames(frames, d_mm=d, depth_ratio=h, seat=chosen, settings=settings) if frames else []
+        found = study_figures(rows, settings, paths, seat=chosen, phantom=(d, h), measured=compared, force=force)
+        where = f"figures 5 to 8 and the frames of four lumps are in {figures}"
+        told = [lookalikes_text(found), *frames_text(compared), where, *told]
+    for line in told:
+        click.echo(line, err=output is None)
 
 
 def study_settings(asked: StudyOptions, at: SectionOptions) -> paper.StudySettings | SolidSettings:
@@ -361,7 +343,14 @@ def sbc_action(
         click.echo(dump_json(document) if as_json else sbc_text(document), nl=False)
 
     try:
-        outcomes, made = _run_sbc(asked.maps, how, workers=workers, scheduler=scheduler, output=output)
+        with (
+            open_executor(workers=workers, cluster=scheduler) as executor,
+            open_unfinished(output, sbc.MapRanks, settings=sbc.settings(size=DEFAULT, **how)) as store,
+            progress_bar("maps") as progress,
+        ):
+            made = max(asked.maps - (0 if store is None else len(store.values)), 0)  # by this run
+            work = partial(ranks_of_map, **how)
+            outcomes = run_batch(work, range(asked.maps), key=str, executor=executor, store=store, progress=progress)
     except BatchInterrupted as stop:
         if output is None:  # else the next run goes on
             report([one.value for one in stop.outcomes if one.value is not None], None)
@@ -382,22 +371,6 @@ def sbc_action(
         report(found, speed)
     if failed:
         raise TactileBayesError(f"{len(failed)} of {len(outcomes)} maps are missing from this report")
-
-
-def _run_sbc(
-    maps: int, how: Mapping[str, Any], *, workers: int, scheduler: str | None, output: Path | None
-) -> tuple[list[Outcome[sbc.MapRanks]], int]:
-    """Outcomes of all maps, and the number that this run made."""
-    with (
-        open_executor(workers=workers, cluster=scheduler) as executor,
-        open_unfinished(output, sbc.MapRanks, settings=sbc.settings(size=DEFAULT, **how)) as store,
-        progress_bar("maps") as progress,
-    ):
-        had = 0 if store is None else len(store.values)
-        outcomes = run_batch(
-            partial(ranks_of_map, **how), range(maps), key=str, executor=executor, store=store, progress=progress
-        )
-    return outcomes, max(maps - had, 0)
 
 
 def ranks_of_map(index: int, *, method: Method, seed: int, cosines: FieldCosines) -> sbc.MapRanks:

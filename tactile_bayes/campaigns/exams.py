@@ -439,16 +439,20 @@ def unnamed(masses: Sequence[Sequence[MassPlace]]) -> list[Finding]:
 Visits = dict[str, list[Exam]]  #: Exams of one mass by the code of the visit, in order of time.
 
 
-def grown_masses(exams: Sequence[Exam]) -> dict[str, Visits]:
-    """Masses with exams at several visits, by their names; `read_manifest` refuses visits whose order is not known."""
+def visits_of(exams: Sequence[Exam]) -> dict[str, Visits]:
+    """Visits of each mass, by its name; `read_manifest` refuses visits whose order is not known."""
     found: dict[str, Visits] = defaultdict(lambda: defaultdict(list))
     for exam in exams:
         found[exam.of_visits][exam.visit].append(exam)
-    several = {name: visits for name, visits in found.items() if len(visits) > 1}
     return {
         name: {visit: visits[visit] for visit in in_order(visit_dates(visits)) or visits}
-        for name, visits in several.items()
+        for name, visits in found.items()
     }
+
+
+def grown_masses(exams: Sequence[Exam]) -> dict[str, Visits]:
+    """Masses with exams at several visits, by their names."""
+    return {name: visits for name, visits in visits_of(exams).items() if len(visits) > 1}
 
 
 def visit_dates(visits: Mapping[str, Sequence[Exam]]) -> dict[str, date | None]:

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from tactile_bayes import __version__
 from tactile_bayes.api.trials import analyse, load_trial, read_excision
-from tactile_bayes.campaigns.exams import MassPlace, grown_masses, unnamed, visit_dates
+from tactile_bayes.campaigns.exams import MassPlace, grown_masses, unnamed, visit_dates, visits_of
 from tactile_bayes.campaigns.run import Campaign
 from tactile_bayes.campaigns.steps import CampaignSettings
 from tactile_bayes.declarations import Record, replace
@@ -29,7 +29,7 @@ from tactile_bayes.options import TrialSettings
 from tactile_bayes.report.campaign_page import ExamEntry, MassRow, VisitEntry, campaign_html, worst
 from tactile_bayes.report.compare import CompareReport, Growth, growth_line, growths
 from tactile_bayes.report.exam_words import reason_on_paper
-from tactile_bayes.trial.readings import at_excision, in_order
+from tactile_bayes.trial.readings import at_excision
 
 # --- Tables: exams done, failures, and the trial table that `validate` takes.
 
@@ -451,18 +451,14 @@ def _page(
 ) -> str:
     """The index: a row for each mass, in the order of the table."""
     changes = {(one.patient, one.mass): one for one in growth}  # the last one of each mass: to its last visit
-    of_mass: dict[str, dict[str, list[Row]]] = defaultdict(lambda: defaultdict(list))
-    for row in rows:
-        of_mass[row.exam.of_visits][row.exam.visit].append(row)
-    masses = []
-    for visits in of_mass.values():
-        dates = visit_dates({code: [row.exam for row in some] for code, some in visits.items()})
-        ordered = in_order(dates) or list(visits)
-        first = visits[ordered[0]][0].exam
-        entries = []
-        for code in ordered:
-            exams = tuple(_exam(campaign, row, inline=len(rows) <= _MOST_INLINE) for row in visits[code])
-            entries.append(_visit(dates[code], visits[code], exams, pooled.get(visits[code][0].exam.of_mass)))
+    row_of, masses = {row.exam.name: row for row in rows}, []
+    for visits in visits_of(campaign.exams).values():
+        dates, entries = visit_dates(visits), []
+        for code, of_visit in visits.items():
+            some = [row_of[exam.name] for exam in of_visit]
+            exams = tuple(_exam(campaign, row, inline=len(rows) <= _MOST_INLINE) for row in some)
+            entries.append(_visit(dates[code], some, exams, pooled.get(of_visit[0].of_mass)))
+        first = next(iter(visits.values()))[0]
         change = changes.get((first.patient, first.mass))
         masses.append(MassRow(first.patient, first.mass, tuple(entries), first.side or "", change))
     shown = worst(masses, _MOST_ROWS)

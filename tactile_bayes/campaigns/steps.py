@@ -97,25 +97,6 @@ _DIGITS: Final = 16
 Writes = dict[str, Callable[[Path], object]]
 
 
-def write_staged(folder: Path, writes: Writes, *, step: str, digest: str, names: Collection[str]) -> dict[str, Any]:
-    """Write a step's files beside their place; returns their digests and where they are.
-
-    `digest` is of all that the step's files depend on: equal files have equal folders. `names` are of all files that
-    the step may write; those of earlier runs are removed when the others are put in place.
-    """
-    staged = folder / f"{_PREFIX}{step}-{digest[:_DIGITS]}"
-    try:
-        if writes:
-            staged.mkdir(mode=0o700, parents=True, exist_ok=True)
-        for name, write in writes.items():
-            write(staged / name)
-        files = {name: sha256(staged / name) for name in writes}
-    except BaseException:
-        shutil.rmtree(staged, ignore_errors=True)
-        raise
-    return {"files": files, STAGED: {"folder": str(staged), "without": [name for name in names if name not in writes]}}
-
-
 def put_in_place(result: Mapping[str, Any]) -> dict[str, Any]:
     """Move the files of a result to their place, and remove those of earlier runs; returns it with their stamps."""
     if STAGED not in result:
@@ -180,6 +161,25 @@ class Task(Record):
         return f"{self.step} {self.name} {self.digest}"
 
 
+def _write_staged(task: Task, writes: Writes) -> Result:
+    """Write a step's files beside their place; returns their digests and where they are.
+
+    Equal files have equal folders. Those of earlier runs are removed when the others are put in place.
+    """
+    staged = task.folder / f"{_PREFIX}{task.step}-{task.digest[:_DIGITS]}"
+    try:
+        if writes:
+            staged.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for name, write in writes.items():
+            write(staged / name)
+        files = {name: sha256(staged / name) for name in writes}
+    except BaseException:
+        shutil.rmtree(staged, ignore_errors=True)
+        raise
+    without = [name for name in FILES[task.step] if name not in writes]
+    return {"files": files, STAGED: {"folder": str(staged), "without": without}}
+
+
 def run_step(task: Task) -> Result:
     """Run a step; returns digests of its files by name, where they wait, the seconds it took and what else it found.
 
@@ -195,7 +195,7 @@ def run_step(task: Task) -> Result:
     if UNWRITTEN in found:
         return found
     try:
-        made = write_staged(task.folder, writes, step=task.step, digest=task.digest, names=FILES[task.step])
+        made = _write_staged(task, writes)
     except (UsageError, OSError) as error:
         return {UNWRITTEN: str(error)}
     spent = {"seconds": time.perf_counter() - begun, "cpu_seconds": time.thread_time() - begun_cpu}
@@ -472,8 +472,7 @@ def _resized(report: EstimateReport, size: SizePosterior, settings: Settings) ->
     if not diagnostics["convergence"]:
         del diagnostics["convergence"]
     provenance = dict(report.provenance)
-    if settings.repeatability is not None:
-        provenance["settings"] = {**provenance["settings"], "repeatability": settings.repeatability.as_dict()}
+    provenance["settings"] = {**provenance["settings"], "repeatability": found.as_dict()}
     provenance["inputs"] = [*provenance["inputs"], {"role": "repeatability", "sha256": found.sha256}]
     return replace(
         report,

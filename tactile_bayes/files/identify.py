@@ -86,7 +86,7 @@ def _map(path: Path) -> dict[str, Any]:
         **({} if tactile_map.nipple_mm is None else {"nipple_mm": tactile_map.nipple_mm.tolist()}),
         "findings": finding_lines(tactile_map.findings),
         "recipe": as_dict(tactile_map.recipe),
-        **({} if tactile_map.head is None else {"head": tactile_map.head.as_dict()}),
+        **({} if tactile_map.head is None else {"head": as_dict(tactile_map.head)}),
         "quality": dict(tactile_map.quality),
         "masked_taxels": list(tactile_map.masked_taxels),
         "provenance": header.provenance,
