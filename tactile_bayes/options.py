@@ -38,7 +38,6 @@ class BumpPrior(Options):
 
 PRIORS: Final = BumpPrior.__struct_fields__
 
-
 MOST_PATIENTS: Final = 10_000  #: Of a plan.
 MOST_ITEMS: Final = 1_000_000  #: Of a batch: memory holds a name and an outcome for each.
 IN_FILE: Final = {"file": True}  #: Of a setting that stands in the file of `--settings`, not on the command line.
@@ -77,8 +76,7 @@ class FitSettings(BumpPrior, kw_only=True):
         ),
     ] = None
     fit_radius_mm: Annotated[
-        Above0 | None,
-        says("Radius of the fitted window. Default: the calibration's, else 20", extra=IN_FILE),
+        Above0 | None, says("Radius of the fitted window. Default: the calibration's, else 20", extra=IN_FILE)
     ] = None
     rotation: Annotated[
         Rotation,
@@ -144,8 +142,7 @@ class MapOptions(Options):
 
     cell_mm: Annotated[float, says("Side of the square cells, mm.", ge=0.01, le=50)] = presets.CELL_MM
     pressure_window_kpa: Annotated[
-        tuple[Least0, Least0],
-        named("LOW HIGH", "Leave out frames whose mean pressure lies outside."),
+        tuple[Least0, Least0], named("LOW HIGH", "Leave out frames whose mean pressure lies outside.")
     ] = presets.PRESSURE_WINDOW_KPA
     normalise: Annotated[
         Normalise,
@@ -419,8 +416,7 @@ class RecordOptions(Options, kw_only=True):
     ] = None
     live: Annotated[bool, says("Draw the map on the terminal while it grows.")] = False
     serve: Annotated[
-        str | None,
-        named("HOST:PORT", "Show the map in a browser on this computer, with a tone for the pressure."),
+        str | None, named("HOST:PORT", "Show the map in a browser on this computer, with a tone for the pressure.")
     ] = None
     size_calibration: Annotated[
         str,
@@ -460,11 +456,6 @@ class FaultOptions(Options):
     ] = 0.0
 
 
-SeatName = Annotated[
-    str, named("centred|resting|0..2", "How far the lump stands out of the gland, if a grid does not state it.")
-]
-
-
 class SectionOptions(Options, kw_only=True):
     """Cross-section of a simulated head."""
 
@@ -493,7 +484,9 @@ class StudyOptions(CaseOptions, kw_only=True):
         says("The paper's two-dimensional body, or balls under the whole head in three dimensions."),
     ] = "plane-strain"
     grid: Annotated[str, named("paper|FILE", "The paper's 150 cases, or a table of cases.")] = "paper"
-    seat: SeatName = "centred"
+    seat: Annotated[
+        str, named("centred|resting|0..2", "How far the lump stands out of the gland, if a grid does not state it.")
+    ] = "centred"
     head: Literal["shoulders-inside", "shoulders-outside"] | None = None
     background: Annotated[
         Background | None,

@@ -59,7 +59,6 @@ TrackerProtocol = Literal["open", "fastrak", "fastrak-ascii", "liberty", "libert
 Method = Literal["optimise", "laplace", "importance", "ensemble"]
 METHODS: Final[tuple[Method, ...]] = get_args(Method)
 Noise = Literal["independent", "field"]
-NOISE: Final[tuple[Noise, ...]] = get_args(Noise)
 Background = Literal["fixed", "free"]
 Rotation = Literal["auto", "off", "on"]
 SceneAsked = Literal["auto", "none", "round", "ellipse", "rotated", "second-lump", "rib"]
