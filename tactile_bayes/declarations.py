@@ -113,9 +113,13 @@ def _allowed(kind: Any, value: object) -> bool:
     return _finite(value)
 
 
-@cache
 def kinds(record: Any) -> Mapping[str, Any]:
     """What is declared for each field of a record."""
+    return _kinds(record)
+
+
+@cache
+def _kinds(record: Any) -> Mapping[str, Any]:
     return {part.name: part.type for part in msgspec.structs.fields(record)}
 
 
