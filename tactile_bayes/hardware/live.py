@@ -22,7 +22,7 @@ from tactile_bayes.hardware.ports import PIPE_BYTES
 from tactile_bayes.hardware.readings import CountArray, PoseReading
 from tactile_bayes.hardware.recorder import Report
 from tactile_bayes.mapping.accumulate import MapAccumulator
-from tactile_bayes.mapping.cells import FramePoses, HeadMoments, head_moments, poses_at
+from tactile_bayes.mapping.cells import FramePoses, HeadMoments, distinct_poses, head_moments, poses_at
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, TrackerPoses
@@ -302,7 +302,7 @@ class LiveMap:
             np.array([one.position_mm for one in self._poses]),
             np.array([one.quaternion_wxyz for one in self._poses]),
         )
-        found = poses_at(poses, np.array([one.device_ns / 1e9 for one in ready]))
+        found = poses_at(distinct_poses(poses), np.array([one.device_ns / 1e9 for one in ready]))
         if self._map is None:
             if not found.known.any():
                 return

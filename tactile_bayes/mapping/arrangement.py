@@ -21,7 +21,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.geometry import FloatArray, IndexArray, apply, inverse, principal_axes
-from tactile_bayes.mapping.cells import FramePoses, between
+from tactile_bayes.mapping.cells import FramePoses, poses_at
 from tactile_bayes.mapping.convention import (
     CONVENTIONS,
     CoarseFrames,
@@ -532,7 +532,7 @@ class _Overlap(Record, eq=False):
         if rotations not in self.paths:
             scan, first = corrected(self.scan, rotations), self.coarse[0].first
             time_s = scan.frames.time_s[self.frames]
-            poses = between(scan.poses, time_s, latency_ms=self.latency_ms, max_gap_ms=np.inf)
+            poses = poses_at(scan.poses, time_s, latency_ms=self.latency_ms, max_gap_ms=np.inf)
             means = block_means(poses.rotation.reshape(-1, 9), first).reshape(-1, 3, 3)
             known = np.logical_and.reduceat(poses.known, first)
             self.paths[rotations] = FramePoses(block_means(poses.position_mm, first), means, known)

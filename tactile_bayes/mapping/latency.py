@@ -10,7 +10,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, Plane
-from tactile_bayes.mapping.cells import FramePoses, Projector, between
+from tactile_bayes.mapping.cells import FramePoses, Projector, poses_at
 from tactile_bayes.mapping.convention import CoarseFrames, numbered_on, stroke_starts
 from tactile_bayes.mapping.map import smooth
 from tactile_bayes.mapping.profile import pose_noise_figures
@@ -274,7 +274,7 @@ class _Part(Record, eq=False):
 
 
 def _poses(selection: SelectedFrames, latency_ms: float, gap_ms: float) -> FramePoses:
-    return between(selection.fresh, selection.scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=gap_ms)
+    return poses_at(selection.fresh, selection.scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=gap_ms)
 
 
 def _solved(parts: Sequence[_Part]) -> tuple[float, ShiftFit]:

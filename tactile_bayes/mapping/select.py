@@ -418,7 +418,7 @@ def select_frames(
     faults = find_faults(scan)
     _refuse_dead(scan, faults)
     fresh = cells.distinct_poses(scan.poses)
-    poses = cells.between(fresh, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=max_pose_gap_ms)
+    poses = cells.poses_at(fresh, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=max_pose_gap_ms)
     readout = cells.Readout.of(scan.element_calibration, good_taxels(scan.head.shape, faults))
     level, share = np.full(len(scan.frames), np.nan), np.zeros(len(scan.frames))
     for part in chunks(len(scan.frames), cells.chunk_frames(readout.size)):

@@ -11,7 +11,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.geometry import rigid
 from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.cells import FramePoses, head_moments, poses_at
+from tactile_bayes.mapping.cells import FramePoses, distinct_poses, head_moments, poses_at
 from tactile_bayes.scans import ElementCalibration, Scan
 
 FRAMES = 90
@@ -44,7 +44,7 @@ SCANS = {"near": rough_scan(), "far": scans.moved(rough_scan(), FAR)}
 
 
 def poses_of(scan: Scan) -> FramePoses:
-    poses = poses_at(scan.poses, scan.frames.time_s)
+    poses = poses_at(distinct_poses(scan.poses), scan.frames.time_s)
     return FramePoses(poses.position_mm, poses.rotation, poses.known & (np.arange(FRAMES) % 11 != 3))
 
 
@@ -81,7 +81,7 @@ def test_frame_by_frame_gives_the_bits_of_build_map():
     scan = SCANS["far"]
     at_once = build_map(scan, normalise="mean")
     assert not at_once.masked_taxels
-    poses = poses_at(scan.poses, scan.frames.time_s)
+    poses = poses_at(distinct_poses(scan.poses), scan.frames.time_s)
     live = empty(scan, at_once.plane_from_base)
     for frame in range(FRAMES):
         live.add(scan.frames.counts[frame : frame + 1], poses.part(slice(frame, frame + 1)))

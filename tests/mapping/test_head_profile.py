@@ -19,7 +19,7 @@ from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.cells import poses_at
+from tactile_bayes.mapping.cells import distinct_poses, poses_at
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.profile import (
     LEAST_FRAMES,
@@ -147,7 +147,7 @@ def grown(scan: Scan, like: TactileMap, portions: Iterable[np.ndarray]) -> MapAc
     """A map that was given the frames in portions, a snapshot after each."""
     assert like.plane_from_base is not None
     found = MapAccumulator(scan.head, scan.element_calibration, plane_from_base=like.plane_from_base)
-    poses = poses_at(scan.poses, scan.frames.time_s)
+    poses = poses_at(distinct_poses(scan.poses), scan.frames.time_s)
     for portion in portions:
         found.add(scan.frames.counts[portion], poses.part(portion))
         found.snapshot()

@@ -22,7 +22,7 @@ def turning(n: int = 50, *, step_s: float = 0.008, degrees: float = 0.3) -> Trac
 
 def test_even_motion_is_interpolated_exactly():
     poses = turning()
-    found = poses_at(poses, poses.time_s[:-1] + 0.002)
+    found = poses_at(distinct_poses(poses), poses.time_s[:-1] + 0.002)
     assert found.known.all()
     assert found.position_mm[7] == pytest.approx([2 * 7.25, -7.25, 0])
     assert found.rotation[7] == pytest.approx(scans.rotation(0.3 * 7.25), abs=1e-9)
@@ -33,16 +33,18 @@ def test_signs_of_quaternions_do_not_matter(flips):
     poses = turning()
     flipped = TrackerPoses(poses.time_s, poses.position_mm, poses.quaternion_wxyz * np.where(flips, -1, 1)[:, None])
     time = poses.time_s[:-1] + 0.003
-    assert poses_at(flipped, time).rotation == pytest.approx(poses_at(poses, time).rotation, abs=1e-15)
+    assert poses_at(distinct_poses(flipped), time).rotation == pytest.approx(
+        poses_at(distinct_poses(poses), time).rotation, abs=1e-15
+    )
 
 
 def test_latency_moves_the_poses_back_in_time():
     poses = turning()
     late = TrackerPoses(poses.time_s + 0.013, poses.position_mm, poses.quaternion_wxyz)
     time = poses.time_s[5:-5] + 0.001
-    straight, corrected = poses_at(poses, time), poses_at(late, time, latency_ms=13.0)
+    straight, corrected = poses_at(distinct_poses(poses), time), poses_at(distinct_poses(late), time, latency_ms=13.0)
     assert corrected.position_mm == pytest.approx(straight.position_mm, abs=1e-9)
-    assert np.abs(poses_at(late, time).position_mm - straight.position_mm).max() > 1
+    assert np.abs(poses_at(distinct_poses(late), time).position_mm - straight.position_mm).max() > 1
 
 
 def test_repeated_samples_are_dropped_whatever_their_sign():
@@ -53,7 +55,9 @@ def test_repeated_samples_are_dropped_whatever_their_sign():
     fresh = distinct_poses(repeated)
     assert np.array_equal(fresh.time_s, 10 + 0.004 * np.arange(0, 100, 2))
     time = poses.time_s[:-1] + 0.003
-    assert poses_at(repeated, time).position_mm == pytest.approx(poses_at(poses, time).position_mm, abs=1e-9)
+    assert poses_at(distinct_poses(repeated), time).position_mm == pytest.approx(
+        poses_at(distinct_poses(poses), time).position_mm, abs=1e-9
+    )
 
 
 def test_frames_in_a_gap_or_outside_are_not_known():
@@ -61,8 +65,19 @@ def test_frames_in_a_gap_or_outside_are_not_known():
     keep = (np.arange(50) < 20) | (np.arange(50) >= 30)
     gap = TrackerPoses(poses.time_s[keep], poses.position_mm[keep], poses.quaternion_wxyz[keep])
     time = np.array([9.999, 10.0, 10.1, 10.152, 10.16, 10.2, 10.24, 10.241, 10.392, 10.393])
-    assert poses_at(gap, time).known.tolist() == [False, True, True, True, False, False, True, True, True, False]
-    assert poses_at(gap, time, max_gap_ms=100.0).known.tolist() == [False, *[True] * 8, False]
+    assert poses_at(distinct_poses(gap), time).known.tolist() == [
+        False,
+        True,
+        True,
+        True,
+        False,
+        False,
+        True,
+        True,
+        True,
+        False,
+    ]
+    assert poses_at(distinct_poses(gap), time, max_gap_ms=100.0).known.tolist() == [False, *[True] * 8, False]
 
 
 def test_a_frozen_tracker_is_a_gap():
@@ -70,7 +85,7 @@ def test_a_frozen_tracker_is_a_gap():
     position, quaternion = poses.position_mm.copy(), poses.quaternion_wxyz.copy()
     position[20:30], quaternion[20:30] = position[20], quaternion[20]
     frozen = TrackerPoses(poses.time_s, position, quaternion)
-    known = poses_at(frozen, poses.time_s + 0.001).known
+    known = poses_at(distinct_poses(frozen), poses.time_s + 0.001).known
     assert not known[21:29].any()
     assert known[:20].all()
 
@@ -94,22 +109,22 @@ STILL = slice(100, 150)
 @pytest.mark.parametrize("part", ["place", "rotation"])
 def test_a_place_or_a_rotation_that_stands_still_alone_is_a_gap(part: str) -> None:
     poses = strokes(**{part: STILL})
-    known = poses_at(poses, poses.time_s).known
+    known = poses_at(distinct_poses(poses), poses.time_s).known
     assert known.tolist() == [not 100 < n < 150 for n in range(300)]
-    assert poses_at(strokes(), poses.time_s).known.all()
+    assert poses_at(distinct_poses(strokes()), poses.time_s).known.all()
 
 
 def test_a_place_that_stands_still_for_some_poses_is_bridged() -> None:
     """Control of what a repeat costs: interpolated, the head is where it was."""
     right = strokes()
-    held = poses_at(strokes(place=slice(100, 104)), right.time_s)
+    held = poses_at(distinct_poses(strokes(place=slice(100, 104))), right.time_s)
     assert held.known.all()
     assert held.position_mm == pytest.approx(right.position_mm, abs=0.1)
 
 
 def test_a_place_that_stands_still_to_the_end_is_none() -> None:
     poses = strokes(place=slice(200, 300))
-    assert poses_at(poses, poses.time_s).known.tolist() == [n <= 200 for n in range(300)]
+    assert poses_at(distinct_poses(poses), poses.time_s).known.tolist() == [n <= 200 for n in range(300)]
 
 
 def test_a_head_that_rests_or_does_not_turn_is_no_frozen_tracker() -> None:
@@ -129,13 +144,13 @@ def test_a_head_that_rests_or_does_not_turn_is_no_frozen_tracker() -> None:
 
 def test_no_pose_knows_no_frame():
     nothing = TrackerPoses(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4)))
-    found = poses_at(nothing, np.arange(3.0))
+    found = poses_at(distinct_poses(nothing), np.arange(3.0))
     assert not found.known.any()
     assert np.isfinite(found.rotation).all()
 
 
 def test_one_pose_knows_the_frame_at_its_time_only():
     one = TrackerPoses(np.array([1.0]), np.array([[1.0, 2.0, 3.0]]), np.array([[1.0, 0, 0, 0]]))
-    found = poses_at(one, np.array([0.5, 1.0, 1.5]))
+    found = poses_at(distinct_poses(one), np.array([0.5, 1.0, 1.5]))
     assert found.known.tolist() == [False, True, False]
     assert found.position_mm[1].tolist() == [1.0, 2.0, 3.0]

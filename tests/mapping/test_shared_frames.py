@@ -11,7 +11,7 @@ import pytest
 from tactile_bayes.declarations import replace
 from tactile_bayes.mapping.accumulate import LEAST_SHARE, MapAccumulator
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.cells import poses_at
+from tactile_bayes.mapping.cells import distinct_poses, poses_at
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.report.map import map_text
 from tactile_bayes.scans import Scan
@@ -136,7 +136,7 @@ def test_where_it_cannot_be_known_it_is_absent_and_the_text_says_so(make):
 
 def test_an_accumulator_does_not_know_it():
     scan = noisy_scan(share=0.5)
-    poses = poses_at(scan.poses, scan.frames.time_s)
+    poses = poses_at(distinct_poses(scan.poses), scan.frames.time_s)
     grown = MapAccumulator(scan.head, scan.element_calibration, plane_from_base=np.eye(4))
     grown.add(scan.frames.counts, poses)
     assert not NAMES & set(grown.snapshot().quality)
