@@ -211,7 +211,9 @@ def _built(
     if how.flat_field:
         selections = _selected(_flattened(selections, figures), how, late_ms, gap_ms)
     if how.latency_ms == "auto":
-        late_ms = _latency(selections, how.cell_mm, gap_ms, figures)
+        found = estimate_latency(selections, plane=_plane(selections), cell_mm=how.cell_mm, max_pose_gap_ms=gap_ms)
+        figures |= {"latency_sd_ms": found.sd_ms, "latency_bound_ms": found.bound_ms}
+        late_ms, figures["latency_frames"] = found.latency_ms, float(found.frames)
         selections = _selected([part.scan for part in selections], how, late_ms, gap_ms)
     figures |= check_convention(selections)
     plane = _plane(selections)
@@ -274,13 +276,6 @@ def _flattened(selections: list[SelectedFrames], figures: dict[str, float]) -> l
     figures["flat_field_frames"] = float(sum(flat.frames for flat in flats))
     figures["flat_field_sd"] = float(np.mean([flat.response.std() for flat in flats]))
     return [flat.applied(part.scan) for flat, part in zip(flats, used, strict=True)]
-
-
-def _latency(selections: list[SelectedFrames], cell_mm: float, gap_ms: float, figures: dict[str, float]) -> float:
-    found = estimate_latency(selections, plane=_plane(selections), cell_mm=cell_mm, max_pose_gap_ms=gap_ms)
-    figures["latency_sd_ms"], figures["latency_bound_ms"] = found.sd_ms, found.bound_ms
-    figures["latency_frames"] = float(found.frames)
-    return found.latency_ms
 
 
 def _plane(selections: list[SelectedFrames]) -> Plane:

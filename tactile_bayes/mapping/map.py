@@ -195,15 +195,11 @@ MOST_YAW_DEG = 15.0
 _ERRORS = 2.5  #: Standard errors by which a figure must exceed 0, besides its limit.
 
 
-def broken_assumptions(quality: Mapping[str, float]) -> tuple[Finding, ...]:
+def broken_assumptions(quality: Mapping[str, float]) -> Iterator[Finding]:
     """Findings from a map's `quality` figures (of evenness and stroke lag) against the assumptions of a size.
 
     Missing figures say nothing.
     """
-    return tuple(_broken(quality))
-
-
-def _broken(quality: Mapping[str, float]) -> Iterator[Finding]:
     if lag := _beyond(quality, "stroke_lag_mm", "stroke_lag_sd_mm", MOST_LAG_MM):
         cause = "each dragged it along" if lag > 0 else "the tracker's positions came late"
         text = (
@@ -317,8 +313,11 @@ def advise_cell(tactile_map: TactileMap) -> CellAdvice | None:
     Gaussian bump the fit, which integrates its model over the cells, is exact to 0.1 % at 0.75 sigma; but lumps are not
     quite Gaussian, and errors of the map change with the cell as well.
     """
-    mean = _smoothed(tactile_map)
-    known = np.isfinite(mean)
+    # the map smoothed with its counts as weights, where readings are not few
+    held = np.where(tactile_map.covered, tactile_map.count, 0).astype(np.float64)
+    weight, total = smooth(held), smooth(np.where(tactile_map.covered, tactile_map.mean, 0.0) * held)
+    known = tactile_map.covered & ~tactile_map.few & (weight > 0)
+    mean = np.divide(total, weight, out=np.full(weight.shape, np.nan), where=known)
     if np.count_nonzero(known) < 25:
         return None
     low, level, high = np.quantile(mean[known], [0.25, 0.5, 0.75])
@@ -334,15 +333,6 @@ def advise_cell(tactile_map: TactileMap) -> CellAdvice | None:
     sigma = float(np.sqrt(max(min(variances), (cell / 2) ** 2)))
     count = tactile_map.count[tactile_map.covered]
     return CellAdvice(sigma, _CELL_PER_SIGMA * sigma, cell, float(np.median(count)))
-
-
-def _smoothed(tactile_map: TactileMap) -> FloatArray:
-    """The map, smoothed with its counts as weights; NaN where readings are few."""
-    count = np.where(tactile_map.covered, tactile_map.count, 0).astype(np.float64)
-    weight = smooth(count)
-    total = smooth(np.where(tactile_map.covered, tactile_map.mean, 0.0) * count)
-    enough = tactile_map.covered & ~tactile_map.few
-    return np.asarray(np.divide(total, weight, out=np.full(weight.shape, np.nan), where=enough & (weight > 0)))
 
 
 def _extent(excess: FloatArray, at: int) -> float:

@@ -19,7 +19,7 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, principal_axes
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
 from tactile_bayes.mapping.select import SelectedFrames, frame_figures, refuse_without_frames, timing_figures
-from tactile_bayes.scans import HeadShape, Landmarks, Scan
+from tactile_bayes.scans import HeadShape, Landmarks
 
 RATE_HZ: Final = (5.0, 2000.0)
 """Of frames."""
@@ -83,13 +83,7 @@ def exam_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
         if readings:
             figures["plateau_count"] = float(count)
         figures["wrapped_readings"] += _wrapped(part)
-        for name, value in (
-            *_stillness(part, still),
-            *_flicker(part),
-            *_motion(part),
-            *_geometry(part),
-            *_resolution(part),
-        ):
+        for name, value in (*_stillness(part, still), *_flicker(part), *_geometry(part)):
             figures[name] = max(value, figures.get(name, 0.0))
     return figures
 
@@ -173,46 +167,32 @@ def _flicker(part: SelectedFrames) -> Iterator[tuple[str, float]]:
         return
     level = part.level_kpa[numbers]
     first = np.unique(np.linspace(0, len(numbers) - 2, _SAMPLE_FRAMES).astype(int))
-    one, following = (_pattern_kpa(part.scan, numbers[at]) for at in (first, first + 1))
+    frames = np.stack([numbers[first], numbers[first + 1]])
+    pressure = part.scan.element_calibration.linear_kpa(part.scan.frames.counts[frames])
+    one, following = pressure - pressure.mean(axis=(-2, -1), keepdims=True)
     if level.std() and one.any():
         pattern = np.mean((following - one) ** 2) / np.mean(one**2)
         yield "frame_flicker", float(min(np.mean(np.diff(level) ** 2) / np.var(level), pattern)) / 2
 
 
-def _pattern_kpa(scan: Scan, frames: IndexArray) -> FloatArray:
-    """(n, rows, columns) readings of frames, less their means."""
-    pressure = scan.element_calibration.linear_kpa(scan.frames.counts[frames])
-    return np.asarray(pressure - pressure.mean(axis=(1, 2), keepdims=True))
-
-
-def _motion(part: SelectedFrames) -> Iterator[tuple[str, float]]:
-    """How far poses zigzag."""
-    poses = part.fresh
-    if len(poses) < 3:
-        return
-    middle = (poses.position_mm[2:] + poses.position_mm[:-2]) / 2
-    yield "pose_zigzag_mm", float(np.median(np.linalg.norm(poses.position_mm[1:-1] - middle, axis=1)))
-
-
 def _geometry(part: SelectedFrames) -> Iterator[tuple[str, float]]:
-    """Length of the array over that by its pitch; distance of the landmarks, and of the head from the xiphoid."""
-    head = part.scan.head
+    """How far poses zigzag; length of the array over that by its pitch; distance of the landmarks, and of the head from
+    the xiphoid; a step of the counts over the mean pressure.
+    """
+    head, level, path_mm = part.scan.head, part.level_kpa[part.used], part.fresh.position_mm
+    if len(path_mm) >= 3:
+        off_mm = path_mm[1:-1] - (path_mm[2:] + path_mm[:-2]) / 2
+        yield "pose_zigzag_mm", float(np.median(np.linalg.norm(off_mm, axis=1)))
     if head.shape[1] > 1:
         length = float(np.linalg.norm(np.diff(head.surface_mm, axis=1), axis=2).sum(axis=1).mean())
         yield "surface_over_pitch", length / (head.pitch_mm * (head.shape[1] - 1))
-    marks: Landmarks | None = part.scan.landmarks
-    if marks is None or not part.used.any():
-        return
-    yield "landmark_distance_mm", float(np.linalg.norm(marks.sternal_notch_mm - marks.xiphoid_mm))
-    places = part.poses.position_mm[part.used]
-    yield "landmark_reach_mm", float(np.linalg.norm(places - marks.xiphoid_mm, axis=1).min())
-
-
-def _resolution(part: SelectedFrames) -> Iterator[tuple[str, float]]:
-    """A step of the counts over the mean pressure."""
-    level = part.level_kpa[part.used]
     if not len(level):
         return
+    marks: Landmarks | None = part.scan.landmarks
+    if marks is not None:
+        yield "landmark_distance_mm", float(np.linalg.norm(marks.sternal_notch_mm - marks.xiphoid_mm))
+        places = part.poses.position_mm[part.used]
+        yield "landmark_reach_mm", float(np.linalg.norm(places - marks.xiphoid_mm, axis=1).min())
     present = np.unique(part.scan.frames.counts[np.flatnonzero(part.used)[:: max(1, len(level) // 50)]])
     step = int(np.gcd.reduce(np.diff(present.astype(np.int64)))) if len(present) > 1 else 0
     gain = float(np.median(part.scan.element_calibration.gain_kpa_per_count[part.good_taxels]))
@@ -226,19 +206,14 @@ def scan_doubts(selection: SelectedFrames, *, pressure_window_kpa: tuple[float, 
     """
     refuse_without_frames([selection], pressure_window_kpa=pressure_window_kpa)
     figures = frame_figures([selection]) | timing_figures([selection.scan]) | exam_figures([selection])
-    given = selection.scan.head
+    given, places = selection.scan.head, selection.poses.position_mm[selection.used]
     head = HeadShape.of(given.surface_mm, given.pitch_mm)
-    at_rest = _at_rest(_felt_mm2(selection, head), head, "the frames cover")
+    # the largest area that an array can have passed over that went so far along and across its way
+    (side, other), (_, *reach_mm) = head.sides_mm, np.ptp(places @ principal_axes(places), axis=0)
+    felt_mm2 = float(max((side + a) * (other + b) for a, b in (reach_mm, reach_mm[::-1])))
+    at_rest = _at_rest(felt_mm2, head, "the frames cover")
     still = [_finding("unlike_an_exam", *told) for told in at_rest if figures["frames_used"] >= LEAST_FRAMES]
     return (*still, *exam_findings(figures, head))
-
-
-def _felt_mm2(selection: SelectedFrames, head: HeadShape) -> float:
-    """Largest area that an array can have passed over that went so far along and across its way."""
-    places = selection.poses.position_mm[selection.used]
-    _, *reach_mm = np.ptp(places @ principal_axes(places), axis=0)
-    side, other = head.sides_mm
-    return float(max((side + a) * (other + b) for a, b in (reach_mm, reach_mm[::-1])))
 
 
 # --- Findings.
@@ -429,19 +404,13 @@ def _of_values(values: FloatArray) -> Iterator[tuple[str, str]]:
             f"{rest[-1]:.4g}): dead lines, or values that stand for none"
         )
         yield text, "mark them as missing"
-    at_top, near = _top(ordered)
+    levels: NDArray[np.int64] = np.unique(ordered, return_counts=True)[1]
+    at_top, near = int(levels[-1]), int(levels[-4:-1].sum())  # at the highest, and at the three distinct ones below it
     if PLATEAU <= at_top < len(ordered) / 2 and at_top > near > 0:
         text = (
             f"{at_top} cells stand at the highest value, {ordered[-1]:.4g}, and few just below it: it was clipped there"
         )
         yield text, "take it again without clipping"
-
-
-def _top(ordered: FloatArray) -> tuple[int, int]:
-    """Number of values at the highest, and at the three distinct ones below it."""
-    levels: NDArray[np.int64]
-    _, levels = np.unique(ordered, return_counts=True)
-    return int(levels[-1]), int(levels[-4:-1].sum())
 
 
 BLOCKING: Final = frozenset({"unlike_an_exam", "frames_contradict", "poses_jump"})

@@ -38,22 +38,19 @@ class StrokeShift(Record):
     known: bool = False  #: True where the stroke crossed a lump or an edge that fixes a shift; else the shift is 0.
 
 
-def find_strokes(source: Source, number: int) -> list[StrokeShift]:
-    """Find runs of a scan's used frames in one direction along x; a turn belongs to the run before it."""
-    return [StrokeShift(start, stop, number, way) for start, stop, way in convention.strokes_along(_x_mm(source))]
-
-
-def _x_mm(source: Source) -> FloatArray:
-    """(n,) places of the head along x at a scan's used frames."""
-    return source.projection.shift[:, 0] * source.projection.cell_mm
+def find_strokes(sources: Sequence[Source]) -> list[StrokeShift]:
+    """Find runs of the scans' used frames in one direction along x; a turn belongs to the run before it."""
+    return [
+        StrokeShift(start, stop, number, way)
+        for number, source in enumerate(sources)
+        for start, stop, way in convention.strokes_along(source.projection.shift[:, 0] * source.projection.cell_mm)
+    ]
 
 
 def stroke_count(sources: Sequence[Source]) -> int:
     """How many strokes the head made along x; runs less than half as long as the longest are turns or corrections."""
     reach = [
-        float(np.ptp(source.projection.shift[stroke.start : stroke.stop, 0]))
-        for number, source in enumerate(sources)
-        for stroke in find_strokes(source, number)
+        float(np.ptp(sources[one.scan].projection.shift[one.start : one.stop, 0])) for one in find_strokes(sources)
     ]
     longest = max(reach, default=0.0)
     return sum(one >= longest / 2 for one in reach)
@@ -70,13 +67,14 @@ def register_strokes(sources: Sequence[Source]) -> tuple[list[Source], list[Stro
     like a shift of half a millimetre (record 0097). Standard errors are those of the regression, widened for errors
     shared by neighbouring frames and for the part of the slopes that is noise; their floor is 0.06 mm.
     """
-    strokes = [stroke for number, source in enumerate(sources) for stroke in find_strokes(source, number)]
+    strokes = find_strokes(sources)
     if len(strokes) < 2:
         raise BadDataError(
             f"the scan has {len(strokes)} stroke over {convention.LEAST_REACH_MM:g} mm", way_out="scan back and forth"
         )
-    parts = [_Part.of(source, number, strokes) for number, source in enumerate(sources)]
-    shifts = np.zeros(len(strokes))
+    numbers = [len(one.frames) * 5e-3 / convention.POOL_S * one.selection.readout.size / 4 for one in sources]
+    every = [max(1, int(np.ceil(len(strokes) * readings / _MOST_NUMBERS))) for readings in numbers]
+    parts, shifts = _parts(sources, strokes, every), np.zeros(len(strokes))
     for _ in range(_ROUNDS):
         round_ = _Round.of(parts, shifts)
         shifts = np.clip(shifts + round_.step(shifts), -2 * EXPECTED_MM, 2 * EXPECTED_MM)
@@ -124,35 +122,36 @@ def mobility(strokes: Sequence[StrokeShift]) -> tuple[float, float]:
 class _Part(Record, eq=False):
     """One scan's averaged frames."""
 
-    coarse: convention.CoarseFrames  #: Thinned out where there are many strokes.
+    coarse: convention.CoarseFrames  #: Of every so many-th stretch of the used frames.
     places_mm: FloatArray  #: (m, k, 2) array.
     stroke: IndexArray
     block: IndexArray
     """`stroke`, `block` (m,) int arrays: Among the strokes of all scans, and which frames share errors."""
 
-    @classmethod
-    def of(cls, source: Source, number: int, strokes: Sequence[StrokeShift]) -> _Part:
-        readings = len(source.frames) * 5e-3 / convention.POOL_S * source.selection.readout.size / 4
-        every = int(np.ceil(len(strokes) * readings / _MOST_NUMBERS))
-        kept, coarse, places_mm, block = _averaged(source, max(every, 1))
-        first = next(n for n, one in enumerate(strokes) if one.scan == number)
-        starts = [one.start for one in strokes if one.scan == number]
-        stroke = np.searchsorted(starts, kept[coarse.first], side="right") - 1 + first
-        return cls(coarse, places_mm, stroke, block)
+    def along_x(self, values: FloatArray) -> FloatArray:
+        """(m, k, 2) moves along x, of each stroke by its value, one for each of all strokes."""
+        moves = np.zeros_like(self.places_mm)
+        moves[:, :, 0] = values[self.stroke, None]
+        return moves
 
     def shifted_mm(self, shifts_mm: FloatArray) -> FloatArray:
-        """(m, k, 2) places with each stroke moved back along x by its shift, one for each of all strokes."""
-        moved = self.places_mm.copy()
-        moved[:, :, 0] -= shifts_mm[self.stroke, None]
-        return moved
+        """(m, k, 2) places with each stroke moved back by its shift."""
+        return np.asarray(self.places_mm - self.along_x(shifts_mm))
 
 
-def _averaged(source: Source, every: int) -> tuple[IndexArray, convention.CoarseFrames, FloatArray, IndexArray]:
-    """Every so many-th stretch of a scan's used frames: which these are, their averages, places, and shared blocks."""
-    time_s = source.selection.scan.frames.time_s
-    kept = convention.every_stretch(time_s[source.frames], every)
-    coarse = convention.CoarseFrames.of(source.selection, source.frames[kept])
-    return kept, coarse, coarse.places_mm(source.projection.part(kept)), coarse.blocks(time_s)
+def _parts(sources: Sequence[Source], strokes: Sequence[StrokeShift], every: Sequence[int]) -> list[_Part]:
+    """The scans with a used frame, averaged over every so many-th stretch."""
+    parts = []
+    for number, source in enumerate(sources):
+        if not len(source.frames):
+            continue
+        time_s = source.selection.scan.frames.time_s
+        kept = convention.every_stretch(time_s[source.frames], every[number])
+        coarse = convention.CoarseFrames.of(source.selection, source.frames[kept])
+        mine = [n for n, one in enumerate(strokes) if one.scan == number]
+        stroke = np.searchsorted([strokes[n].start for n in mine], kept[coarse.first], side="right") - 1 + mine[0]
+        parts.append(_Part(coarse, coarse.places_mm(source.projection.part(kept)), stroke, coarse.blocks(time_s)))
+    return parts
 
 
 class _Round(Record, eq=False):
@@ -244,25 +243,17 @@ def stroke_lag_figures(sources: Sequence[Source]) -> dict[str, float]:
     every = convention.thinning(
         (source.selection.scan.frames.time_s[source.frames] for source in sources), most=MOST_FRAMES
     )
-    averaged = [(source, *_averaged(source, every)) for source in sources if len(source.frames)]
-    moves = []
-    for source, kept, coarse, place_mm, _ in averaged:
-        moves.append(np.zeros_like(place_mm))
-        moves[-1][:, :, 0] = convention.ways_along(_x_mm(source))[kept[coarse.first], None]
-    ways = np.concatenate([np.zeros(0), *(move[:, 0, 0] for move in moves)])
-    if not (np.any(ways > 0) and np.any(ways < 0)):
+    strokes = find_strokes(sources)
+    parts, ways = _parts(sources, strokes, [every] * len(sources)), np.array([one.direction for one in strokes])
+    if len({way for part in parts for way in ways[part.stroke].tolist()}) < 2:
         return {}
-    fit = ShiftFit.of([coarse for _, _, coarse, _, _ in averaged], [place_mm for *_, place_mm, _ in averaged])
-    return _step(fit, moves, [block for *_, block in averaged])
-
-
-def _step(fit: ShiftFit, moves: Sequence[FloatArray], blocks: Sequence[IndexArray]) -> dict[str, float]:
-    design = fit.design(moves)
+    fit = ShiftFit.of([part.coarse for part in parts], [part.places_mm for part in parts])
+    design = fit.design([part.along_x(ways) for part in parts])
     whole = float(design @ design)
     if not whole > 0:
         return {}
     # a lump that is ahead of its place is seen at places that are behind theirs
     lag = -float(design @ fit.data) / whole
-    block = convention.numbered_on(blocks)[fit.frame_numbers()]
+    block = convention.numbered_on([part.block for part in parts])[fit.frame_numbers()]
     scores = np.bincount(block, design * (fit.data + lag * design))
     return {"stroke_lag_mm": lag, "stroke_lag_sd_mm": float(np.sqrt(np.sum(scores**2))) / whole}
