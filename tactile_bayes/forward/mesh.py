@@ -12,7 +12,7 @@ from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import splu
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.errors import BadDataError, require
+from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.tissue import Body
 from tactile_bayes.geometry import FloatArray
 
@@ -115,7 +115,8 @@ class _Box(Record, eq=False):
         return cls(
             body,
             _BOX * d,
-            _rows_above(top, d, fineness),
+            # rows between the skin and the box; the skin alone where the box reaches it
+            np.linspace(0.0, top, 2 * fineness * int(np.ceil(min(2 * top / d, 6.0))) + 1),
             side_up,
             np.linspace(middle, bottom, 2 * down * fineness + 1),
             _graded(bottom, layers.thickness_mm, 2 * float(side_up[1] - side_up[0]), fineness),
@@ -151,13 +152,6 @@ class _Box(Record, eq=False):
             np.linspace(boundary, np.pi, n_down),
         ]
         return np.concatenate(parts)
-
-
-def _rows_above(top_mm: float, d_mm: float, fineness: int) -> FloatArray:
-    """Rows between the skin and the box; the skin alone where the box reaches it."""
-    if top_mm <= 0:
-        return np.zeros(1)
-    return np.linspace(0.0, top_mm, 2 * fineness * int(np.ceil(min(2 * top_mm / d_mm, 6.0))) + 1)
 
 
 def _projected(half_width_mm: float, distance_mm: float, count: int) -> FloatArray:
@@ -245,23 +239,13 @@ class LumpGeometry(Record):
     thickness_mm: float  #: Depth of the rigid base.
 
     def __post_init__(self) -> None:
-        for name in ("radius_mm", "half_height_mm", "depth_mm", "fat_mm"):
-            if not getattr(self, name) > 0:
-                raise BadDataError(f"{name} is {getattr(self, name)}", way_out="it must be above 0")
-        top, bottom = self.depth_mm - self.half_height_mm, self.depth_mm + self.half_height_mm
-        room = 0.02 * self.half_height_mm
-        if top < room:
-            raise BadDataError(
-                f"the lump reaches {-top:.3g} mm above the skin (depth {self.depth_mm:g} mm)",
-                way_out=f"its centre must lie {self.half_height_mm + room:.4g} mm deep or deeper",
-            )
-        if bottom > self.thickness_mm - room:
+        """Refuse what the mesh cannot resolve; bodies and scenes have refused all else."""
+        bottom = self.depth_mm + self.half_height_mm
+        if bottom > self.thickness_mm - 0.02 * self.half_height_mm:
             raise BadDataError(
                 f"the lump reaches {bottom:.4g} mm deep, the base lies at {self.thickness_mm:g} mm",
                 way_out="give a thicker body or a shallower lump",
             )
-        rule = f"stay below thickness_mm, {self.thickness_mm:g} mm"
-        require(self.fat_mm < self.thickness_mm, "fat_mm", self.fat_mm, rule)
 
     def boundary_mm(self) -> float:
         """Depth of the layer boundary, moved by up to 4 % of the half height where it nearly touches the lump."""

@@ -381,17 +381,10 @@ def slide(
     return LineFrames(x_c, half.s_mm, np.concatenate([mirrored, half.pressure_kpa]))
 
 
-def build_line(frames: LineFrames, *, normalise: str = "mean") -> TactileLine:
-    """Average frames at equal steps in cells as wide as a step, with edges at multiples of it.
-
-    ``normalise="mean"`` divides each frame by its mean, ``"none"`` keeps kPa.
-    """
-    if normalise not in ("mean", "none"):
-        raise BadDataError(f"normalise is {normalise!r}", way_out="give mean or none")
+def build_line(frames: LineFrames) -> TactileLine:
+    """Average frames over their means, at equal steps, in cells as wide as a step, with edges at multiples of it."""
     step = float(frames.x_c_mm[1] - frames.x_c_mm[0])
-    values = frames.pressure_kpa
-    if normalise == "mean":
-        values = values / values.mean(axis=1, keepdims=True)
+    values = frames.pressure_kpa / frames.pressure_kpa.mean(axis=1, keepdims=True)
     place = (frames.x_c_mm[:, None] + frames.s_mm[None, :]) / step
     number = np.floor(place + 1e-9).astype(np.int64)
     low = int(number.min())
@@ -515,33 +508,21 @@ def fit_empirical(
     """
     if len(s_mm) < 4 or not (far_kpa > 0).any():
         raise BadDataError(f"a frame of {len(s_mm)} cells", way_out="give at least 4, some of them above 0 kPa")
-    peak, curvature = _fit_homogeneous(s_mm, far_kpa, half_width_mm)
-    fitted = homogeneous_pressure(s_mm, peak_kpa=peak, curvature_per_mm2=curvature, half_width_mm=half_width_mm)
-    height, width = _fit_lump(s_mm, centred_kpa - SHARE * fitted)
-    return EmpiricalModel(peak, curvature, height, width, d_mm, half_width_mm)
 
-
-def _fit_homogeneous(s_mm: FloatArray, pressure: FloatArray, half_width_mm: float) -> tuple[float, float]:
-    """Least squares of Eq 1."""
-
-    def shape(scaled: float) -> FloatArray:
+    def profile(scaled: float) -> FloatArray:
         curvature = scaled / half_width_mm**2
         return homogeneous_pressure(s_mm, peak_kpa=1.0, curvature_per_mm2=curvature, half_width_mm=half_width_mm)
 
-    # 1 is the profile that falls to 0 at the sides; far below -8 the middle would be a small part of the sides.
-    fit = fit_shape(shape, pressure, grid=np.linspace(-8.0, 1.0, 31))
-    return fit.height, fit.parameter / half_width_mm**2
+    def bump(log_width: float) -> FloatArray:
+        return lump_pressure(s_mm, height_kpa=1.0, width_mm=float(np.exp(log_width)))
 
-
-def _fit_lump(x_mm: FloatArray, pressure: FloatArray) -> tuple[float, float]:
-    """Least squares of Eq 2 over all widths that a frame can show."""
-
-    def shape(log_width: float) -> FloatArray:
-        return lump_pressure(x_mm, height_kpa=1.0, width_mm=float(np.exp(log_width)))
-
-    cell, reach = float(x_mm[1] - x_mm[0]), float(np.abs(x_mm).max())
-    fit = fit_shape(shape, pressure, grid=np.linspace(np.log(0.5 * cell), np.log(10.0 * reach), 60))
-    return fit.height, float(np.exp(fit.parameter))
+    # 1 is the profile that falls to 0 at the sides; far below -8 the middle would be a small part of the sides
+    far = fit_shape(profile, far_kpa, grid=np.linspace(-8.0, 1.0, 31))
+    # all widths that a frame can show
+    ends = np.log([0.5 * float(s_mm[1] - s_mm[0]), 10.0 * float(np.abs(s_mm).max())])
+    over = fit_shape(bump, centred_kpa - SHARE * (far.height * profile(far.parameter)), grid=np.linspace(*ends, 60))
+    curvature, width = far.parameter / half_width_mm**2, float(np.exp(over.parameter))
+    return EmpiricalModel(far.height, curvature, over.height, width, d_mm, half_width_mm)
 
 
 class ShapeFit(Record):

@@ -82,9 +82,8 @@ def simulate(
         pressure, depth = frames_at_poses(scene, *poses, mean_kpa=level, progress=progress)
     else:
         told = {"model": chosen, "shape": _SHAPE, "head": head or SHOULDERS_INSIDE}
-        section = plane_section(scene, chosen, shoulders=head or SHOULDERS_INSIDE)
-        sections = section.sections(chosen, reach_mm=_reach_of_strokes(scene, section))
-        pressure = plane_frames(scene, *poses, level, sections, lump_x_mm=section.x_mm, progress=progress)
+        section = PlaneSection.of(scene, chosen, shoulders=head or SHOULDERS_INSIDE)
+        pressure = section.frames(*poses, level, reach_mm=_reach_of_strokes(section), progress=progress)
     truth = told | tissue_truth(scene)
     sunk = (lambda at: np.interp(at, time, depth)) if chosen == "solid" else None
     return record(scene, felt=lambda at: pressure[np.searchsorted(time, at)], depth=sunk, truth=truth, rng=rng)
@@ -137,15 +136,14 @@ def felt_at_poses(
         return _gaussian_frames(scene, rotation, origin_mm, mean_kpa, share_load=True)
     if chosen == "solid":
         return frames_at_poses(scene, rotation, origin_mm, mean_kpa=mean_kpa, progress=progress)[0]
-    section = plane_section(scene, chosen, shoulders=head or SHOULDERS_INSIDE)
-    place = _column_places(scene, rotation, origin_mm) - section.x_mm
-    reach, most = float(np.abs(place).max()) + section.half_face_mm + 1.0, section.most_reach_mm
+    section = PlaneSection.of(scene, chosen, shoulders=head or SHOULDERS_INSIDE)
+    place, most = section.places_mm(rotation, origin_mm), section.most_reach_mm
+    reach = float(np.abs(place).max()) + section.half_face_mm + 1.0
     if reach > most:
         raise BadDataError(
             f"the head gets {reach:.4g} mm from the lump", way_out=f"the {chosen} model reaches {most:g} mm"
         )
-    sections = section.sections(chosen, reach_mm=reach)
-    return plane_frames(scene, rotation, origin_mm, mean_kpa, sections, lump_x_mm=section.x_mm, progress=progress)
+    return section.frames(rotation, origin_mm, mean_kpa, reach_mm=reach, progress=progress)
 
 
 def _gaussian_frames(
@@ -179,9 +177,9 @@ _FRAMES_AT_ONCE = 100
 _SHAPE = "a cylinder along y: each frame's profile across the head is repeated along it"
 
 
-def _reach_of_strokes(scene: Scene, section: PlaneSection) -> float:
+def _reach_of_strokes(section: PlaneSection) -> float:
     """How far the head's edges get from the lump's axis, mm."""
-    half_mm, most = section.half_face_mm, section.most_reach_mm
+    scene, half_mm, most = section.scene, section.half_face_mm, section.most_reach_mm
     stroke = scene.strokes.half_length_mm + scene.strokes.wander_mm + scene.head.columns * scene.head.pitch_mm / 2
     reach = stroke + abs(section.x_mm) + half_mm + 1.0
     if reach > most:
@@ -196,17 +194,41 @@ def _reach_of_strokes(scene: Scene, section: PlaneSection) -> float:
 class PlaneSection(Record, eq=False):
     """A scene's section across the lump."""
 
+    scene: Scene
+    fidelity: str  #: The contact problem (``"plane-strain"``) or Eqs 1 to 4.
     head: Section  #: Section of the head: shoulders of the scene's `shoulder_mm`, or its `rim_mm` where that is 0.
-    pitch_mm: float  #: Width of a taxel, of six of the contact's cells.
     layers: Layers  #: The body without the lump.
     lump: tuple[Body, float] | None  #: Below the skin, with its stiffness ratio; None for nothing.
-    x_mm: float  #: Place of the lump's axis.
-    mean_kpa: float  #: The nominal pressure.
+
+    @classmethod
+    def of(cls, scene: Scene, fidelity: str, *, shoulders: str = SHOULDERS_INSIDE) -> PlaneSection:
+        """Prepare the section of a scene; a key that two dimensions cannot follow is an error."""
+        many = "a rib" if scene.ribs else f"{len(scene.solid_lumps)} lumps" if len(scene.solid_lumps) > 1 else ""
+        if many:
+            raise BadDataError(
+                f"the scene has {many}", way_out=f"the {fidelity} model has one lump and no rib; use --fidelity solid"
+            )
+        body = scene.body or SceneBody()
+        fat = fat_thickness(body, scene.solid_lumps)
+        layers = Layers(fat, body.thickness_mm, body.fat_kpa, body.gland_ratio, body.nu)
+        lump = _cylinder(scene.solid_lumps[0], body, fat, fidelity) if scene.solid_lumps else None
+        width = scene.head.rows * scene.head.pitch_mm
+        if shoulders == SHOULDERS_INSIDE and scene.head.rim_mm > width / 2:
+            raise BadDataError(
+                f"head.rim_mm is {scene.head.rim_mm:g}",
+                way_out=f"in two dimensions the rim is cut into the array: give at most {width / 2:g} mm",
+            )
+        return cls(scene, fidelity, scene.head.section(shoulders), layers, lump)
+
+    @property
+    def x_mm(self) -> float:
+        """Place of the lump's axis."""
+        return self.scene.solid_lumps[0].x_mm if self.scene.solid_lumps else 0.0
 
     @property
     def cell_mm(self) -> float:
         """Width of the contact's cells."""
-        return self.pitch_mm / _CELLS_A_TAXEL
+        return self.scene.head.pitch_mm / _CELLS_A_TAXEL
 
     @property
     def half_face_mm(self) -> float:
@@ -218,21 +240,51 @@ class PlaneSection(Record, eq=False):
         """How far from the lump's axis the head's edges may get."""
         return mesh.REACH_MM + self.layers.thickness_mm
 
-    def sections(self, fidelity: str, *, reach_mm: float) -> Sections:
-        """Sections from the contact problem or Eqs 1 to 4, of a head whose edges get so far from the lump's axis.
+    def places_mm(self, rotation: FloatArray, origin_mm: FloatArray) -> FloatArray:
+        """(n, columns) place of each column of taxels at (n,) poses, from the lump's axis."""
+        head = self.scene.head
+        along = (np.arange(head.columns) - (head.columns - 1) / 2) * head.pitch_mm
+        return np.asarray(origin_mm[:, :1] + rotation[:, 0, 1, None] * along - self.x_mm)
 
-        Without a lump the section is the same at every place.
+    def frames(
+        self,
+        rotation: FloatArray,
+        origin_mm: FloatArray,
+        level_kpa: FloatArray,
+        *,
+        reach_mm: float,
+        progress: Progress = untold,
+    ) -> FloatArray:
+        """(n, rows, columns) kPa that the taxels feel at (n,) poses and mean pressures, before any noise.
+
+        A head turned about the normal has its columns at different places across the lump, up to `reach_mm` with its
+        edges. Sections are computed no more than 0.25 mm apart and interpolated between.
         """
+        sections, place = self._sections(reach_mm), self.places_mm(rotation, origin_mm)
+        pressure = np.zeros((len(level_kpa), self.scene.head.rows, self.scene.head.columns))
+        pressed = np.flatnonzero(level_kpa > 0)
+        for chunk in np.array_split(pressed, len(pressed) // _FRAMES_AT_ONCE or 1) if len(pressed) else ():
+            ends = [(float(place[i].min()), float(place[i].max())) for i in chunk]
+            across = [np.linspace(low, high, 1 + int(np.ceil((high - low) / _APART_MM - 1e-9))) for low, high in ends]
+            many = [len(x) for x in across]
+            profile = sections(np.concatenate(across), np.repeat(level_kpa[chunk], many))
+            for i, x, mine in zip(chunk, across, np.split(profile, np.cumsum(many)[:-1]), strict=True):
+                pressure[i] = [np.interp(place[i], x, taxel) for taxel in mine.T]
+            progress(int(chunk[-1]) + 1, len(level_kpa))
+        return pressure
+
+    def _sections(self, reach_mm: float) -> Sections:
+        """Sections at places whose edges get so far from the lump; without one the section is the same everywhere."""
         if self.lump is None:
             return lambda _, mean_kpa: self._far(mean_kpa).pressure_kpa
         body, ratio = self.lump
         surface = plane.condense(body, reach_mm=reach_mm, cell_mm=self.cell_mm)
-        if fidelity == "plane-strain":
+        if self.fidelity == "plane-strain":
             return lambda x_mm, mean_kpa: self._over(surface, ratio, x_mm, mean_kpa).pressure_kpa
         model, s = self.empirical_model(surface)
 
         def empirical(x_mm: FloatArray, mean_kpa: FloatArray) -> FloatArray:
-            share = mean_kpa / self.mean_kpa
+            share = mean_kpa / self.scene.background.mean_kpa
             return np.asarray(share[:, None] * model.surface_pressure(s[None, :], x_mm[:, None]))
 
         return empirical
@@ -240,40 +292,20 @@ class PlaneSection(Record, eq=False):
     def empirical_model(self, surface: plane.SurfaceCompliance) -> tuple[plane.EmpiricalModel, FloatArray]:
         """Eqs 1 to 4 fitted to what taxels see far from and over the lump, and the taxels' places across the head."""
         assert self.lump is not None
-        far, over = self._far(self.mean_kpa), self._over(surface, self.lump[1], np.zeros(1), self.mean_kpa)
-        s, d, half = over.s_mm, surface.body.d_mm, self.head.half_width_mm
-        return plane.fit_empirical(s, far.at(0.0), over.at(0.0), d_mm=d, half_width_mm=half), s
+        nominal = self.scene.background.mean_kpa
+        far, over = self._far(nominal), self._over(surface, self.lump[1], np.zeros(1), nominal)
+        d, half = surface.body.d_mm, self.head.half_width_mm
+        return plane.fit_empirical(over.s_mm, far.at(0.0), over.at(0.0), d_mm=d, half_width_mm=half), over.s_mm
 
     def _far(self, mean_kpa: float | FloatArray) -> plane.LineFrames:
         far = plane.press_layers(self.layers, head=self.head, mean_kpa=mean_kpa, cell_mm=self.cell_mm)
-        return far.as_taxels(self.pitch_mm)
+        return far.as_taxels(self.scene.head.pitch_mm)
 
     def _over(
         self, surface: plane.SurfaceCompliance, ratio: float, x_mm: FloatArray, mean_kpa: float | FloatArray
     ) -> plane.LineFrames:
-        return plane.press(surface, ratio, x_mm, head=self.head, mean_kpa=mean_kpa).as_taxels(self.pitch_mm)
-
-
-def plane_section(scene: Scene, fidelity: str, *, shoulders: str = SHOULDERS_INSIDE) -> PlaneSection:
-    """Prepare the section of a scene; a key that two dimensions cannot follow is an error."""
-    many = "a rib" if scene.ribs else f"{len(scene.solid_lumps)} lumps" if len(scene.solid_lumps) > 1 else ""
-    if many:
-        raise BadDataError(
-            f"the scene has {many}", way_out=f"the {fidelity} model has one lump and no rib; use --fidelity solid"
-        )
-    body = scene.body or SceneBody()
-    fat = fat_thickness(body, scene.solid_lumps)
-    layers = Layers(fat, body.thickness_mm, body.fat_kpa, body.gland_ratio, body.nu)
-    lump = _cylinder(scene.solid_lumps[0], body, fat, fidelity) if scene.solid_lumps else None
-    x_mm = scene.solid_lumps[0].x_mm if scene.solid_lumps else 0.0
-    width = scene.head.rows * scene.head.pitch_mm
-    if shoulders == SHOULDERS_INSIDE and scene.head.rim_mm > width / 2:
-        raise BadDataError(
-            f"head.rim_mm is {scene.head.rim_mm:g}",
-            way_out=f"in two dimensions the rim is cut into the array: give at most {width / 2:g} mm",
-        )
-    head, level = scene.head.section(shoulders), scene.background.mean_kpa
-    return PlaneSection(head, scene.head.pitch_mm, layers, lump, x_mm, level)
+        over = plane.press(surface, ratio, x_mm, head=self.head, mean_kpa=mean_kpa)
+        return over.as_taxels(self.scene.head.pitch_mm)
 
 
 def _cylinder(lump: SolidLump, body: SceneBody, fat_mm: float, fidelity: str) -> tuple[Body, float]:
@@ -295,41 +327,6 @@ def _cylinder(lump: SolidLump, body: SceneBody, fat_mm: float, fidelity: str) ->
     except BadDataError as error:
         raise BadDataError(f"lump[0]: {error.what}", way_out=error.way_out) from None
     return section, lump.stiffness_ratio
-
-
-def _column_places(scene: Scene, rotation: FloatArray, origin_mm: FloatArray) -> FloatArray:
-    """(n, columns) place of each column of taxels across the scene's `plane`."""
-    along = (np.arange(scene.head.columns) - (scene.head.columns - 1) / 2) * scene.head.pitch_mm
-    return np.asarray(origin_mm[:, :1] + rotation[:, 0, 1, None] * along)
-
-
-def plane_frames(
-    scene: Scene,
-    rotation: FloatArray,
-    origin_mm: FloatArray,
-    level_kpa: FloatArray,
-    sections: Sections,
-    *,
-    lump_x_mm: float,
-    progress: Progress = untold,
-) -> FloatArray:
-    """(n, rows, columns) kPa that the taxels feel at (n,) poses and mean pressures, before any noise.
-
-    A head turned about the normal has its columns at different places across the lump. Sections are computed no more
-    than 0.25 mm apart and interpolated between.
-    """
-    place = _column_places(scene, rotation, origin_mm) - lump_x_mm
-    pressure = np.zeros((len(level_kpa), scene.head.rows, scene.head.columns))
-    pressed = np.flatnonzero(level_kpa > 0)
-    for chunk in np.array_split(pressed, len(pressed) // _FRAMES_AT_ONCE or 1) if len(pressed) else ():
-        ends = [(float(place[i].min()), float(place[i].max())) for i in chunk]
-        across = [np.linspace(low, high, 1 + int(np.ceil((high - low) / _APART_MM - 1e-9))) for low, high in ends]
-        many = [len(x) for x in across]
-        profile = sections(np.concatenate(across), np.repeat(level_kpa[chunk], many))
-        for i, x, mine in zip(chunk, across, np.split(profile, np.cumsum(many)[:-1]), strict=True):
-            pressure[i] = [np.interp(place[i], x, taxel) for taxel in mine.T]
-        progress(int(chunk[-1]) + 1, len(level_kpa))
-    return pressure
 
 
 # --- Frames of the head on a layered body with lumps, in three dimensions.

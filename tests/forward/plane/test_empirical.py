@@ -87,11 +87,11 @@ def test_the_fit_finds_what_it_was_made_of(peak: float, curvature: float, height
 def test_the_map_is_the_average_of_the_curves() -> None:
     x_c = head_positions((-40.0, 40.0, 0.5))
     frames = MODEL.frames(x_c, S)
-    line = build_line(frames, normalise="none")
+    line = build_line(frames)
     k = int(np.argmin(np.abs(line.x_mm - 2.25)))
     readings = [
-        MODEL.surface_pressure(s, x)
-        for x in x_c
+        MODEL.surface_pressure(s, x) / mean
+        for x, mean in zip(x_c, frames.pressure_kpa.mean(axis=1), strict=True)
         for s in S
         if line.x_mm[k] - 0.25 <= x + s + 1e-9 < line.x_mm[k] + 0.25 + 1e-9
     ]

@@ -17,7 +17,7 @@ from tactile_bayes.forward import scene as scene_types
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.plane import condense, kappa, press, press_layers
 from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, Strokes, frame_times, head_positions, level_kpa
-from tactile_bayes.forward.simulate import plane_frames, plane_section, simulate
+from tactile_bayes.forward.simulate import PlaneSection, simulate
 from tactile_bayes.forward.tissue import Body, Layers, Rib, SceneBody, SolidLump
 
 Run = Callable[..., "CompletedProcess[str]"]
@@ -32,9 +32,8 @@ SCENE = Scene(
 
 
 def frames_of(scene: Scene, time_s: np.ndarray, fidelity: str = "plane-strain") -> np.ndarray:
-    section = plane_section(scene, fidelity)
-    sections, level = section.sections(fidelity, reach_mm=60.0), level_kpa(scene.background, time_s)
-    return plane_frames(scene, *head_positions(scene, time_s), level, sections, lump_x_mm=section.x_mm)
+    level = level_kpa(scene.background, time_s)
+    return PlaneSection.of(scene, fidelity).frames(*head_positions(scene, time_s), level, reach_mm=60.0)
 
 
 @cache
@@ -57,7 +56,7 @@ def test_the_empirical_frames_are_eqs_1_to_4() -> None:
     """Their parts by the printed formulas, from the fitted numbers; scaled with the level."""
     time = frame_times(SCENE)
     place, level = head_positions(SCENE, time)[1][:, 0] - 3.0, level_kpa(SCENE.background, time)
-    model, s = plane_section(SCENE, "empirical").empirical_model(condense(Body(15.0, 1.0, 0.0)))
+    model, s = PlaneSection.of(SCENE, "empirical").empirical_model(condense(Body(15.0, 1.0, 0.0)))
     p1 = model.peak_kpa * np.sqrt(1 - model.curvature_per_mm2 * s**2)
     largest = max(model.peak_kpa, model.peak_kpa * np.sqrt(1 - model.curvature_per_mm2 * 12.0**2))
     for i in (12, 20, 33):
