@@ -90,7 +90,7 @@ class Frames:
             counts.reshape(frames, -1),
             self.calibration.gain_kpa_per_count.ravel(),
             self.calibration.offset_kpa.ravel(),
-            np.ascontiguousarray(projection.turn),
+            np.ascontiguousarray(projection.matrix[:, :, :3]),
             projection.shift - np.array([first[1], first[0]]),
             projection.taxels[:3],
             shape,

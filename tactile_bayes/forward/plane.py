@@ -520,7 +520,9 @@ def fit_empirical(
     far = fit_shape(profile, far_kpa, grid=np.linspace(-8.0, 1.0, 31))
     # all widths that a frame can show
     ends = np.log([0.5 * float(s_mm[1] - s_mm[0]), 10.0 * float(np.abs(s_mm).max())])
-    over = fit_shape(bump, centred_kpa - SHARE * (far.height * profile(far.parameter)), grid=np.linspace(*ends, 60))
+    over = fit_shape(
+        bump, centred_kpa - SHARE * (far.height * profile(far.parameter)), grid=np.linspace(ends[0], ends[1], 60)
+    )
     curvature, width = far.parameter / half_width_mm**2, float(np.exp(over.parameter))
     return EmpiricalModel(far.height, curvature, over.height, width, d_mm, half_width_mm)
 

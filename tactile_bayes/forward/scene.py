@@ -470,10 +470,16 @@ def _whole_truth(scene: Scene, model: Mapping[str, Any]) -> dict[str, Any]:
         normal = base_from_plane[:3, 2]
         patient = patient_from_base(landmarks.sternal_notch_mm, landmarks.xiphoid_mm, normal=normal)
         patient_from_plane = patient @ base_from_plane
+
+    def placed(given: Mapping[str, Any]) -> dict[str, Any]:
+        point = np.array([given["x_mm"], given["y_mm"], 0.0])
+        patient = None if patient_from_plane is None else apply(patient_from_plane, point).tolist()
+        return {**given, "base_mm": apply(base_from_plane, point).tolist(), "patient_mm": patient}
+
     return {
         "schema": TRUTH_SCHEMA,
         **model,
-        "lumps": [_placed_truth(lump, base_from_plane, patient_from_plane) for lump in model["lumps"]],
+        "lumps": [placed(lump) for lump in model["lumps"]],
         "background": as_dict(scene.background),
         "noise": as_dict(scene.noise),
         "latency_ms": scene.tracker.latency_ms,
@@ -482,11 +488,3 @@ def _whole_truth(scene: Scene, model: Mapping[str, Any]) -> dict[str, Any]:
         "dead": [list(taxel) for taxel in scene.taxels.dead],
         "saturated": [list(taxel) for taxel in scene.taxels.saturated],
     }
-
-
-def _placed_truth(
-    given: Mapping[str, Any], base_from_plane: FloatArray, patient_from_plane: FloatArray | None
-) -> dict[str, Any]:
-    point = np.array([given["x_mm"], given["y_mm"], 0.0])
-    patient = None if patient_from_plane is None else apply(patient_from_plane, point).tolist()
-    return {**given, "base_mm": apply(base_from_plane, point).tolist(), "patient_mm": patient}

@@ -51,17 +51,15 @@ class PtyLink:
 
     def read(self) -> bytes:
         """Read bytes from the host; empty when none have come."""
-        try:
+        with contextlib.suppress(BlockingIOError):
             return os.read(self._near, _READ)
-        except BlockingIOError:
-            return b""
+        return b""
 
     def write(self, data: bytes) -> int:
         """Send as much as fits; return the number of bytes."""
-        try:
+        with contextlib.suppress(BlockingIOError):
             return os.write(self._near, data)
-        except BlockingIOError:
-            return 0
+        return 0
 
     def finish(self, patience_s: float) -> None:
         """Wait until the terminal's buffers are empty, because they are lost when it closes.

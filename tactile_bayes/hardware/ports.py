@@ -115,7 +115,9 @@ class Port:
         A port without one (rfc2217, loop) is read by a thread here that passes its bytes on; under load a thread is
         less sure to be in time than a process.
         """
-        number = _descriptor_of(self._serial)
+        number = None
+        with contextlib.suppress(AttributeError, OSError, TypeError):
+            number = int(self._serial.fileno())
         if number is not None:
             yield number
             return
@@ -151,13 +153,6 @@ def _open(url: str, baud: int, role: str) -> Any:
             f"{role} {url}: cannot be opened ({_reason(error)}); `tactile-bayes devices` lists what is there"
         ) from None
     return port
-
-
-def _descriptor_of(port: Any) -> int | None:
-    try:
-        return int(port.fileno())
-    except (AttributeError, OSError, TypeError):
-        return None
 
 
 def _relay(port: Any, sink: socket.socket) -> None:

@@ -79,7 +79,10 @@ class _Door(socket.socket):
             self._wait()
             self._open = [one for one in self._open if one.fileno() >= 0]
             if len(self._open) >= MOST_OPEN:
-                self._shed()
+                pages = self._pages()
+                for one in [one for one in self._open if one not in pages][:1]:
+                    with contextlib.suppress(OSError):
+                        one.shutdown(socket.SHUT_RDWR)  # its thread closes it
                 time.sleep(SHED_S)
                 continue
             with contextlib.suppress(OSError):  # its other end has gone, or the system has nothing left
@@ -95,12 +98,6 @@ class _Door(socket.socket):
                 if select.select([self], [], [], WAIT_S)[0]:
                     return
         raise OSError("closed")
-
-    def _shed(self) -> None:
-        pages = self._pages()
-        for one in [one for one in self._open if one not in pages][:1]:
-            with contextlib.suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)  # its thread closes it
 
 
 class LiveServer:

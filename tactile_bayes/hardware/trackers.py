@@ -533,20 +533,15 @@ class _SocketLine:
         self._line.close()
 
 
-def _say(words: str) -> None:
-    """Print one line to the parent process."""
-    os.write(sys.stdout.fileno(), f"{words}\n".encode())
-
-
 def main(words: list[str]) -> int:
     """Run ``python -m tactile_bayes.hardware.trackers FD URL [ROM...]``: prints ``ready``, or what is wrong."""
     line = socket.socket(fileno=int(words[0]))
     try:
         tracker = NdiTracker(importlib.import_module(MODULE), words[1], roms=[*map(Path, words[2:])])
     except DeviceError as error:
-        _say(str(error))
+        print(error, flush=True)
         return error.exit_code
-    _say("ready")
+    print("ready", flush=True)
     os.close(sys.stdout.fileno())
     try:
         serve(tracker, line)

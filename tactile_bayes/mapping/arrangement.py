@@ -315,7 +315,10 @@ def check_arrangement(selection: SelectedFrames, *, latency_ms: float = 0.0, tho
     overlap = _Overlap.of(selection, latency_ms)
     if overlap is None:
         return _TOO_SHORT
-    first, *others = _arrangements(selection.scan)
+    # all corrections, the fewest first; of a lever arm that is none, none of the lever arm
+    lever = _LEVER[:1] if np.allclose(selection.scan.head.scanhead_from_tracker, np.eye(4)) else _LEVER
+    every: list[Corrections] = [sum(parts, ()) for parts in product(_ARRAY, _FRAMES, lever, _ROTATIONS)]
+    first, *others = sorted((one for one in every if len(one) <= MOST_CHANGES), key=len)
     single = [one for one in others if len(one) == 1]
     stated = overlap.judged(first)
     if _lasting(overlap.varying[0]) < LEAST_LASTING:
@@ -375,13 +378,6 @@ def check_scan(
     selection = select_frames(scan, pressure_window_kpa=pressure_window_kpa)
     doubts = (*scan_findings(scan), *scan_doubts(selection, pressure_window_kpa=pressure_window_kpa))
     return replace(check_arrangement(selection, thorough=thorough), doubts=doubts)
-
-
-def _arrangements(scan: Scan) -> list[Corrections]:
-    """All corrections to try, the fewest first; of a lever arm that is none, none of the lever arm."""
-    lever = _LEVER[:1] if np.allclose(scan.head.scanhead_from_tracker, np.eye(4)) else _LEVER
-    every = [sum(parts, ()) for parts in product(_ARRAY, _FRAMES, lever, _ROTATIONS)]
-    return sorted((one for one in every if len(one) <= MOST_CHANGES), key=len)
 
 
 _NOT_JUDGED: Final = Arrangement((), spread=0.0, explained=0.0, lasting=0.0, agreement=0.0)

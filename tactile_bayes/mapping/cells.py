@@ -252,8 +252,11 @@ class CellSums:
         counted, unless `bounded` says that all lie in 0 to `LIMIT_STEPS`.
         """
         self._make_room(first, shape)
-        if not bounded:
-            self._count_and_clip(steps)
+        if not bounded and (lowest := float(steps.min())) < 0:
+            self.negative += int((steps < 0).sum())
+        if not bounded and max(float(steps.max()), -lowest) > LIMIT_STEPS:
+            self.clipped += int((np.abs(steps) > LIMIT_STEPS).sum())
+            np.clip(steps, -LIMIT_STEPS, LIMIT_STEPS, out=steps)
         cells, weights, index = shape[0] * shape[1], steps.ravel(), flat.ravel()
         square = np.bincount(index, weights * weights, cells).astype(np.int64)
         weights += 2.0**_PACK_BITS
@@ -262,14 +265,6 @@ class CellSums:
         window = self.window(first, shape)
         for sums, block in ((self.count, count), (self.total, packed - (count << _PACK_BITS)), (self.square, square)):
             sums[window] += block.reshape(shape)
-
-    def _count_and_clip(self, steps: FloatArray) -> None:
-        lowest = float(steps.min())
-        if lowest < 0:
-            self.negative += int((steps < 0).sum())
-        if max(float(steps.max()), -lowest) > LIMIT_STEPS:
-            self.clipped += int((np.abs(steps) > LIMIT_STEPS).sum())
-            np.clip(steps, -LIMIT_STEPS, LIMIT_STEPS, out=steps)
 
     def trimmed(self) -> CellSums:
         """A copy without the empty rows and columns around the data."""
@@ -370,11 +365,6 @@ class Projection(Record, eq=False):
 
     def __len__(self) -> int:
         return len(self.matrix)
-
-    @property
-    def turn(self) -> FloatArray:
-        """(n, 2, 3) rotations, in cells per mm."""
-        return self.matrix[:, :, :3]
 
     @property
     def shift(self) -> FloatArray:

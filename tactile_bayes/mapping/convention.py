@@ -294,7 +294,9 @@ def _agreement(parts: Sequence[tuple[SelectedFrames, TrackerPoses]], corrections
         lever = inverse(part.scan.head.scanhead_from_tracker)
         normals.append(rotation @ lever[:3, 2])
         places.append(poses.position_mm + rotation @ lever[:3, 3])
-        levels.append(_level_at(part, poses))
+        known = np.isfinite(part.level_kpa)  # the mean pressure when the poses were taken
+        at_frames = part.scan.frames.time_s[known], part.level_kpa[known]
+        levels.append(np.interp(poses.time_s, *at_frames) if known.any() else np.zeros(len(poses)))
     normal: FloatArray = np.concatenate(normals).mean(axis=0)
     raw = np.concatenate(places)
     agreements = [_along(normal, one) for one in (raw, _without_sinking(raw, np.concatenate(levels)))]
@@ -307,14 +309,6 @@ def _along(normal: FloatArray, places_mm: FloatArray) -> float:
     if not variances[1] > LEAST_SPREAD_MM**2:
         return float("nan")
     return float(abs(normal @ axes[:, 0]))
-
-
-def _level_at(part: SelectedFrames, poses: TrackerPoses) -> FloatArray:
-    """(n,) mean pressure when the poses were taken, kPa."""
-    known = np.isfinite(part.level_kpa)
-    if not len(poses) or not known.any():
-        return np.zeros(len(poses))
-    return np.asarray(np.interp(poses.time_s, part.scan.frames.time_s[known], part.level_kpa[known]))
 
 
 def _without_sinking(places_mm: FloatArray, level_kpa: FloatArray) -> FloatArray:

@@ -93,24 +93,20 @@ def orientation_of(tactile_map: TactileMap) -> Orientation:
     viewer's right. Without landmarks y, along the scan head, is up, and x runs to the left. A grid that was imported
     has no outside and is shown as its file reads: first row on top, first column on the left.
     """
-    if tactile_map.patient_from_plane is not None:
-        return _towards(tactile_map.patient_from_plane[1, :2])
-    if tactile_map.plane_from_base is not None:
+    if tactile_map.patient_from_plane is None and tactile_map.plane_from_base is None:
+        return Orientation("+x", "-y", GRID_WORDS)
+    if tactile_map.patient_from_plane is None:
         return Orientation("-x", "+y", PLANE_WORDS)
-    return Orientation("+x", "-y", GRID_WORDS)
-
-
-# What runs to the right when an axis is up and z points away from the viewer.
-_RIGHT_OF_UP: Final = {"+y": "-x", "-y": "+x", "+x": "+y", "-x": "-y"}
-
-
-def _towards(notch: FloatArray) -> Orientation:
-    """Quarter turn that brings a direction of the plane nearest to straight up; y up where it has none."""
+    notch = tactile_map.patient_from_plane[1, :2]
     length = float(np.hypot(*notch))
     x, y = (float(value) / length for value in notch) if length > 0 else (0.0, 1.0)
     along = {"+y": y, "-y": -y, "+x": x, "-x": -x}
     up = max(along, key=lambda axis: along[axis])
     return Orientation(_RIGHT_OF_UP[up], up, PATIENT_WORDS, (along[_RIGHT_OF_UP[up]], along[up]))
+
+
+# What runs to the right when an axis is up and z points away from the viewer.
+_RIGHT_OF_UP: Final = {"+y": "-x", "-y": "+x", "+x": "+y", "-x": "-y"}
 
 
 def _opposite(axis: str) -> str:

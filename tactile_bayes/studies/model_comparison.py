@@ -22,7 +22,7 @@ from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import BumpFit, fit_bump, fitted_candidates
 from tactile_bayes.progress import Progress, untold
 from tactile_bayes.scans import ElementCalibration, PressureFrames, Scan
-from tactile_bayes.studies.paper import HARD_RATIO, LineFit, StudySettings, fit_line
+from tactile_bayes.studies.paper import HARD_RATIO, PAPER_DIAMETERS_MM, LineFit, StudySettings, fit_line
 
 # --- Tables 1 and 2 of the paper and the phantoms of its section 2.3: the empirical model against the elastic one.
 #
@@ -33,7 +33,7 @@ from tactile_bayes.studies.paper import HARD_RATIO, LineFit, StudySettings, fit_
 # with v the elastic model, and beside it the same relative to what the lump adds, :math:`\sum_i (v_i - 1)^2`, for
 # maps. The first hides a bump under the background of 1 (decision record 0007); the second does not.
 
-TABLE_DIAMETERS_MM = (5.0, 10.0, 15.0, 20.0, 25.0)
+TABLE_DIAMETERS_MM = PAPER_DIAMETERS_MM
 TABLE_DEPTH_RATIOS = (0.6, 1.8)
 PRINTED_FRAMES = {0.6: (4.1, 4.3, 4.1, 4.1, 4.2), 1.8: (4.1, 4.2, 4.2, 4.0, 4.1)}
 """Table 1 in percent, by h/d, over the diameters."""

@@ -285,7 +285,6 @@ def learn_as_printed(rows: Sequence[StudyRow], *, axis: str = "x") -> PrintedEq6
 # How alike two frames are is measured against what the lump itself adds: frames of two faint lumps are alike
 # because both are those of no lump.
 
-DIAMETERS_MM = (5.0, 10.0, 15.0, 20.0, 25.0)
 DEPTH_RATIOS = (0.6, 0.7, 0.8, 0.9, 1.0, 1.2, 1.5)
 LEAST_RISE = 0.1
 """A lump takes part when it raises the middle of the head by this share of the frame's mean: five times the noise."""
@@ -334,7 +333,7 @@ def find_lookalikes(
     settings: StudySettings,
     *,
     seat: float,
-    diameters_mm: Sequence[float] = DIAMETERS_MM,
+    diameters_mm: Sequence[float] = PAPER_DIAMETERS_MM,
     depth_ratios: Sequence[float] = DEPTH_RATIOS,
 ) -> Lookalikes | None:
     """The pair of visible hard lumps whose frames are most alike though one's diameter is `LEAST_SIZE_RATIO` times the

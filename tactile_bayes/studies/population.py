@@ -80,30 +80,21 @@ class ExamPrior(_Ranges):
     """Ranges of an examiner's technique and of the instrument's errors, drawn anew for each scan."""
 
     mean_kpa: tuple[Pressure, Pressure] = (7.0, 12.0)  #: Mean pressure of a scan, kPa.
-    drift_kpa: tuple[To10, To10] = (
-        0.2,
-        1.5,
-    )
+    drift_kpa: tuple[To10, To10] = (0.2, 1.5)
     """Amplitude of its drift, kPa; below the lowest mean_kpa."""
     yaw_deg: tuple[Yaw, Yaw] = (-30.0, 30.0)  #: Turn of the head about the normal, degrees.
     tilt_deg: tuple[Tilt, Tilt] = (0.5, 4.0)  #: Amplitude of its rocking, degrees.
     wander_mm: tuple[To10, To10] = (0.2, 1.5)  #: Departure from the line, mm.
     lines: tuple[Lines, Lines] = (4, 7)  #: Parallel lines.
     spacing_mm: tuple[Length, Length] = (4.0, 7.0)  #: Distance between them, mm.
-    half_length_mm: tuple[Length, Length] = (
-        28.0,
-        38.0,
-    )
+    half_length_mm: tuple[Length, Length] = (28.0, 38.0)
     """Reach of a line either side of the middle, mm."""
     off_centre_mm: tuple[Shift, Shift] = (-6.0, 6.0)  #: Distance of the strokes' middle from the lump, each way, mm.
     line_s: tuple[Seconds, Seconds] = (1.0, 1.8)  #: Time for a line, s.
     element_kpa: tuple[To10, To10] = (0.02, 0.3)  #: SD of a reading, kPa.
     tracker_mm: tuple[To10, To10] = (0.05, 0.6)  #: SD of the tracker's position, mm.
     tracker_deg: tuple[To10, To10] = (0.02, 0.3)  #: SD of its attitude, degrees.
-    gain_share: tuple[Share, Share] = (
-        0.002,
-        0.02,
-    )
+    gain_share: tuple[Share, Share] = (0.002, 0.02)
     """Error of the array's calibration, as a share of the gain."""
     latency_ms: tuple[Latency, Latency] = (0.0, 12.0)  #: By how much the stamp of a pose is late, ms.
 
@@ -245,16 +236,13 @@ class Population(Record):
 
     def rows(self, index: int, scan: Callable[[Scene], Scan] | None = None) -> list[MassRow]:
         """Scan each exam of a mass, by default with the scene's seed, map and fit it; a row for each normalisation."""
-        made = [(i, one, (scan or _scanned)(one)) for i, one in enumerate(self.scenes(index))]
+        scan = scan or (lambda scene: simulate(scene, rng=np.random.default_rng(scene.seed)).scan)
+        made = [(i, one, scan(one)) for i, one in enumerate(self.scenes(index))]
         return [
             measure_exam(scene, scanned, body=index, exam=i, normalise=way)
             for i, scene, scanned in made
             for way in self.normalise
         ]
-
-
-def _scanned(scene: Scene) -> Scan:
-    return simulate(scene, rng=np.random.default_rng(scene.seed)).scan
 
 
 def measure_exam(scene: Scene, scan: Scan, *, body: int, exam: int, normalise: str = DEFAULT_NORMALISE) -> MassRow:

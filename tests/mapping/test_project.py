@@ -42,7 +42,7 @@ def test_a_frame_alone_falls_into_the_cells_it_falls_into_among_others(seed, cel
         assert (first, shape) == among.block()
         flat = together.part([i, (i + 1) % len(poses.known)]).flat(first, shape)[0]
         np.testing.assert_array_equal(alone.flat(first, shape)[0], flat)
-        uv = np.floor(among.turn[0] @ alone.taxels[:3] + among.shift[0][:, None])
+        uv = np.floor(among.matrix[0, :, :3] @ alone.taxels[:3] + among.shift[0][:, None])
         np.testing.assert_array_equal(flat, (uv[1] - first[0]) * shape[1] + uv[0] - first[1])
 
 
