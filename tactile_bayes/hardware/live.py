@@ -207,10 +207,11 @@ class LiveState(Record, eq=False):
     @property
     def account_words(self) -> str:
         """Numbers so far; a tool that is not seen comes first."""
-        unseen = f"NO POSE ({self.unseen}); " if self.unseen else ""
+        unseen, made = f"NO POSE ({self.unseen}); " if self.unseen else "", self.tactile_map
+        covered_mm2 = 0.0 if made is None else float(made.covered.sum()) * made.recipe.cell_mm**2
         return (
             f"{unseen}{self.duration_s:.1f} s, {self.frames} frames, {self.frames_lost} lost, {self.poses} poses, "
-            f"{self.covered_mm2 / 100:.1f} cm² covered"
+            f"{covered_mm2 / 100:.1f} cm² covered"
         )
 
     @property
@@ -239,13 +240,6 @@ class LiveState(Record, eq=False):
             return "off"
         low, high = self.window_kpa
         return "low" if self.pressure_kpa < low else "high" if self.pressure_kpa > high else "in"
-
-    @property
-    def covered_mm2(self) -> float:
-        """Area of the cells with data."""
-        if self.tactile_map is None:
-            return 0.0
-        return float(self.tactile_map.covered.sum()) * self.tactile_map.recipe.cell_mm**2
 
 
 @dataclass(slots=True)

@@ -85,19 +85,17 @@ def deviation(answers: Sequence[SizeAnswer], reference: SizeAnswer | None) -> De
         return UNKNOWN
     name = SIZE if SIZE in reference.quantities else WIDTHS[0]
     return Deviation(
-        _rms([one.quantities[name].median - reference.quantities[name].median for one in answers]),
-        _rms([gap for one in answers for gap in _gaps(one, reference, name)]),
-        _rms([gap for one in answers for width in WIDTHS for gap in _gaps(one, reference, width)]),
+        _apart(answers, reference, [name], ["median"]),
+        _apart(answers, reference, [name], ["low", "high"]),
+        _apart(answers, reference, WIDTHS, ["low", "high"]),
     )
 
 
-def _gaps(answer: SizeAnswer, reference: SizeAnswer, name: str) -> tuple[float, float]:
-    one, other = answer.quantities[name], reference.quantities[name]
-    return one.low - other.low, one.high - other.high
-
-
-def _rms(values: Sequence[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+def _apart(answers: Sequence[SizeAnswer], reference: SizeAnswer, names: Sequence[str], ends: Sequence[str]) -> float:
+    """Root mean square distance of numbers of answers, by name and end, from the reference's."""
+    pairs = [(one.quantities[name], reference.quantities[name]) for one in answers for name in names]
+    gaps = [getattr(ours, end) - getattr(theirs, end) for ours, theirs in pairs for end in ends]
+    return float(np.sqrt(np.mean(np.square(gaps))))
 
 
 # --- Settings with what each costs and answers, against one reference; the frontier, and which setting is enough.
@@ -346,8 +344,15 @@ class Estimator(Record):
     work: Work
 
     def run(self, options: SamplerSettings) -> Run:
-        """A whole estimate, from the map to the size, as a function of the number of the run."""
-        calibration = fitted_as(self.calibration, options)
+        """A whole estimate, from the map to the size, as a function of the number of the run.
+
+        The calibration counts as learned from maps fitted as the options say: `estimate` refuses a size from a map
+        fitted in another way, and here it is wanted, to see how far off it would be.
+        """
+        calibration = self.calibration
+        if calibration is not None:
+            used = {"background": options.background, "radius_mm": options.fit_radius_mm, "noise": options.noise}
+            calibration = replace(calibration, recipe=replace(calibration.recipe, **used))
 
         def once(number: int) -> tuple[dict[str, float], SizeAnswer]:
             rng = np.random.default_rng([self.work.seed, number, self.tactile_map.fingerprint])
@@ -373,18 +378,6 @@ class Estimator(Record):
             if answer.code != "method":  # no draws are made, so none can be more exact
                 break
         return Reference(f"none: {answer.reason}", None, spent)
-
-
-def fitted_as(calibration: Calibration | None, options: SamplerSettings) -> Calibration | None:
-    """The calibration as if it had been learned from maps fitted as the options say.
-
-    `estimate` refuses a size from a map fitted in another way; here it is wanted, to see how far off it would be.
-    """
-    if calibration is None:
-        return None
-    used = {"background": options.background, "radius_mm": options.fit_radius_mm, "noise": options.noise}
-    recipe = replace(calibration.recipe, **used)
-    return replace(calibration, recipe=recipe)
 
 
 def measure(
