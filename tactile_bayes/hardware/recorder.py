@@ -12,7 +12,6 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from tactile_bayes.declarations import Record
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.geometry import FloatArray, inverse, rotation_from_quaternion
 from tactile_bayes.hardware import readings
@@ -108,14 +107,31 @@ SAMPLES: Final = 60
 STEADY_MM: Final = 2.0  #: A hand at rest on bone; more says that the head slipped while it touched.
 
 
-class Touch(Record, eq=False):
-    """A touched landmark."""
+class LandmarkTouch:
+    """A landmark, such as ``nipple``: the mean of the next poses of the apex on it; the tracker is in the handle."""
 
-    name: str
-    """``sternal_notch``, ``xiphoid`` or ``nipple``."""
-    position_mm: FloatArray  #: (3,) array: Mean in `base`.
-    spread_mm: float  #: Standard deviation of the samples about it (root of the sum over axes).
-    samples: int  #: How many there were.
+    def __init__(self, name: str, *, scanhead_from_tracker: FloatArray, samples: int = SAMPLES) -> None:
+        self.name = name
+        self._apex_mm = inverse(scanhead_from_tracker)[:3, 3]
+        self._wanted = samples
+        self._points: list[FloatArray] = []
+
+    def add(self, pose: readings.PoseReading) -> bool:
+        """Add one pose; True when there are enough. Poses that the tracker flags are skipped."""
+        if not pose.flags:
+            rotation = rotation_from_quaternion(np.array(pose.quaternion_wxyz))
+            self._points.append(np.array(pose.position_mm) + rotation @ self._apex_mm)
+        return len(self._points) >= self._wanted
+
+    @property
+    def position_mm(self) -> FloatArray:
+        """(3,) mean in `base`."""
+        return np.asarray(np.mean(self._points, axis=0))
+
+    @property
+    def spread_mm(self) -> float:
+        """Standard deviation of the samples about it (root of the sum over axes)."""
+        return float(np.sqrt(np.var(self._points, axis=0, ddof=1).sum())) if len(self._points) > 1 else 0.0
 
     @property
     def steady(self) -> bool:
@@ -127,30 +143,8 @@ class Touch(Record, eq=False):
         words = "" if self.steady else "; the head moved, touch it again"
         return (
             f"{self.name.replace('_', ' ')} at {x:.1f} {y:.1f} {z:.1f} mm, spread {self.spread_mm:.2f} mm over "
-            f"{self.samples} samples{words}"
+            f"{len(self._points)} samples{words}"
         )
-
-
-class LandmarkTouch:
-    """Averages the next `samples` poses to a landmark that the head's apex touches; the tracker is in the handle."""
-
-    def __init__(self, name: str, *, scanhead_from_tracker: FloatArray, samples: int = SAMPLES) -> None:
-        self.name = name
-        self._apex_mm = inverse(scanhead_from_tracker)[:3, 3]
-        self._wanted = samples
-        self._points: list[FloatArray] = []
-
-    def add(self, pose: readings.PoseReading) -> Touch | None:
-        """Add one pose; returns the landmark when there are enough. Poses that the tracker flags are skipped."""
-        if pose.flags:
-            return None
-        rotation = rotation_from_quaternion(np.array(pose.quaternion_wxyz))
-        self._points.append(np.array(pose.position_mm) + rotation @ self._apex_mm)
-        if len(self._points) < self._wanted:
-            return None
-        points = np.array(self._points)
-        spread = float(np.sqrt(points.var(axis=0, ddof=1).sum())) if len(points) > 1 else 0.0
-        return Touch(self.name, points.mean(axis=0), spread, len(points))
 
 
 # --- Recorder: passes what devices send to a writer without loss, and reports losses on the way.
@@ -412,8 +406,8 @@ class Recorder:
         return (*reading.flags, "repeated")
 
     def _touched(self, reading: readings.PoseReading, host_ns: int) -> None:
-        touch = self._touch.add(reading) if self._touch else None
-        if touch is None:
+        touch = self._touch
+        if touch is None or not touch.add(reading):
             return
         self._touch = None
         self.report.landmarks.append(str(touch))

@@ -233,15 +233,15 @@ def test_a_landmark_is_where_the_apex_touches_however_the_handle_is_held():
     rng, point = np.random.default_rng(3), np.array([10.0, -20.0, 30.0])
     lever = rigid(np.eye(3), np.array([5.0, 6.0, -70.0]))
     apex = inverse(lever)[:3, 3]
-    touch = LandmarkTouch("xiphoid", scanhead_from_tracker=lever, samples=50)
-    result = None
+    result, enough = LandmarkTouch("xiphoid", scanhead_from_tracker=lever, samples=50), False
     for _ in range(50):
+        assert not enough
         turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
         turn *= np.linalg.det(turn)
         position = point - turn @ apex + 0.2 * rng.standard_normal(3)
         q = quaternion_from_rotation(turn)
-        result = touch.add(PoseReading(tuple(position), tuple(q), flags=()))
-    assert result is not None
+        enough = result.add(PoseReading(tuple(position), tuple(q), flags=()))
+    assert enough
     assert np.abs(result.position_mm - point).max() < 0.15
     assert 0.2 < result.spread_mm < 0.5
     assert result.steady
@@ -250,11 +250,11 @@ def test_a_landmark_is_where_the_apex_touches_however_the_handle_is_held():
 
 def test_a_landmark_that_slipped_says_so_and_doubtful_poses_do_not_count():
     touch = LandmarkTouch("xiphoid", scanhead_from_tracker=np.eye(4), samples=2)
-    assert touch.add(PoseReading((0, 0, 0), (1, 0, 0, 0))) is None
-    assert touch.add(PoseReading((9, 9, 9), (1, 0, 0, 0), flags=("error W",))) is None
-    found = touch.add(PoseReading((9, 0, 0), (1, 0, 0, 0)))
-    assert not found.steady
-    assert "touch it again" in str(found)
+    assert not touch.add(PoseReading((0, 0, 0), (1, 0, 0, 0)))
+    assert not touch.add(PoseReading((9, 9, 9), (1, 0, 0, 0), flags=("error W",)))
+    assert touch.add(PoseReading((9, 0, 0), (1, 0, 0, 0)))
+    assert not touch.steady
+    assert "touch it again" in str(touch)
 
 
 def test_faults_come_as_often_as_asked():
