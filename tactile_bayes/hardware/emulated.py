@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from tactile_bayes.geometry import FloatArray, rotation_from_quaternion
+from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.head import Packet, PacketParser
 from tactile_bayes.hardware.readings import (
@@ -229,8 +229,7 @@ def encoded(protocol: str, pose: ToolReading, number: int) -> bytes:
     if protocol == "open":
         return head.encode_pose(pose, sequence=number)
     if protocol == "igtlink":
-        turn = rotation_from_quaternion(np.array(pose.quaternion_wxyz)) if isinstance(pose, PoseReading) else None
-        return encode_transform(pose, turn)
+        return encode_transform(pose)
     if not isinstance(pose, PoseReading):
         return b""
     station = int(pose.tool or 1)

@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.errors import DeviceError
-from tactile_bayes.geometry import FloatArray, quaternion_from_rotation
+from tactile_bayes.geometry import quaternion_from_rotation, rotation_from_quaternion
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.head import PacketParser
 from tactile_bayes.hardware.ports import Port
@@ -282,23 +282,17 @@ def _turn_of_matrix(columns: tuple[float, ...]) -> tuple[float, ...] | None:
     return tuple(map(float, quaternion_from_rotation(rotation))) if np.linalg.det(rotation) > 0 else None
 
 
-def encode_transform(
-    pose: PoseReading | MissingReading, rotation: FloatArray | None = None, *, version: int = 1
-) -> bytes:
-    """Encode a pose with its rotation matrix as a message; of a missing one an identity with its status."""
-    if isinstance(pose, PoseReading) and rotation is not None:
-        body, device_ns, status = _MATRIX.pack(*rotation.T.ravel(), *pose.position_mm), pose.device_ns or 0, b"OK"
+def encode_transform(pose: ToolReading) -> bytes:
+    """Encode a pose with its rotation matrix as a message of header version 1; of a missing one an identity."""
+    if isinstance(pose, PoseReading):
+        turn = rotation_from_quaternion(np.array(pose.quaternion_wxyz))
+        body, device_ns = _MATRIX.pack(*turn.T.ravel(), *pose.position_mm), pose.device_ns or 0
     else:
-        body, device_ns, status = _MATRIX.pack(*np.eye(3).ravel(), 0, 0, 0), 0, b"MISSING"
-    if version > 1:
-        key = b"TransformStatus"
-        header = struct.pack(">H", 1) + _PAIR.pack(len(key), _US_ASCII, len(status))
-        sizes = _EXTENDED.pack(_EXTENDED.size, len(header), len(key + status), 0)
-        body = sizes + body + header + key + status
+        body, device_ns = _MATRIX.pack(*np.eye(3).ravel(), 0, 0, 0), 0
     seconds, rest_ns = divmod(device_ns, 1_000_000_000)
     fraction = -(-(rest_ns << 32) // 1_000_000_000)  # rounded up, so that whole nanoseconds come back
     name = (pose.tool or "Tracker").encode()
-    return _HEADER.pack(version, b"TRANSFORM", name, seconds, fraction, len(body), crc64(body)) + body
+    return _HEADER.pack(1, b"TRANSFORM", name, seconds, fraction, len(body), crc64(body)) + body
 
 
 def ask_for_tdata() -> bytes:
@@ -307,7 +301,6 @@ def ask_for_tdata() -> bytes:
     return _HEADER.pack(1, b"STT_TDATA", b"", 0, 0, len(body), crc64(body)) + body
 
 
-_US_ASCII: Final = 3
 _ASK_BYTES: Final = 36  # least time between two in ms, and the name of a frame
 
 

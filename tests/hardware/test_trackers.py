@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 import struct
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tactile_bayes.geometry import rotation_from_quaternion
 from tactile_bayes.hardware.head import HeadParser, encode_pose
 from tactile_bayes.hardware.readings import PoseReading
 from tactile_bayes.hardware.serial_trackers import (
@@ -34,10 +32,7 @@ LIBERTY = bytes.fromhex(
 )
 LIBERTY_TEXT = b"01    10.000   -5.000    1.000   0.50000  0.50000 -0.50000  0.50000  123456  0\r\n"
 BIRD = bytes.fromhex("e3 11 0e 77 63 01 00 20 00 20 00 60 00 20")
-IGTLINK = encode_transform(
-    PoseReading((254.0, -127.0, 25.4), (0.5, 0.5, -0.5, 0.5), 123_456_000_000),
-    rotation_from_quaternion(np.array([0.5, 0.5, -0.5, 0.5])),
-)
+IGTLINK = encode_transform(PoseReading((254.0, -127.0, 25.4), (0.5, 0.5, -0.5, 0.5), 123_456_000_000))
 OPEN = encode_pose(PoseReading((254.0, -127.0, 25.4), (0.5, 0.5, -0.5, 0.5), 123_456_000_000), sequence=0)
 
 PROTOCOLS = {
