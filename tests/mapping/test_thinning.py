@@ -8,7 +8,7 @@ import pytest
 
 import tactile_bayes as tb
 from tactile_bayes.declarations import replace
-from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.errors import UsageError
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.convention import POOL_S, every_stretch, thinning
 from tactile_bayes.mapping.select import every_nth, first_seconds
@@ -49,11 +49,6 @@ def test_the_first_seconds_are_those():
 def test_a_number_that_is_none_is_refused(every):
     with pytest.raises(UsageError, match=r"every is .*; give a whole number from 1 on"):
         build_map(scan(), every=every)
-
-
-def test_no_time_is_refused():
-    with pytest.raises(BadDataError, match="duration_s is 0; give a time above 0 s"):
-        first_seconds(scan(), 0)
 
 
 @pytest.mark.parametrize(("every", "start"), [(6, 3), (12, 4), (21, 17), (32, 7), (40, 39)])
