@@ -312,6 +312,7 @@ def _as_map(
 ) -> TactileMap:
     sums, scans = done.sums.trimmed(), [part.scan for part in selections]
     patient, nipple, spread = _landmarks(scans, plane)
+    parts = [(f"scan {number} " if len(scans) > 1 else "", part) for number, part in enumerate(selections, start=1)]
     quality = {
         **frame_figures(selections),
         **timing_figures(scans),
@@ -337,7 +338,7 @@ def _as_map(
         background=None if recipe.normalise == "none" else 1.0,
         frame_count=int(quality["frames_used"]),
         quality=quality,
-        masked_taxels=_masked(selections),
+        masked_taxels=tuple(f"{which}{fault}" for which, part in parts for fault in part.faults),
         head=_head(scans),
     )
     of_map = (*convention_findings(quality, findings), *broken_assumptions(quality), *handling_findings(quality))
@@ -354,16 +355,6 @@ def _head(scans: list[Scan]) -> HeadShape:
                 way_out="build one map per head",
             )
     return first
-
-
-def _masked(selections: list[SelectedFrames]) -> tuple[str, ...]:
-    """List the taxels left out, with their scan's name where there are several."""
-    several = len(selections) > 1
-    return tuple(
-        f"scan {number} {fault}" if several else str(fault)
-        for number, part in enumerate(selections, start=1)
-        for fault in part.faults
-    )
 
 
 def _landmarks(scans: list[Scan], plane: Plane) -> tuple[FloatArray | None, FloatArray | None, dict[str, float]]:

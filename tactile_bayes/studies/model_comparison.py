@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_bayes import presets
 from tactile_bayes.declarations import Record, replace
@@ -17,7 +16,7 @@ from tactile_bayes.forward.simulate import felt_at_poses
 from tactile_bayes.geometry import FloatArray, inverse
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.select import SelectedFrames, select_frames
+from tactile_bayes.mapping.select import select_frames
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import BumpFit, fit_bump, fitted_candidates
 from tactile_bayes.progress import Progress, untold
@@ -318,7 +317,10 @@ def measured_frames(
         part, cell_mm=cell_mm, pressure_window_kpa=pressure_window_kpa, latency_ms=latency_ms, normalise="mean"
     )
     assert made.plane_from_base is not None
-    rotation, origin = _poses_in_plane(selected, used, made.plane_from_base)
+    tracker_from_head, turn = inverse(scan.head.scanhead_from_tracker), made.plane_from_base[:3, :3]
+    on_base = selected.poses.rotation[used]
+    origin = selected.poses.position_mm[used] + on_base @ tracker_from_head[:3, 3]
+    origin, rotation = origin @ turn.T + made.plane_from_base[:3, 3], turn @ on_base @ tracker_from_head[:3, :3]
     pressure = scan.element_calibration.to_kpa(scan.frames.counts[used])
     pressure[:, ~selected.good_taxels] = np.nan
     lump = _bump(made, place_mm)
@@ -407,17 +409,6 @@ def residual_slope(measured: MeasuredScan, comparison: ModelComparison) -> tuple
     residual = residual_map(measured, comparison)[cells]
     found = np.linalg.lstsq(design, residual, rcond=None)[0]
     return float(found[1]), float(found[2]), float(np.sqrt(np.mean((residual - design @ found) ** 2)))
-
-
-def _poses_in_plane(
-    selected: SelectedFrames, used: NDArray[np.intp], plane_from_base: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Rotations (n, 3, 3) and origins (n, 3) of the head's face in the plane."""
-    tracker_from_head = inverse(selected.scan.head.scanhead_from_tracker)
-    rotation = selected.poses.rotation[used]
-    origin = selected.poses.position_mm[used] + rotation @ tracker_from_head[:3, 3]
-    turn = plane_from_base[:3, :3]
-    return turn @ rotation @ tracker_from_head[:3, :3], origin @ turn.T + plane_from_base[:3, 3]
 
 
 def _model_map(measured: MeasuredScan, pressure_kpa: FloatArray) -> TactileMap:

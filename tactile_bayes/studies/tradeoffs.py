@@ -166,7 +166,12 @@ def measure_forward(case: LumpCase, setting: Setting, *, clock: estimate_tradeof
         found = fitted(case.stiffness_ratio)
         times.append((middle - begun, clock() - middle))
     lump, one_map = np.min(times, axis=0)
-    element = _element_mm(case, setting.settings)
+    settings = setting.settings
+    if isinstance(settings, SolidSettings):
+        nodes = len(lump_mesh(settings.geometry(case.body), settings.mesh_size).arc)
+    else:
+        nodes = rim_nodes(case.body, fineness=settings.fineness)
+    element = float(np.pi * case.body.radius_mm / ((nodes - 1) / 2))  # half the circumference over its elements
     return Measured(setting, element, float(lump), float(one_map), found.amplitude, *found.widths_mm)
 
 
@@ -182,15 +187,6 @@ def _empirical(case: LumpCase) -> Callable[[float], paper.LineFit]:
         )
 
     return fitted
-
-
-def _element_mm(case: LumpCase, settings: paper.StudySettings | SolidSettings) -> float:
-    """Half the lump's circumference over the elements on it."""
-    if isinstance(settings, SolidSettings):
-        nodes = len(lump_mesh(settings.geometry(case.body), settings.mesh_size).arc)
-    else:
-        nodes = rim_nodes(case.body, fineness=settings.fineness)
-    return float(np.pi * case.body.radius_mm / ((nodes - 1) / 2))
 
 
 def teach(case: LumpCase, model: str, *, progress: Callable[[int, int], None]) -> list[paper.StudyRow]:
@@ -365,17 +361,14 @@ def measure_map(scan: Scan, *, inputs: Inputs, work: estimate_tradeoff.Work) -> 
 
         return once
 
+    def reference() -> estimate_tradeoff.Reference:
+        """A long run on the map with the finest cells, of all frames."""
+        begun, finest = clock(), build_map(scan, cell_mm=FINEST_CELL_MM)
+        calibration, options = inputs(finest)
+        found = estimate_tradeoff.Estimator(finest, calibration, work).reference(options)
+        ours = f"the map of all frames in cells of {FINEST_CELL_MM:g} mm"
+        words = found.words.replace("the default's posterior", ours)
+        return replace(found, words=words, cpu_s=clock() - begun)
+
     seconds, _ = estimate_tradeoff.default_run(run_of(settings[0].how))
-    return estimate_tradeoff.climbed(
-        settings, run_of, lambda: _reference(scan, inputs, work), default_s=seconds, work=work
-    )
-
-
-def _reference(scan: Scan, inputs: Inputs, work: estimate_tradeoff.Work) -> estimate_tradeoff.Reference:
-    """A long run on the map with the finest cells, of all frames."""
-    begun = work.clock()
-    finest = build_map(scan, cell_mm=FINEST_CELL_MM)
-    calibration, options = inputs(finest)
-    found = estimate_tradeoff.Estimator(finest, calibration, work).reference(options)
-    words = found.words.replace("the default's posterior", f"the map of all frames in cells of {FINEST_CELL_MM:g} mm")
-    return replace(found, words=words, cpu_s=work.clock() - begun)
+    return estimate_tradeoff.climbed(settings, run_of, reference, default_s=seconds, work=work)
