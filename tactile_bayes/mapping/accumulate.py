@@ -290,13 +290,14 @@ class MapAccumulator:
         self._head, self._readout, self._window_kpa = head, Readout.of(calibration, taxels), pressure_window_kpa
         self._projector = Projector(head, plane_from_base=plane_from_base, taxels=taxels, cell_mm=cell_mm)
         self._sums, self._profile = CellSums(cell_mm), GrowingProfile(taxels)
-        self._counted: Counter[str] = Counter()
+        dropped = ("dropped_no_pose", "dropped_elements", "dropped_low", "dropped_high")
+        self._counted = Counter(dict.fromkeys(("frames_total", "frames_used", *dropped, "saturated_readings"), 0))
 
     @property
     def figures(self) -> dict[str, float]:
         """Frames and readings so far, used and left out by reason."""
         more = {"clipped_values": self._sums.clipped, "negative_readings": self._sums.negative}
-        return {name: float(value) for name, value in ({name: self._counted[name] for name in _COUNTED} | more).items()}
+        return {name: float(value) for name, value in {**self._counted, **more}.items()}
 
     def add(self, counts: CountArray, poses: FramePoses) -> BoolArray:
         """Add (n, rows, columns) frames with the n poses at their times; returns the (n,) that were used."""
@@ -343,17 +344,6 @@ class MapAccumulator:
             quality=self.figures | self._profile.figures(),
             head=HeadShape.of(self._head.surface_mm, self._head.pitch_mm),
         )
-
-
-_COUNTED = (
-    "frames_total",
-    "frames_used",
-    "dropped_no_pose",
-    "dropped_elements",
-    "dropped_low",
-    "dropped_high",
-    "saturated_readings",
-)
 
 
 # --- Correlation of the errors within a frame: readings share frames, so a map holds less than they would alone.
