@@ -532,9 +532,9 @@ def main(words: list[str]) -> int:
     try:
         tracker = NdiTracker(importlib.import_module(MODULE), words[1], roms=[*map(Path, words[2:])])
     except DeviceError as error:
-        print(error, flush=True)
+        os.write(sys.stdout.fileno(), f"{error}\n".encode())
         return error.exit_code
-    print("ready", flush=True)
+    os.write(sys.stdout.fileno(), b"ready\n")
     os.close(sys.stdout.fileno())
     try:
         serve(tracker, line)
