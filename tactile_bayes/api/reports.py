@@ -240,14 +240,14 @@ def export(
     several = listed(files)
     outputs = Outputs(path_of(path), path_of(dictionary), to=to, force=force)
     outputs.check(files=bool(several))
-    exported = None
+    exported, notes = dict[str, bytes](), tuple[str, ...]()
     if several:
         read = [_read(one) for one in several]
         if to == "dicom" and not any(isinstance(one, MapFile) for one in read):  # a report refers to its maps
             read = [*(_map_file(*one) for estimate in several for one in _maps_of(estimate)), *read]
         who = identity_of(path_of(worklist), identity)
-        exported = exported_files(read, to=to, identity=who, id_from_scan=patient_id_from_scan)
-    return ExportedFiles(outputs.write(exported), () if exported is None else exported.notes)
+        exported, notes = exported_files(read, to=to, identity=who, id_from_scan=patient_id_from_scan)
+    return ExportedFiles(outputs.write(exported), notes)
 
 
 def _read(given: Any) -> MapFile | Sequence[EstimateFile]:

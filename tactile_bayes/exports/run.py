@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
@@ -88,13 +88,13 @@ class Outputs(Record):
                 check_suffix(path, written)
                 refuse_existing(path, force=self.force)
 
-    def write(self, exported: Exported | None) -> tuple[Path, ...]:
-        """Write the files of the export, and the dictionary: all of them, or none."""
+    def write(self, exported: Mapping[str, bytes]) -> tuple[Path, ...]:
+        """Write the files of the export, as `export` names them, and the dictionary: all of them, or none."""
         paths, folder = dict[Path, bytes](), None
-        if exported is not None and self.path is not None:
-            if "" not in exported.files:
-                folder = _prepared_folder(self.path, set(exported.files))
-            paths = {self.path / name if name else self.path: data for name, data in exported.files.items()}
+        if exported and self.path is not None:
+            if "" not in exported:
+                folder = _prepared_folder(self.path, set(exported))
+            paths = {self.path / name if name else self.path: data for name, data in exported.items()}
         if self.dictionary is not None:
             paths[self.dictionary] = dictionary_csv().encode()
         try:
@@ -132,13 +132,8 @@ TAKES: Final[dict[ExportFormat, tuple[str, ...]]] = {
     "csv": ("patient_id", "study_date"),
 }
 """Which parts of an identity each format holds."""
-
-
-class Exported(Record, eq=False):
-    """Files of an export."""
-
-    files: dict[str, bytes]  #: Bytes by file name, for a folder; one file has the empty name.
-    notes: tuple[str, ...] = ()  #: What a user should know of them, one line each.
+Written = tuple[dict[str, bytes], tuple[str, ...]]
+"""Bytes by file name, for a folder, or by the empty name, for one file; and what a user should know of them."""
 
 
 def refuse_untaken(to: ExportFormat, options: Iterable[str]) -> None:
@@ -154,24 +149,16 @@ def _option(name: str) -> str:
 
 
 def export(
-    files: Iterable[MapFile | Sequence[EstimateFile]],
-    *,
-    to: ExportFormat,
-    identity: Identity,
-    id_from_scan: bool = False,
-) -> Exported:
+    files: Sequence[MapFile | Sequence[EstimateFile]], *, to: ExportFormat, identity: Identity, id_from_scan: bool
+) -> Written:
     """Export maps and estimates.
 
     `files`: as `read_exam` gives them for maps, estimates (JSON) and posteriors, in any order; `identity`: of patient
     and study; what the format does not hold is left out; `id_from_scan`: take the subject code of the scans for the
     patient ID where none is given.
     """
-    maps, estimates = list[MapFile](), list[EstimateFile]()
-    for found in files:
-        if isinstance(found, MapFile):
-            maps.append(found)
-        else:
-            estimates.extend(found)
+    maps = [one for one in files if isinstance(one, MapFile)]
+    estimates = [one for several in files if not isinstance(several, MapFile) for one in several]
     _refuse_twice(maps)
     _refuse_twice(estimates)
     check_pairs(maps, estimates)
@@ -184,10 +171,10 @@ def export(
             raise UsageError(f"nrrd files hold a map; {estimates[0].path} is none")
         if len(maps) > 1:
             raise UsageError("a nrrd file holds one map; give one")
-        return Exported({"": nrrd_bytes(maps[0])})
+        return {"": nrrd_bytes(maps[0])}, ()
     if to == "csv":
         _refuse_maps(maps, estimates, to)
-        return Exported({"": records_csv(estimates, who, id_from_scan=id_from_scan).encode()})
+        return {"": records_csv(estimates, who, id_from_scan=id_from_scan).encode()}, ()
     if id_from_scan and not who.patient_id:
         facts = [*(one.facts for one in maps), *(one.facts for one in estimates)]
         subjects = {one.get("subject", "") for one in facts}
@@ -195,10 +182,13 @@ def export(
             way_out = "give --patient-id instead of --patient-id-from-scan"
             raise UsageError(f"the scans name no subject, or several; {way_out}")
         who = replace(who, patient_id=subjects.pop())
+    no_patient = "the patient ID is empty; --patient-id, --worklist or --patient-id-from-scan gives one"
+    notes = [] if who.patient_id else [no_patient]
     if to == "dicom":
-        return _dicom(maps, estimates, who)
+        held, others = _dicom(maps, estimates, who)
+        return held, (*notes, *others)
     _refuse_maps(maps, estimates, to)
-    return Exported({"": bundle_json(_one_estimate(estimates, to), who).encode()}, tuple(_no_patient(who)))
+    return {"": bundle_json(_one_estimate(estimates, to), who).encode()}, tuple(notes)
 
 
 def _refuse_twice(files: Sequence[MapFile] | Sequence[EstimateFile]) -> None:
@@ -209,12 +199,6 @@ def _refuse_twice(files: Sequence[MapFile] | Sequence[EstimateFile]) -> None:
         seen[one.digest] = one.path
 
 
-def _no_patient(identity: Identity) -> list[str]:
-    if identity.patient_id:
-        return []
-    return ["the patient ID is empty; --patient-id, --worklist or --patient-id-from-scan gives one"]
-
-
 def _one_estimate(estimates: Sequence[EstimateFile], to: ExportFormat) -> EstimateFile:
     if len(estimates) > 1:
         where = f"{estimates[0].path} holds" if len({one.path for one in estimates}) == 1 else "the files hold"
@@ -222,21 +206,20 @@ def _one_estimate(estimates: Sequence[EstimateFile], to: ExportFormat) -> Estima
     return estimates[0]
 
 
-def _dicom(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity: Identity) -> Exported:
+def _dicom(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity: Identity) -> Written:
     if not maps:
         raise UsageError(f"a DICOM report refers to its map; give it too: export MAP.nc {estimates[0].path} --to dicom")
     estimate = _one_estimate(estimates, "dicom") if estimates else None
     if estimate is None and len(maps) > 1:
         raise UsageError("several maps without an estimate may be of several exams; give one map, or their pooled size")
-    files = dicom_files(maps, estimate, identity=identity)
-    notes = _no_patient(identity)
+    files, notes = dicom_files(maps, estimate, identity=identity), list[str]()
     if estimate is None:
         one = maps[0].path
         notes.append(f"no estimate was given, so there is no report; `tactile-bayes estimate {one} --json` makes one")
     if not any(name.startswith(VALUES) for name in files):
         why = "no landmarks" if maps[0].tactile_map.patient_from_plane is None else "no posture of a person"
         notes.append(f"the map has {why}, so its values have no place in a patient: there is its picture only")
-    return Exported(files, tuple(notes))
+    return files, tuple(notes)
 
 
 def _refuse_maps(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], to: ExportFormat) -> None:
