@@ -20,9 +20,9 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.findings import Finding, Verdict, finding_lines, verdict
 from tactile_bayes.inference.draws import Draws
-from tactile_bayes.inference.ensemble import inference_data
+from tactile_bayes.inference.ensemble import DrawGroup, inference_data
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.result import DrawGroup, Estimate, Mass, inference_groups
+from tactile_bayes.posterior.result import Estimate, Mass, inference_groups
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import estimate_report, leading_size, patient_mm, side_of
 from tactile_bayes.report.estimate_figures import draw_fit, draw_map, draw_size
@@ -120,8 +120,7 @@ class Sized(Record, eq=False, dict=True):
         columns = self._columns()
         if not columns:
             raise UsageError(f"there are no draws: {self.why}")
-        groups = {name: (group.arrays, group.notes) for name, group in self._groups().items()}
-        return inference_data({name: draws.values for name, draws in columns.items()}, groups)
+        return inference_data({name: draws.values for name, draws in columns.items()}, self._groups())
 
     def _groups(self) -> dict[str, DrawGroup]:
         """The groups besides ``posterior``."""

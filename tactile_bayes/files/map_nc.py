@@ -21,8 +21,9 @@ from tactile_bayes.files.reading import CELLS, check_limit
 from tactile_bayes.files.reports import EstimateReport, PooledReport
 from tactile_bayes.findings import Finding, FindingEntry, findings_in
 from tactile_bayes.geometry import FloatArray, check_rigid
+from tactile_bayes.inference.ensemble import DrawGroup
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
-from tactile_bayes.posterior.result import DrawGroup, Estimate
+from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scans import HeadShape
 from tactile_bayes.size.draws import SizePosterior

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from tactile_bayes.declarations import Record
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws, student_draws
@@ -58,22 +58,21 @@ def convergence(draws: FloatArray) -> dict[str, float]:
     return _agreement(known) | quantile
 
 
-Arrays = Mapping[str, tuple[tuple[str, ...], FloatArray]]
+class DrawGroup(Record, eq=False):
+    """Arrays of one group with the names of their axes, and what is to be said of it."""
+
+    arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]  #: Names of the axes, and values.
+    notes: Mapping[str, str] = field(default_factory=dict)  #: Text by name.
 
 
-def inference_data(
-    draws: Mapping[str, FloatArray], groups: Mapping[str, tuple[Arrays, Mapping[str, str]]] | None = None
-) -> Any:
-    """Convert (chain, draw) arrays to `arviz.InferenceData`: a group ``posterior``, and those given.
-
-    Each other group has the names of axes and values by variable, and its attributes.
-    """
+def inference_data(draws: Mapping[str, FloatArray], groups: Mapping[str, DrawGroup]) -> Any:
+    """Convert (chain, draw) arrays to `arviz.InferenceData`: a group ``posterior``, and those given."""
     import xarray
 
-    posterior = {name: (("chain", "draw"), values) for name, values in draws.items()}
+    posterior = DrawGroup({name: (("chain", "draw"), values) for name, values in draws.items()})
     datasets = {}
-    for name, (arrays, notes) in {"posterior": (posterior, {}), **(groups or {})}.items():
-        dataset = xarray.Dataset(dict(arrays), attrs=dict(notes))
+    for name, group in {"posterior": posterior, **groups}.items():
+        dataset = xarray.Dataset(dict(group.arrays), attrs=dict(group.notes))
         datasets[name] = dataset.assign_coords({axis: np.arange(size) for axis, size in dataset.sizes.items()})
     return _arviz().InferenceData(**datasets)
 

@@ -17,11 +17,9 @@ from tactile_bayes.inference.draws import INDEPENDENT_DRAWS, ParameterDraws, stu
 def stencil(theta: FloatArray, *, step: FloatArray) -> FloatArray:
     """(1 + 2 p^2, p) points for central first and second differences, `theta` first."""
     shifts = np.diag(step)
-    points = [theta[None], theta + shifts, theta - shifts]
-    for i, j in _pairs(len(theta)):
-        corners = [shifts[i] + shifts[j], shifts[i] - shifts[j], shifts[j] - shifts[i], -shifts[i] - shifts[j]]
-        points.append(theta + np.array(corners))
-    return np.concatenate(points)
+    one, other = (shifts[index] for index in np.tril_indices(len(theta), -1))
+    corners = np.stack([one + other, one - other, other - one, -one - other], axis=1).reshape(-1, len(theta))
+    return np.concatenate([theta[None], theta + shifts, theta - shifts, theta + corners])
 
 
 def finite_differences(values: FloatArray, *, step: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -29,13 +27,10 @@ def finite_differences(values: FloatArray, *, step: FloatArray) -> tuple[FloatAr
     p = len(step)
     here, up, down = values[0], values[1 : p + 1], values[p + 1 : 2 * p + 1]
     hessian = np.diag((up - 2 * here + down) / step**2)
-    for (i, j), quad in zip(_pairs(p), values[2 * p + 1 :].reshape(-1, 4), strict=True):
-        hessian[i, j] = hessian[j, i] = (quad[0] - quad[1] - quad[2] + quad[3]) / (4 * step[i] * step[j])
+    i, j = np.tril_indices(p, -1)
+    a, b, c, d = values[2 * p + 1 :].reshape(-1, 4).T
+    hessian[i, j] = hessian[j, i] = (a - b - c + d) / (4 * step[i] * step[j])
     return (up - down) / (2 * step), hessian
-
-
-def _pairs(p: int) -> list[tuple[int, int]]:
-    return [(i, j) for i in range(p) for j in range(i)]
 
 
 # --- The paper's method: least squares (Eq 7) with its covariance and no prior.

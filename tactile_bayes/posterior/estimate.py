@@ -31,7 +31,7 @@ from tactile_bayes.presets import CELL_PER_SIGMA, INTERVAL
 from tactile_bayes.progress import Progress
 from tactile_bayes.scans import DEFAULT_HEAD, HeadShape
 from tactile_bayes.size import terms
-from tactile_bayes.size.draws import EXTREMES, SizePosterior
+from tactile_bayes.size.draws import BUMP, EXTREMES, SIZES, SizePosterior
 from tactile_bayes.size.pooling import Calibration, draw_sizes
 
 # --- Search for the lump: candidate places, highest first, each fitted and assessed.
@@ -436,10 +436,6 @@ def _way_to(recipe: terms.Recipe, tactile_map: TactileMap) -> str:
     return "leave the fit's options to the calibration, or learn a calibration for these"
 
 
-_SIZES = ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm")
-_BUMP = ("amplitude", "sigma_x_mm", "sigma_y_mm")
-
-
 def _diagnostics(sized: SizedDraws) -> Diagnostics:
     made, calibration = sized.made, sized.calibration
     return Diagnostics(
@@ -451,7 +447,7 @@ def _diagnostics(sized: SizedDraws) -> Diagnostics:
         noise=made.figures,
         convergence={
             name: convergence(getattr(source, name))
-            for source, names in ((sized.size, _SIZES), (made.posterior, _BUMP))
+            for source, names in ((sized.size, SIZES), (made.posterior, BUMP[:3]))
             if source is not None and made.draws.method == "ensemble"
             for name in names
         },

@@ -70,11 +70,6 @@ class FieldFit(Record, eq=False, dict=True):
         """Log evidence of the scene, from the Gaussians' volumes."""
         return self.mixture.log_evidence
 
-    def sd(self, name: str) -> float:
-        """Posterior standard deviation of one parameter."""
-        i = self.scene.names.index(name)
-        return float(np.sqrt(self.covariance[i, i]))
-
     @property
     def widths_mm(self) -> tuple[float, float]:
         """sigma_x_mm and sigma_y_mm at the mode."""
@@ -84,8 +79,8 @@ class FieldFit(Record, eq=False, dict=True):
     @property
     def width_sd_mm(self) -> float:
         """Posterior SD of the less certain width, from the Gaussian approximation."""
-        names = [name for name in ("u", "v") if name in self.scene.names]
-        return max(self.sd(name) * float(np.exp(self.at[name])) for name in names)
+        sd = dict(zip(self.scene.names, np.sqrt(np.diag(self.covariance)), strict=True))
+        return max(float(sd[name]) * float(np.exp(self.at[name])) for name in ("u", "v") if name in sd)
 
     def methods(self, options: SamplerSettings) -> Sequence[Method]:
         """The requested method, and the next one where a step up is allowed."""

@@ -267,12 +267,11 @@ def with_masses(tactile_map: TactileMap, first: Estimate, options: SamplerSettin
     for rise in [*_second_lump_of_scene(tactile_map, first), *shown]:
         mass = _sized_at(tactile_map, rise, first, others, estimator)
         if mass is None and rise not in shown:
-            why = "the map shows it beside the first lump only, not by itself"
-            unresolved = Estimate("no_estimate", why, code="unresolved", advice=BOTH, on_paper=BOTH, bump=rise)
-            mass = Mass(rise.x_mm, rise.y_mm, rise.probability, unresolved)
+            mass = _unsized(rise, "unresolved", "the map shows it beside the first lump only, not by itself", BOTH)
         if mass is not None and all(_apart(mass, one) for one in sized):
             sized.append(mass)
-    unsized = [_hardly_shown(rise) for rise in hardly]
+    why = "the map shows too little of it for a size"
+    unsized = [_unsized(rise, "prior", why, MORE_LINES, MORE_LINES_ON_PAPER) for rise in hardly]
     sized += [mass for mass in unsized if all(_apart(mass, one) for one in sized)]
     sized = by_evidence(sized)
     kept = options.centre_mm is not None or bool(set(OF_A_LUMP) & set(options.size_priors.known))
@@ -353,9 +352,7 @@ def _sized_at(
     None where neither shows a lump.
     """
     if not on_map(tactile_map, rise.x_mm, rise.y_mm):
-        why = "its centre lies off the map"
-        off_map = Estimate("no_estimate", why, code="window", advice=BEYOND_IT, on_paper=BEYOND_IT, bump=rise)
-        return Mass(rise.x_mm, rise.y_mm, rise.probability, off_map)
+        return _unsized(rise, "window", "its centre lies off the map", BEYOND_IT)
     given = replace(options, centre_mm=(rise.x_mm, rise.y_mm), start_width_mm=None)
     estimate = _estimated(tactile_map, given, estimator)
     if first.map_posterior is not None and not _same_lump(estimate, rise, first):
@@ -380,10 +377,9 @@ def _sized_at(
     return Mass(rise.x_mm, rise.y_mm, rise.probability, replace(estimate, bump=rise))
 
 
-def _hardly_shown(rise: Rise) -> Mass:
-    """The mass of a rise that is likely a lump, of which the map shows too little for a size."""
-    why = "the map shows too little of it for a size"
-    estimate = Estimate("no_estimate", why, code="prior", advice=MORE_LINES, on_paper=MORE_LINES_ON_PAPER, bump=rise)
+def _unsized(rise: Rise, code: str, why: str, advice: str, on_paper: str = "") -> Mass:
+    """The mass at a rise that is likely a lump, and why it has no size."""
+    estimate = Estimate("no_estimate", why, code=code, advice=advice, on_paper=on_paper or advice, bump=rise)
     return Mass(rise.x_mm, rise.y_mm, rise.probability, estimate)
 
 

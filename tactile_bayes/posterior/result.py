@@ -9,10 +9,11 @@ from typing import Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, field
+from tactile_bayes.declarations import Record
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws, quantiles_of, weighted_quantiles_of
+from tactile_bayes.inference.ensemble import DrawGroup
 from tactile_bayes.inference.importance import smooth_weights
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import principal_widths
@@ -276,13 +277,6 @@ def fitted_cells(estimate: Estimate) -> FittedCells | None:
 PRIOR_DRAWS = 2000
 LIKELIHOOD_DRAWS = 400  #: Evenly thinned: a value for each cell and draw takes a second and 4 MB for 400 of them.
 LEAST_SIZED = 100  #: Fewer prior draws within the calibration's range say nothing of a size.
-
-
-class DrawGroup(Record, eq=False):
-    """Arrays of one group with the names of their axes, and what is to be said of it."""
-
-    arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]  #: Names of the axes, and values.
-    notes: Mapping[str, str] = field(default_factory=dict)  #: Text by name.
 
 
 def inference_groups(

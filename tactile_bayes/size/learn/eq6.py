@@ -246,7 +246,7 @@ def learn_two_stage(table: SizeTable, *, recipe: Recipe, rng: np.random.Generato
 def axis_in_two_stages(data: AxisRows) -> AxisCalibration:
     """Eq 6 fitted in two stages to the rows themselves: a single draw, as `axis_at_mode` of the joint posterior."""
     ones = np.ones((1, len(data.d_mm)))
-    return data.calibration(_with_scatter(_two_stage_coefficients(data, ones), data, ones))
+    return data.calibration(_two_stages(data, ones))
 
 
 def other_fit(calibration: SizeCalibration, table: SizeTable) -> OtherFit | None:
@@ -268,7 +268,7 @@ def other_fit(calibration: SizeCalibration, table: SizeTable) -> OtherFit | None
 def _learn_in_two_stages(data: AxisRows, rng: np.random.Generator) -> AxisCalibration:
     fitted = axis_in_two_stages(data)
     counts = _resampled(data, rng)
-    draws = _with_scatter(_two_stage_coefficients(data, counts), data, counts)
+    draws = _two_stages(data, counts)
     _stretch(draws, diameters=len(np.unique(data.d_mm)))
     # the estimate is the fit to the table itself, not the mean over its resamples
     scaled = [2, 4]
@@ -328,13 +328,23 @@ def _resampled(data: AxisRows, rng: np.random.Generator) -> FloatArray:
     return np.array(drawn)[:, group]
 
 
-def _two_stage_coefficients(data: AxisRows, counts: FloatArray) -> FloatArray:
-    """(k, 4) m, b, e, f of (k, rows) resamples."""
+def _two_stages(data: AxisRows, counts: FloatArray) -> FloatArray:
+    """(k, 6) coefficients of (k, rows) resamples, with s and g of ln d about them by maximum likelihood on a grid."""
     level, known = _stages(data)
     assert data.width_change is not None
     m, b = _line(data.sigma_mm[level], data.d_mm[level], counts[:, level])
     f, log_e = _line(np.log(data.amplitude[known]), np.log(data.width_change[known]), counts[:, known])
-    return np.stack([m, b, np.exp(log_e), f], axis=1)
+    zeros = np.zeros_like(m)
+    coefficients = np.stack([m, b, np.exp(log_e), f, zeros, zeros], axis=1)
+    axis = data.calibration(coefficients)
+    error = log_error(axis.size_mm(data.sigma_mm, data.amplitude, draws=coefficients[:, None, :]), data.d_mm)
+    log_a = np.log(data.amplitude / data.centre[0])
+    share = counts / counts.sum(axis=1, keepdims=True)
+    variance = (share * error**2) @ np.exp(2.0 * np.outer(log_a, _SLOPES))
+    best = np.argmin(0.5 * np.log(variance) - np.outer(share @ log_a, _SLOPES), axis=1)
+    coefficients[:, 4] = np.sqrt(np.maximum(variance[np.arange(len(best)), best], 1e-12))
+    coefficients[:, 5] = _SLOPES[best]
+    return coefficients
 
 
 def _line(x: FloatArray, y: FloatArray, counts: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -344,19 +354,6 @@ def _line(x: FloatArray, y: FloatArray, counts: FloatArray) -> tuple[FloatArray,
     dx = x - x_mean[:, None]
     slope = np.sum(counts * dx * (y - y_mean[:, None]), axis=1) / np.sum(counts * dx**2, axis=1)
     return slope, y_mean - slope * x_mean
-
-
-def _with_scatter(coefficients: FloatArray, data: AxisRows, counts: FloatArray) -> FloatArray:
-    """(k, 6) coefficients with scatter s and slope g of ln d about them, by maximum likelihood on a grid of g."""
-    axis = data.calibration(np.zeros((1, 6)))
-    padded = np.pad(coefficients, ((0, 0), (0, 2)))[:, None, :]
-    error = log_error(axis.size_mm(data.sigma_mm, data.amplitude, draws=padded), data.d_mm)
-    log_a = np.log(data.amplitude / data.centre[0])
-    share = counts / counts.sum(axis=1, keepdims=True)
-    variance = (share * error**2) @ np.exp(2.0 * np.outer(log_a, _SLOPES))
-    best = np.argmin(0.5 * np.log(variance) - np.outer(share @ log_a, _SLOPES), axis=1)
-    s = np.sqrt(np.maximum(variance[np.arange(len(best)), best], 1e-12))
-    return np.column_stack([coefficients, s, _SLOPES[best]])
 
 
 # --- Cross-validation of a size calibration's form over the geometries of a study.

@@ -24,7 +24,7 @@ from typing import Final
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, replace
+from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.size.bodies import BodyCalibration
@@ -80,10 +80,6 @@ class Residuals(Record, eq=False):
     spread_variance: FloatArray  #: Variance of B and E, before the factor k^2.
     map_variance: FloatArray  #: Variance of the maps' own noise.
     common: FloatArray  #: s: loading of what the phantoms share.
-
-    def without(self, index: int) -> Residuals:
-        """All phantoms but one."""
-        return Residuals(*(np.delete(getattr(self, name), index) for name in self.__struct_fields__))
 
     @property
     def design(self) -> FloatArray:
@@ -245,7 +241,8 @@ def cautions_of(names: Sequence[str], data: Residuals, posterior: ShiftPosterior
             "check their sizes, depths, seats and stiffness"
         )
     for i, name in enumerate(names):  # those that lie far from what the others predict
-        others, x = shift_posterior(data.without(i)), data.design[i]
+        rest = Residuals(*(np.delete(getattr(data, column), i) for column in names_of(Residuals)))
+        others, x = shift_posterior(rest), data.design[i]
         variance = x @ others.covariance @ x + others.spread_square * data.spread_variance[i] + data.map_variance[i]
         score = float((data.residual[i] - x @ others.mean) / np.sqrt(variance))
         if abs(score) > APART:
