@@ -62,8 +62,7 @@ class ShapeDraws(Record, eq=False):
     """`presets.HEAD_PROFILE` of the map; None where it has none."""
     labels: Labels | None = None
     oblique: tuple[float, float] | None = None
-    irregular: bool = False
-    """`labels`, `oblique`, `irregular`: As of `BumpDraws`."""
+    irregular: bool = False  #: Like the two above as of `BumpDraws`.
 
     @property
     def replicates(self) -> Labels:

@@ -328,17 +328,17 @@ def _covariance(
     parts: Sequence[Weighted], fitted: Sequence[BodyCalibration], correlation: FloatArray, score: FloatArray
 ) -> FloatArray:
     """(n, v, v) covariance of ln d at the visits given each draw of the maps."""
-    site = fitted[0].site
+    terms, exams, widths = (
+        np.stack([getattr(one, name) for one in parts], axis=1) for name in ("terms", "variance", "log_width")
+    )
     bodies = np.stack(
         [at.body_sd(one.log_amplitude, one.log_width, score) for one, at in zip(parts, fitted, strict=True)], axis=1
     )
-    terms = np.stack([one.terms for one in parts], axis=1)
     covariance = bodies[:, :, None] * correlation * bodies[:, None, :]
     covariance = covariance + (terms @ fitted[0].coefficient_covariance) @ np.swapaxes(terms, 1, 2)
-    exams = np.stack([one.variance for one in parts], axis=1)
     covariance[:, range(len(parts)), range(len(parts))] += exams
-    if site is not None:
-        widths = np.stack([one.log_width for one in parts], axis=1) - site.centre
+    if (site := fitted[0].site) is not None:
+        widths = widths - site.centre
         about = np.stack([np.ones_like(widths), widths], axis=-1)
         covariance = covariance + (about @ site.covariance) @ np.swapaxes(about, 1, 2)
     return np.asarray(covariance)

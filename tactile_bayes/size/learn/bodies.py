@@ -54,9 +54,8 @@ def learn_population(
             regression.BodiesLeft(rows.of_bodies(eq6.data), rows.spread_terms(eq6.data), left, noise)
         )
         steps = np.eye(3)[:2] * _STEP  # along u and v
-        at = fitted.residual.at
-        slopes = [(at(rows.values + h) - at(rows.values - h)) / (2 * _STEP) for h in steps]
-        size, slope = size + at(rows.values), slope + np.stack(slopes)
+        slopes = [(fitted.at(rows.values + h) - fitted.at(rows.values - h)) / (2 * _STEP) for h in steps]
+        size, slope = size + fitted.at(rows.values), slope + np.stack(slopes)
         exam, noise = _exams(rows, eq6, size, slope)
         left, noise = left - fitted.predicted, noise + fitted.variance
     return _calibration(rows, eq6, fitted, exam, left=left, noise=noise, recipe=recipe, source=source)

@@ -287,6 +287,10 @@ class FittedResidual(Record, eq=False):
     predicted: FloatArray
     variance: FloatArray
 
+    def at(self, x: FloatArray) -> FloatArray:
+        """(n,) the residual at (n, 3) values."""
+        return np.asarray(self.kernel.functions(x) @ self.mean)
+
     @property
     def residual(self) -> Residual:
         """As part of a calibration."""
