@@ -215,15 +215,13 @@ LEAST_BUMPS = 256  #: Fewer have no basis that pays.
 MOST_PRODUCTS = 200  #: More cost as much as each bump by itself.
 
 
-class Spanned:
-    """Bumps along the grid's axes in a shared basis: sums of products of two profiles.
+class Spanned(Record, eq=False):
+    """Bumps along the grid's axes in a shared basis: sums of products of two profiles."""
 
-    The (m, r) coefficients have a row per bump; `products` are inner products of the r templates that span them, the
-    (r, r) `gram` those with each other.
-    """
-
-    def __init__(self, coefficients: FloatArray, products: Projected, gram: FloatArray, linear: LinearModel) -> None:
-        self._coefficients, self._products, self._gram, self._linear = coefficients, products, gram, linear
+    coefficients: FloatArray  #: (m, r) array: A row per bump.
+    products: Projected  #: Inner products of the r templates that span them.
+    gram: FloatArray  #: (r, r) array: Those with each other.
+    linear: LinearModel
 
     @classmethod
     def of(cls, bumps: Profiles, linear: LinearModel) -> Spanned | None:
@@ -244,15 +242,14 @@ class Spanned:
 
     def solution(self, fields: list[FieldColumns]) -> LinearSolution:
         """Solutions for the bumps under all noise fields."""
-        return joined([self._linear.solve([self._inner(columns)], None, columns) for columns in fields])
+        return joined([self.linear.solve([self._inner(columns)], None, columns) for columns in fields])
 
     def _inner(self, columns: FieldColumns) -> Inner:
         """Inner products under the noise fields of one length."""
-        basis = Inner.of(self._products, columns)
-        c = self._coefficients
+        basis, c = Inner.of(self.products, columns), self.coefficients
         m, (r, h, plain) = len(c), basis.plain.shape
         shared = (basis.low[:, None, :] * columns.weight.T) @ basis.low.T
-        power = self._gram - shared.transpose(1, 0, 2)
+        power = self.gram - shared.transpose(1, 0, 2)
         square = np.stack([np.einsum("mr,mr->m", c @ one, c) for one in power], axis=1)
         return Inner((c @ basis.plain.reshape(r, -1)).reshape(m, h, plain), square, np.empty((m, 0)))
 

@@ -68,7 +68,7 @@ def test_a_strong_maps_bumps_are_few(monkeypatch: pytest.MonkeyPatch) -> None:
 
     few = basis(NEAR, {})
     assert few is not None
-    assert 25 <= few._coefficients.shape[1] <= 90
+    assert 25 <= few.coefficients.shape[1] <= 90
     assert basis(1.5, {}) is None
     assert basis(NEAR, {"x": 1e4}) is None
     monkeypatch.setattr(collapsed, "MOST_PRODUCTS", 10)
