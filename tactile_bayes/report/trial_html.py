@@ -49,7 +49,7 @@ _PANEL_IN = 4.1
 _LEGEND: dict[str, Any] = {"frameon": True, "framealpha": 0.85}
 
 
-def sizes_figure(report: TrialReport, trial: Trial) -> bytes:
+def sizes_figure(report: TrialReport, trial: Trial) -> str:
     """Draw size against ex-vivo size, one panel per modality, as figure 10 of Wellman & Howe (1999).
 
     Error bars: +- 1 SD of the ex-vivo size where the table gives it, +- 1 SD of a mass's replicates. Dashed: identity;
@@ -63,7 +63,7 @@ def sizes_figure(report: TrialReport, trial: Trial) -> bytes:
     return _svg([partial(_draw_sizes, one, sds, slopes[one.name], reach) for one in modalities])
 
 
-def differences_figure(report: TrialReport, trial: Trial) -> bytes:
+def differences_figure(report: TrialReport, trial: Trial) -> str:
     """Draw Bland-Altman plots: difference from the ex-vivo size against the mean, with limits and intervals.
 
     All panels have the same axes, so that modalities can be compared by eye.
@@ -73,8 +73,8 @@ def differences_figure(report: TrialReport, trial: Trial) -> bytes:
     return _svg([partial(_draw_differences, one, methods[one.name]) for one in found], alike=True)
 
 
-def _svg(panels: Sequence[Callable[[Axes], None]], *, alike: bool = False) -> bytes:
-    """Draw panels side by side as SVG, independent of the user's matplotlib settings; `alike`: all with one range."""
+def _svg(panels: Sequence[Callable[[Axes], None]], *, alike: bool = False) -> str:
+    """Draw panels side by side, `alike` with one range, as SVG in base 64, whatever the user's matplotlib settings."""
     with plain_matplotlib() as library:
         figure = library.figure.Figure(figsize=(_PANEL_IN * len(panels), _PANEL_IN), layout="constrained")
         every = figure.subplots(1, len(panels), squeeze=False)[0]
@@ -86,7 +86,7 @@ def _svg(panels: Sequence[Callable[[Axes], None]], *, alike: bool = False) -> by
                 axes.set(xlim=(across[:, 0].min(), across[:, 1].max()), ylim=(up[:, 0].min(), up[:, 1].max()))
         buffer = io.BytesIO()
         figure.savefig(buffer, format="svg", metadata=FORMATS[".svg"])
-    return buffer.getvalue()
+    return base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
 def _spread(sizes: ModalitySizes) -> FloatArray:
@@ -213,10 +213,10 @@ def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence
         spelled=SPELLED,
         masses=_masses(trial),
         ratios=[ratio_line(name, one) for name, one in report.mape_ratio_to_tactile.items()],
-        sizes_svg=_base64(sizes_figure(report, trial)),
+        sizes_svg=sizes_figure(report, trial),
         error_ratio=f"{methods[0].error_ratio if methods else 1.0:g}",
         growing=growing_line(report),
-        differences_svg=_base64(differences_figure(report, trial)),
+        differences_svg=differences_figure(report, trial),
         replicates=[(name, one) for name, one in modalities if one.replicates.within_mass_log_sd is not None],
         calibrations=list(_calibrations(report, trial)),
         growth=growth,
@@ -259,7 +259,7 @@ def _calibrations(report: TrialReport, trial: Trial) -> Iterator[tuple[str, Cali
         found, prediction = one.calibration, prediction_of(trial, name)
         if found is not None and prediction is not None:
             panels = [partial(_draw_pit, found), partial(_draw_ecdf, found, prediction), partial(_draw_coverage, found)]
-            yield name, found, _base64(_svg(panels))
+            yield name, found, _svg(panels)
 
 
 def _cells(figures: Figures, wanted: Mapping[str, tuple[str, str]]) -> list[str]:
@@ -276,7 +276,3 @@ def _of_variances(report: ModalityReport) -> list[str]:
 
 def _middles(one: NextOfModality, names: Iterable[str]) -> list[str]:
     return [getattr(one, name).shown(".3g") for name in names]
-
-
-def _base64(png: bytes) -> str:
-    return base64.b64encode(png).decode("ascii")

@@ -369,7 +369,7 @@ class Sample(Record):
                 values = self.statistic.finish(sums.sum(axis=0) - sums)
             if np.all(np.abs(values) < LARGEST):
                 return values
-        return np.array([finite(self.statistic, sizes.without(one)) for one in patients.tolist()])
+        return np.array([finite(self.statistic, sizes.only(sizes.patient != one)) for one in patients])
 
     def _drawn_anew(self, sizes: ModalitySizes, patients: npt.NDArray[np.int64], draws: FloatArray) -> FloatArray:
         if isinstance(self.statistic, SumStatistic):

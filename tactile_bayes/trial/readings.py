@@ -112,10 +112,6 @@ class ModalitySizes(Record, eq=False):
         """Copy with only the masses that have two or more detected replicates."""
         return self.only(np.array([len(sizes) > 1 for sizes in self.replicates_mm], dtype=bool))
 
-    def without(self, patient: int) -> ModalitySizes:
-        """Copy without the masses of one patient."""
-        return self.only(self.patient != patient)
-
 
 _COLUMNS = (
     *("patient", "mass", "modality", "replicate", "status", "size_mm", "low_mm", "high_mm", "probability"),
