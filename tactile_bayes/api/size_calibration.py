@@ -20,7 +20,7 @@ from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.reading import open_input
 from tactile_bayes.files.size_json import SHIPPED, read_size_calibration, size_calibration_path, write_size_calibration
-from tactile_bayes.files.tables import Sheet, Table, read_table
+from tactile_bayes.files.tables import Sheet, Table, read_table, separator_in
 from tactile_bayes.forward.tissue import parse_seat
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.options import LearnOptions
@@ -187,7 +187,7 @@ def _header_of(source: Path | Sheet) -> list[str]:
             first = file.readline(4096).decode("utf-8-sig", errors="replace")
     else:
         first = source.text.partition("\n")[0]
-    return [name.strip() for name in next(csv.reader([first]), [])]
+    return [name.strip() for name in next(csv.reader([first], delimiter=separator_in(first)), [])]
 
 
 def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:

@@ -185,6 +185,15 @@ def test_tables_that_do_not_fit_are_refused_in_one_line(tmp_path: Path, change, 
     assert not (tmp_path / "out.json").exists()
 
 
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_a_spreadsheets_list_of_maps_is_known_as_one(tmp_path: Path, separator: str) -> None:
+    """By commas alone its header was one name, and the map files "not known here"."""
+    (tmp_path / "maps.csv").write_text(f"file{separator}d_mm\nnone.nc{separator}19,9\n", encoding="utf-8-sig")
+    done = run_here("calibrate", "size", "maps.csv", "--correct", "solid", "-o", "s.json", cwd=tmp_path)
+    assert done.returncode == 3
+    assert "none.nc: cannot be read (No such file or directory)" in done.stderr
+
+
 @pytest.mark.long
 def test_what_cannot_be_corrected_is_refused(folder: Path) -> None:
     words = ("calibrate", "size", "phantoms.csv", "-o", "never.json", "--correct")
