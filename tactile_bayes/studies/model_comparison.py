@@ -420,11 +420,11 @@ def _model_map(measured: MeasuredScan, pressure_kpa: FloatArray) -> TactileMap:
     scan = replace(measured.scan, frames=PressureFrames(measured.scan.frames.time_s, counts), element_calibration=gains)
     recipe = measured.tactile_map.recipe
     low, high = recipe.pressure_window_kpa or presets.PRESSURE_WINDOW_KPA
-    # The model's level is the measured one's to rounding: no frame may fall out at the window's ends.
+    # No frame may fall out at the window's ends: Eqs 1 to 4 keep the mean that they are given to a fifth only.
     return build_map(
         scan,
         cell_mm=recipe.cell_mm,
-        pressure_window_kpa=(0.99 * low, 1.01 * high),
+        pressure_window_kpa=(0.5 * low, 2.0 * high),
         latency_ms=recipe.latency_ms,
         normalise="mean",
         as_stated=True,
