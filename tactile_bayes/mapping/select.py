@@ -50,18 +50,6 @@ class TaxelFault(NamedTuple):
         return f"row {self.row} column {self.column} {self.fault}"
 
 
-class _Levels(NamedTuple):
-    """Statistics of each taxel's counts over a scan; (rows, columns) arrays."""
-
-    lowest: NDArray[np.uint16]
-    highest: NDArray[np.uint16]
-    mean_kpa: FloatArray
-    flicker_kpa: FloatArray
-    still_share: FloatArray
-    lost_share: FloatArray
-    saturated_share: FloatArray
-
-
 def find_faults(scan: Scan) -> tuple[TaxelFault, ...]:
     """Find the taxels to leave out of every frame of `scan`, in row order.
 
@@ -77,36 +65,36 @@ def find_faults(scan: Scan) -> tuple[TaxelFault, ...]:
     """
     if not len(scan.frames):
         return ()
-    levels = _element_levels(scan)
-    faults = _classify(scan, levels)
+    faults = _classify(scan)
     return tuple(
         TaxelFault(int(row), int(column), str(faults[row, column])) for row, column in np.argwhere(faults != "")
     )
 
 
-def _classify(scan: Scan, levels: _Levels) -> NDArray[np.str_]:
+def _classify(scan: Scan) -> NDArray[np.str_]:
     """(rows, columns) fault of each taxel, "" for a good one."""
-    mean = levels.mean_kpa
+    mean, flicker, still, lost, saturated = _element_levels(scan)
+    lowest, highest = scan.frames.counts.min(axis=0), scan.frames.counts.max(axis=0)
     usual = float(np.median(mean))
     of_row, of_column = np.median(mean, axis=1)[:, None], np.median(mean, axis=0)[None, :]
     low, high = np.minimum(of_row, of_column), np.maximum(of_row, of_column)
-    constant = (levels.highest == levels.lowest) & (len(scan.frames) >= MIN_FRAMES)
-    moving = bool(np.median(levels.highest - levels.lowest) > 0)
-    empty = constant & ((levels.highest == 0) | (mean <= DEAD_SHARE * usual))
+    constant = (highest == lowest) & (len(scan.frames) >= MIN_FRAMES)
+    moving = bool(np.median(highest - lowest) > 0)
+    empty = constant & ((highest == 0) | (mean <= DEAD_SHARE * usual))
     weak = (mean < DEAD_SHARE * low) & (low > CONTACT_KPA)
-    flicker = (levels.flicker_kpa > FLICKER_RATIO * np.median(levels.flicker_kpa)) & (levels.flicker_kpa > FLICKER_KPA)
+    flickers = (flicker > FLICKER_RATIO * np.median(flicker)) & (flicker > FLICKER_KPA)
     faults = np.full(mean.shape, "", dtype="<U9")
-    faults[((mean > HOT_RATIO * high) & (mean > usual + CONTACT_KPA)) | flicker] = "hot"
-    sticks = (levels.still_share > STILL_SHARE) | (levels.lost_share > LOST_SHARE)
-    sticks &= bool(np.median(levels.still_share) < STILL_SHARE / 2)
+    faults[((mean > HOT_RATIO * high) & (mean > usual + CONTACT_KPA)) | flickers] = "hot"
+    sticks = (still > STILL_SHARE) | (lost > LOST_SHARE)
+    sticks &= bool(np.median(still) < STILL_SHARE / 2)
     faults[(constant & moving) | (sticks & (len(scan.frames) >= MIN_FRAMES))] = "stuck"
-    faults[levels.saturated_share > SATURATED_SHARE] = "saturated"
+    faults[saturated > SATURATED_SHARE] = "saturated"
     faults[(scan.element_calibration.gain_kpa_per_count == 0) | empty | weak] = "dead"
     return faults
 
 
-def _element_levels(scan: Scan) -> _Levels:
-    """Compute the statistics in one pass over the counts."""
+def _element_levels(scan: Scan) -> tuple[FloatArray, ...]:
+    """Each taxel's mean and flicker in kPa, and shares of frames: still, lost and saturated; in one pass."""
     counts, calibration = scan.frames.counts, scan.element_calibration
     total = np.zeros(counts.shape[1:])
     steps, still = np.zeros(counts.shape[1:]), np.zeros(counts.shape[1:])
@@ -128,9 +116,7 @@ def _element_levels(scan: Scan) -> _Levels:
         saturated += (chunk >= calibration.saturation_count).sum(axis=0)
         last = chunk[-1:]
     n = len(counts)
-    return _Levels(
-        counts.min(axis=0),
-        highest,
+    return (
         calibration.linear_kpa(total / n),
         calibration.gain_kpa_per_count * (steps / max(n - 1, 1)),
         (still - 1) / max(n - 1, 1),  # the first frame was compared with itself
