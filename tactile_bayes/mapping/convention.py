@@ -92,7 +92,7 @@ class CoarseFrames(Record, eq=False):
 
         Both are projections and commute: together they take off the least-squares fit of the two.
         """
-        return self.within_frames(values - np.full(len(values), 1 / len(values)) @ values)
+        return self.within_frames(values - values.mean(axis=0))
 
     def within_frames(self, values: FloatArray) -> FloatArray:
         """(m, k) values without their level, slopes and curvatures in each frame."""
