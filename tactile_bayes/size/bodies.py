@@ -50,7 +50,9 @@ SUPPOSED: Final[Mapping[str, tuple[str, float]]] = {
 }
 """A property and its value by name: lumps of 8 to 15 and 50 to 100 times the stiffness of fat, centred on the gland's
 surface and resting on it."""
-BEYOND: Final = 2.0  #: A known value so many times outside the calibration's bodies is refused: they say nothing of it.
+BEYOND: Final = 2.0
+"""A known value so many times outside the calibration's bodies is refused, for they say nothing of it; but a lump may
+be of any stiffness above theirs, which is nearly rigid already."""
 LIKELY_SDS: Final = 2.5  #: A value farther than this from what the map leads one to expect is not supposed.
 _STEP = 1e-4
 
@@ -353,7 +355,8 @@ def known_body(
         columns = ("d_mm", "depth_ratio") if name == "depth_mm" else (name,)
         if all(one in calibration.bodies for one in columns):
             low, high = np.prod([calibration.bodies[one] for one in columns], axis=0).tolist()
-            check_number(f"known {name}", value, low / BEYOND, high * BEYOND)
+            most = None if hidden is not None and name in hidden.inverted else high * BEYOND
+            check_number(f"known {name}", value, low / BEYOND, most)
     assert hidden is not None
     expected = hidden.expected_body(known, calibration.features(log_amplitude, log_width))
     explained_sd = np.minimum(own_sd, hidden.most_sd)
