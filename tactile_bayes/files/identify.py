@@ -201,8 +201,8 @@ def _table(path: Path, head: bytes) -> dict[str, Any]:
 
 def _foreign(path: Path) -> BadDataError:
     return BadDataError(
-        "is none of this program's files",
-        way_out="bring arrays, grids and images in with `tactile-bayes import`",
+        "is empty" if not path.stat().st_size else "is no scan, map, table or report that `show` can describe",
+        way_out="bring arrays, grids and images in with `tactile-bayes import`; settings and scenes are plain text",
         path=str(path),
     )
 
