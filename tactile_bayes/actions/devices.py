@@ -142,7 +142,7 @@ def replay_action(*, scan: Path, output: Path | None, speed: float, **given: Any
     """Replay a scan through emulated devices, recorder and live view, as if it were being recorded."""
     found = read_scan(scan)
     with tempfile.TemporaryDirectory() as folder, _emulated(scan, speed, poses=bool(len(found.poses))) as urls:
-        options = {"like": scan, "clock": "shared", "at_once": True, **given}
+        options = {"like": scan, "clock": "shared", "at_once": True, "replayed": dict(found.session), **given}
         options |= {f"{role}_url": url for role, url in urls.items()} | {"tracker_protocol": "open"}
         if found.landmarks is not None:
             options["landmarks"] = scan

@@ -22,7 +22,7 @@ import numpy as np
 from tactile_bayes.actions.live_view import KEYS, can_redraw, live_view
 from tactile_bayes.api.arguments import PathLike, path_of, plain, takes
 from tactile_bayes.commands.options import also_read
-from tactile_bayes.declarations import as_dict
+from tactile_bayes.declarations import as_dict, field
 from tactile_bayes.errors import EXIT_DONE, EXIT_INTERRUPTED, DeviceError, UsageError, check_number
 from tactile_bayes.files.atomic import refuse_existing, unwritable
 from tactile_bayes.files.documents import check_session, read_session
@@ -45,6 +45,8 @@ from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks
 class Request(RecordOptions, kw_only=True):
     """Options of one recording, and what of them its file stores."""
 
+    replayed: dict[str, str] = field(default_factory=dict)  #: Session of the scan that is replayed: it stays as it is.
+
     def facts(self) -> dict[str, str]:
         """Session facts as text: from the file, overridden by options."""
         facts = read_session(self.session_file) if self.session_file else {}
@@ -59,7 +61,7 @@ class Request(RecordOptions, kw_only=True):
         devices = {"source": "recorded", "head_id": hello.device_id[:64], "tracker_id": tracker, "clock": self.clock}
         tools = {"tool": follower.tool, "reference": follower.reference}
         devices |= {name: value for name, value in tools.items() if value}
-        return devices | ({"rotation": "inverted"} if self.invert_rotation else {}) | facts
+        return devices | ({"rotation": "inverted"} if self.invert_rotation else {}) | facts | self.replayed
 
     def settings(self, hello: HelloReading) -> dict[str, Any]:
         """Settings for the provenance."""

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from emulated_devices import serving, short_scan, wait_for_bytes
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
@@ -104,7 +105,7 @@ def test_a_pivot_is_measured_on_the_tracker_itself(run_cli):
 
 @pytest.mark.long
 def test_a_replay_goes_the_way_of_a_recording(run_cli, tmp_path):
-    scan = short_scan(0.5)
+    scan = replace(short_scan(0.5), session={"source": "simulated", "side": "left", "subject": "P7"})
     write_scan(tmp_path / "a.mcap", scan, provenance=Provenance("test", {}))
     done = run_cli("replay", "a.mcap", "-o", "b.mcap", "--speed", 2, "--live", cwd=tmp_path, env={"TERM": "dumb"})
     assert done.returncode == 0, done.stderr
@@ -113,6 +114,7 @@ def test_a_replay_goes_the_way_of_a_recording(run_cli, tmp_path):
     again = read_scan(tmp_path / "b.mcap")
     np.testing.assert_array_equal(again.frames.counts, scan.frames.counts)
     np.testing.assert_array_equal(again.poses.position_mm, scan.poses.position_mm)
+    assert dict(again.session) | dict(scan.session) == dict(again.session)  # a simulated scan is none of a person
     shown = run_cli("show", "b.mcap", cwd=tmp_path)
     assert "frames_missing  0" in shown.stdout
     assert "the head stopped" in shown.stdout
