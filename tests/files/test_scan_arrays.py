@@ -386,7 +386,7 @@ def test_a_mat_is_read_as_scipy_reads_it(tmp_path: Path, packed: bool) -> None:
     }
     scipy.io.savemat(tmp_path / "a.mat", {**held, "exam": inner, **odd}, do_compression=packed)
     found = read_named(tmp_path / "a.mat", list)
-    by_scipy = scipy.io.loadmat(tmp_path / "a.mat")
+    by_scipy = scipy.io.loadmat(tmp_path / "a.mat", spmatrix=False)
     for name in held:
         np.testing.assert_array_equal(found[name], by_scipy[name])
     np.testing.assert_array_equal(found["exam.x"], np.eye(3))

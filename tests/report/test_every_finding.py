@@ -275,7 +275,7 @@ PRINTERS = {
     # of draws, not of a size; names of files that were written
     "actions/pages", "actions/show", "actions/campaign", "actions/live_view", "actions/record",
     # of trials, calibrations, devices and studies
-    "actions/calibrate", "actions/devices", "api/diagnosing", "api/trials",
+    "actions/calibrate", "actions/devices", "api/diagnosing", "api/repeatability", "api/trials",
     "campaigns/campaign", "actions/bring_in", "actions/exam",
     "actions/simulation", "actions/study",
     "actions/tradeoff", "files/size_json", "presets", "report/calibration",
