@@ -20,7 +20,7 @@ from math import lgamma, log, pi
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, names_of
+from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import FitCells, cell_mean_gaussian, covariance_from_log_widths
@@ -538,7 +538,7 @@ class LinearModel:
 
 def joined(solutions: list[LinearSolution]) -> LinearSolution:
     """Concatenate the fields of several lengths."""
-    each = ([getattr(one, name) for one in solutions] for name in names_of(LinearSolution))
+    each = ([getattr(one, name) for one in solutions] for name in LinearSolution.__struct_fields__)
     return LinearSolution(*(np.concatenate(parts, axis=1) for parts in each))
 
 
