@@ -78,17 +78,24 @@ def _source_of(error: BadDataError, sources: Sequence[Source]) -> str:
     return next((one.path for one in reversed(sources) if one.path and same & set(one.arrays)), sources[0].path)
 
 
-def _over(given: Stated, said: Stated) -> tuple[Stated, list[str]]:
-    """What is stated by the caller, and otherwise by a file, and a line for each thing that they say otherwise."""
-    ours = {name: value for name in names_of(Stated) if (value := getattr(given, name)) is not None}
-    told = [
-        f"{name.replace('_', '-')} {value} as stated, where the file says {theirs}"
-        for name, value in ours.items()
-        if (theirs := getattr(said, name)) not in (None, value)
-    ]
+def _stated_in(one: Stated) -> dict[str, Any]:
+    return {name: value for name in names_of(Stated) if (value := getattr(one, name)) is not None}
+
+
+def _over(given: Stated, said: Stated) -> Stated:
+    """What is stated by the caller, and otherwise by a file."""
     if given.unit not in (None, said.unit):
         said = replace(said, saturation=None)  # in the file's unit
-    return replace(said, **ours), told
+    return replace(said, **_stated_in(given))
+
+
+def _overridden(given: Stated, said: Stated) -> list[str]:
+    """A line for each thing that the caller states and a file says otherwise."""
+    return [
+        f"{name.replace('_', '-')} {ours} as stated, where the file says {theirs}"
+        for name, ours in _stated_in(given).items()
+        if (theirs := getattr(said, name)) not in (None, ours)
+    ]
 
 
 def _read(path: Path, given: ArrayMap, beside: Sequence[Source]) -> Source:
@@ -181,9 +188,10 @@ def combined(sources: Sequence[Source], given: Stated) -> Imported:
     held: Arrays = {}
     checked_on = ""
     for source in sources:
-        checked_on = source.checked_on or checked_on
-        told += [*_over(given, source.stated)[1], *source.notes]
-        stated, _ = _over(stated, source.stated)
+        if "head_surface_mm" in source.arrays:
+            checked_on = source.checked_on
+        told += [*_overridden(given, source.stated), *source.notes]
+        stated = _over(stated, source.stated)
         held |= {name: np.asarray(one) for name, one in source.arrays.items()}
     _leave_out_gaps(held, stated, told)
     _check_numbers(held)

@@ -23,10 +23,11 @@ from in_process import run_here
 from scipy.spatial.transform import Rotation
 
 import tactile_bayes as tb
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.arrays_layout import ArrayMap
 from tactile_bayes.files.documents import parse_toml
-from tactile_bayes.files.imports import import_arrays, of_poses, read_arrays
+from tactile_bayes.files.imports import import_arrays, of_head, of_poses, read_arrays
 from tactile_bayes.files.named_arrays import array_template, read_named
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.forward.scene import Scene
@@ -109,6 +110,14 @@ def test_every_container_gives_the_same_scan(good: Arrays, scan: Scan, tmp_path:
     path = tmp_path / f"exam{suffix}"
     CONTAINERS[suffix](path, good)
     same(read_arrays(path), scan)
+
+
+def test_the_day_of_a_check_is_that_of_the_head_that_stands(good: Arrays, scan: Scan, tmp_path: Path) -> None:
+    as_npz(tmp_path / "exam.npz", good)
+    checked = replace(scan.head, checked_on="2026-03-01")
+    for last in (checked, scan.head):
+        heads = [of_head(checked), of_head(last)]
+        assert import_arrays(tmp_path / "exam.npz", ArrayMap(), heads).scan.head.checked_on == last.checked_on
 
 
 def test_fields_of_a_structure_and_members_of_a_group_are_named(good: Arrays, scan: Scan, tmp_path: Path) -> None:
