@@ -12,6 +12,7 @@ A breast in which nothing stands out looks alike in all of them: then nothing is
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
 from itertools import product
 from math import exp, log
 from typing import Any, Final
@@ -315,12 +316,12 @@ def check_arrangement(selection: SelectedFrames, *, latency_ms: float = 0.0, tho
     overlap = _Overlap.of(selection, latency_ms)
     if overlap is None:
         return _TOO_SHORT
-    # all corrections, the fewest first; of a lever arm that is none, none of the lever arm
+    # what to try, the fewest corrections first; of a lever arm that is none, none of the lever arm
     lever = _LEVER[:1] if np.allclose(selection.scan.head.scanhead_from_tracker, np.eye(4)) else _LEVER
     every: list[Corrections] = [sum(parts, ()) for parts in product(_ARRAY, _FRAMES, lever, _ROTATIONS)]
-    first, *others = sorted((one for one in every if len(one) <= MOST_CHANGES), key=len)
+    others = sorted((one for one in every if 0 < len(one) <= MOST_CHANGES), key=len)
     single = [one for one in others if len(one) == 1]
-    stated = overlap.judged(first)
+    stated = overlap.still[0]
     if _lasting(overlap.varying[0]) < LEAST_LASTING:
         return ArrangementCheck(stated, stated, 0.0, {one[0]: 0.0 for one in single})
     tried = [stated, *map(overlap.judged, single), *(overlap.late(sign * ms) for ms in CLOCK_MS for sign in (1, -1))]
@@ -398,7 +399,7 @@ def _moves(course: FloatArray, cells: Cells, values: FloatArray, error: FloatArr
     return float(error @ (design @ moves)), moves.reshape(-1, 2)
 
 
-class _Overlap(Record, eq=False):
+class _Overlap(Record, eq=False, dict=True):
     """Averaged frames of a scan, as they are and with the array transposed, and what is needed to place them."""
 
     scan: Scan  #: With distinct poses.
@@ -436,6 +437,11 @@ class _Overlap(Record, eq=False):
         """What is stated, with poses that are later by so much."""
         return replace(replace(self, latency_ms=self.latency_ms + late_ms, paths={}).judged(()), late_ms=late_ms)
 
+    @cached_property
+    def still(self) -> tuple[Arrangement, Cells, FloatArray, FloatArray]:
+        """What is stated, of a body that lies still, as `_fitted` has it."""
+        return self._fitted(())
+
     def judged(self, corrections: Corrections) -> Arrangement:
         """Predict each averaged reading by those of other times in its cell of the plane."""
         return self._fitted(corrections)[0]
@@ -446,7 +452,7 @@ class _Overlap(Record, eq=False):
         None where the first step takes off little.
         """
         time_s = block_means(self.scan.frames.time_s[self.frames, None], self.coarse[0].first)
-        still = self._fitted(())[1:]
+        still = self.still[1:]
         waves = {rate: np.hstack([np.cos(turn := 2 * np.pi * rate * time_s), np.sin(turn)]) for rate in _SWAYS_HZ}
         gains = {rate: _moves(wave, *still)[0] for rate, wave in waves.items()}
         if max(gains.values()) < _LEAST_SWAY_START * float(still[-1] @ still[-1]):
@@ -465,7 +471,7 @@ class _Overlap(Record, eq=False):
         """
         path = self._places_mm(())[0].mean(axis=1)
         strokes = (path - path.mean(axis=0)) @ principal_axes(path)[:, [-1]]
-        return self._moving(strokes, self._fitted(())[1:])[0]
+        return self._moving(strokes, self.still[1:])[0]
 
     def _moving(
         self, course: FloatArray, still: tuple[Cells, FloatArray, FloatArray]
