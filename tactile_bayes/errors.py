@@ -158,14 +158,16 @@ class DeviceError(TactileBayesError):
 class NotConvergedError(TactileBayesError):
     """A sampler or solver stopped before its own criteria were met.
 
-    The message says what was not reached and how much longer to run; `diagnostics` are the figures at that time.
+    The message says what was not reached and how much longer to run; `diagnostics` are the figures at that time, and
+    `advice` is the remedy where running longer is none.
     """
 
     exit_code = EXIT_NOT_CONVERGED
 
-    def __init__(self, message: str, *, diagnostics: dict[str, float] | None = None) -> None:
+    def __init__(self, message: str, *, diagnostics: dict[str, float] | None = None, advice: str = "") -> None:
         super().__init__(message)
         self.diagnostics = diagnostics or {}
+        self.advice = advice
 
 
 def one_line(error: BaseException) -> str:

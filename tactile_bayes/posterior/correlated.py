@@ -181,7 +181,7 @@ class Correlated(Record, eq=False):
         assert choice is not None
         wanted = neighbours.WANTED.get(asked, "")
         if wanted and choice.fit.scene.extra != wanted:
-            raise NotConvergedError(f"no {wanted} found beside the bump; leave out --scene {asked}")
+            raise NotConvergedError(f"no {wanted} found beside the bump", advice=f"leave out --scene {asked}")
         fit, target = choice.fit, choice.fit.target
         solved = Solved(target.conditional)
         draws, passed_over = draw_parameters(fit, options, rng=rng, progress=progress, solved=solved)

@@ -254,6 +254,7 @@ def draw_with_size(work: Work, seen: Assessment) -> SizedDraws:
 # --- The answer for one map: a size, widths, or the reason for neither.
 
 MOST_INVALID = 0.05
+LONGER = "give --method ensemble, with a larger max_steps in --settings FILE.toml"
 OTHER_METHOD_ON_PAPER = "have the size estimated again by the slower method"
 OTHER_HEAD = (
     "learn one for this head: `tactile-bayes population --head HEAD.json -o population.csv`, then `tactile-bayes "
@@ -341,10 +342,11 @@ def _measured(work: Work, seen: Assessment, candidates: tuple[Candidate, ...]) -
     try:
         sized = draw_until_accurate(work, seen)
     except NotConvergedError as error:
-        if options.method == "ensemble" or not options.correlated:
+        why = Abstention("method", f"no method converged: {error}", LONGER, OTHER_METHOD_ON_PAPER)
+        if error.advice:
+            why = Abstention("method", str(error), error.advice, "have the size estimated again without this neighbour")
+        elif options.method == "ensemble" or not options.correlated:
             raise
-        advice = "give --method ensemble, with a larger max_steps in --settings FILE.toml"
-        why = Abstention("method", f"no method converged: {error}", advice, OTHER_METHOD_ON_PAPER)
         return _none(why, candidates, detection, bump)
     made, size, calibration, fault = sized.made, sized.size, sized.calibration, sized.fault
     detection, posterior, diagnostics = made.detection, made.posterior, _diagnostics(sized)

@@ -332,6 +332,15 @@ def test_the_scene_is_told_and_can_be_given(folder: Path) -> None:
     assert none.stdout.startswith("No estimate: no lump was assumed")
 
 
+@pytest.mark.parametrize("method", ["importance", "ensemble"])
+def test_a_neighbour_asked_for_that_is_not_there_is_the_reason(folder: Path, method: str) -> None:
+    asked = field(folder, "--scene", "rib", "--method", method)
+    assert asked.returncode == 6
+    assert asked.stdout.startswith(
+        "No estimate: no rib found beside the bump.\nWhat would help: leave out --scene rib.\n"
+    )
+
+
 @pytest.mark.long
 def test_priors_come_from_a_file_and_are_printed(folder: Path) -> None:
     assert "log-normal about 3.5 mm" in field(folder, "-v", width_median_mm=3.5).stdout
