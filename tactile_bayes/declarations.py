@@ -220,20 +220,23 @@ def check(record: Record, where: str = "") -> None:
 
 def to_plain(record: object, *, digits: int = 9) -> Any:
     """Plain data of a record for JSON: arrays as nested lists, floats with this many significant digits."""
-    return _rounded(msgspec.to_builtins(record, enc_hook=_lists, str_keys=True), digits)
+    return rounded(msgspec.to_builtins(record, enc_hook=_lists, str_keys=True), digits, lists=True)
 
 
-def rounded(value: T, digits: int = 9) -> T:
-    """A record, or plain data, whose floats have so many significant digits, as files have them."""
+def rounded(value: T, digits: int = 9, *, lists: bool = False) -> T:
+    """A record, or plain data, whose floats have so many significant digits, as files have them.
+
+    With `lists` every tuple is a list, as in JSON.
+    """
     found: Any = value
     if isinstance(value, msgspec.Struct):
         found = type(value)(**{name: rounded(getattr(value, name), digits) for name in value.__struct_fields__})
     elif isinstance(value, float):
         found = float(f"{value:.{digits}g}")
     elif isinstance(value, dict):
-        found = {key: rounded(one, digits) for key, one in value.items()}
+        found = {key: rounded(one, digits, lists=lists) for key, one in value.items()}
     elif isinstance(value, list | tuple):
-        found = type(value)(rounded(one, digits) for one in value)
+        found = (list if lists else type(value))(rounded(one, digits, lists=lists) for one in value)
     return cast("T", found)
 
 
@@ -324,14 +327,6 @@ def _lists(value: object) -> object:
     if hasattr(value, "tolist"):
         return value.tolist()
     raise NotImplementedError(f"no way to write a {type(value)}")
-
-
-def _rounded(value: Any, digits: int) -> Any:
-    if isinstance(value, float):
-        return float(f"{value:.{digits}g}")
-    if isinstance(value, dict):
-        return {key: _rounded(one, digits) for key, one in value.items()}
-    return [_rounded(one, digits) for one in value] if isinstance(value, list | tuple) else value
 
 
 # Schemas
@@ -530,7 +525,7 @@ def _in_words(kind: Any) -> str:
     if origin is Literal:
         return repr(args[0]) if len(args) == 1 else f"one of {', '.join(map(str, args))}"
     if origin in (int, float):
-        return _numbers(rules, whole=origin is int)
+        return number_words(*range_of(kind), whole=origin is int)
     if origin is str:
         return _texts(rules)
     if origin is tuple and args[-1] is not Ellipsis:
@@ -540,16 +535,6 @@ def _in_words(kind: Any) -> str:
         told = "" if least is None else f" of {least} or more" if most is None else f" of {least} to {most}"
         return f"a list{told or ('' if most is None else f' of at most {most}')}"
     return "a table of keys" if _is_record(bare) else _KINDS.get(origin, "a list of numbers")
-
-
-def _numbers(rules: Mapping[str, Any], *, whole: bool) -> str:
-    if "gt" in rules and "le" in rules:
-        return f"{number_words(rules['gt'], None, whole=whole, open_ends=True)} up to {rules['le']:g}"
-    if "ge" in rules and "lt" in rules:
-        return f"{number_words(rules['ge'], None, whole=whole).removesuffix(' on')} to below {rules['lt']:g}"
-    open_ends = "gt" in rules or "lt" in rules
-    least, most = rules.get("gt", rules.get("ge")), rules.get("lt", rules.get("le"))
-    return number_words(least, most, whole=whole, open_ends=open_ends)
 
 
 def _texts(rules: Mapping[str, Any]) -> str:

@@ -73,15 +73,20 @@ def check_number(
         if inside and not (open_ends and number in (least, most)) and math.isfinite(number):
             return
     shown = f"{value:g}" if isinstance(value, float) else _shortened(repr(value))
-    raise UsageError(f"{name} is {shown}; give {number_words(least, most, whole=whole, open_ends=open_ends)}")
+    raise UsageError(f"{name} is {shown}; give {number_words(least, most, _ENDS if open_ends else (), whole=whole)}")
 
 
-def number_words(least: float | None, most: float | None, *, whole: bool = False, open_ends: bool = False) -> str:
-    """The numbers that can be given, in words: ``a number above 0 and below 1``."""
-    told = "" if least is None else f" above {least:g}" if open_ends else f" from {least:g}"
+_ENDS = ("min", "max")
+
+
+def number_words(least: float | None, most: float | None, open_ends: Collection[str], *, whole: bool = False) -> str:
+    """The numbers that can be given, in words: ``a number above 0 and below 1``; `open_ends` are of "min" and "max"."""
+    above, below = (end in open_ends for end in _ENDS)
+    told = "" if least is None else f" above {least:g}" if above else f" from {least:g}"
     if most is not None:
-        told += f"{' and' if told else ''} below {most:g}" if open_ends else f"{' to' if told else ' up to'} {most:g}"
-    elif told and not open_ends:
+        joint = "" if least is None else " and" if above else " to"
+        told += f"{joint} below {most:g}" if below else f"{' to' if told and not above else ' up to'} {most:g}"
+    elif told and not above:
         told += " on"
     return f"a {'whole ' if whole else ''}number{told}"
 

@@ -182,7 +182,7 @@ class FiniteRange(click.FloatRange):
             part = float(text.removesuffix("%").strip()) / 100
             if self.max is not None and self.max <= 1 and self.min is not None and self.min <= part <= self.max:
                 share = f"; for {text.removesuffix('%').strip()} % give {part:g}"
-        words = number_words(self.min, self.max, open_ends=self.min_open or self.max_open)
+        words = number_words(self.min, self.max, ("min", "max") if self.min_open or self.max_open else ())
         return self.fail(f"{text!r} is not {words}{share}", param, ctx)
 
     def _describe_range(self) -> str:
