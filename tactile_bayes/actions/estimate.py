@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from tactile_bayes.api.estimating import answer_file, estimate_file
-from tactile_bayes.api.pooled import elsewhere, pool_answers
+from tactile_bayes.api.pooled import pool_answers
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
 from tactile_bayes.api.sized import Answer, Failure
 from tactile_bayes.batch import BatchInterrupted, Outcome, fault_lines, open_executor, run_batch
@@ -24,7 +24,7 @@ from tactile_bayes.files.reports import json_text
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_figures import draw_size
 from tactile_bayes.report.figure_file import named_exam
-from tactile_bayes.report.pooled import pooled_summary, pooled_text
+from tactile_bayes.report.pooled import elsewhere, pooled_summary, pooled_text
 from tactile_bayes.shell import progress_bar
 
 Answers = Sequence[Answer | Failure]

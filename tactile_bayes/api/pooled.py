@@ -17,16 +17,15 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError
 from tactile_bayes.files.map_nc import write_posterior
 from tactile_bayes.files.provenance import Provenance, scans_of
-from tactile_bayes.files.reports import EstimateReport, MassReport, PooledReport
+from tactile_bayes.files.reports import EstimateReport, PooledReport
 from tactile_bayes.files.size_json import default_for, read_size_calibration, size_calibration_path
 from tactile_bayes.findings import Finding
 from tactile_bayes.options import PRIORS
 from tactile_bayes.posterior.estimate import way_to_head
-from tactile_bayes.presets import MATCH_MM
 from tactile_bayes.report.estimate_document import side_of
 from tactile_bayes.report.estimate_figures import draw_size
 from tactile_bayes.report.exam_words import Exam
-from tactile_bayes.report.pooled import pooled_report
+from tactile_bayes.report.pooled import elsewhere, pooled_report
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import LEAST_PROBABILITY
 from tactile_bayes.size.pooling import DISAGREE, PooledEstimate, pool_maps
@@ -36,12 +35,7 @@ from tactile_bayes.size.visits import one_place_probability
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# --- Which mass of each map is the one that is pooled: by its place in the patient.
-#
-# A report is about the surest mass of its map, so of two maps of one breast each may report another one. With
-# landmarks the masses of all maps have places in patient axes, and the one that most maps show is pooled.
-
-MapPlace = tuple[float, float]
+# --- The maps of one mass, estimated again where they report another one.
 
 
 def one_mass(found: Sequence[SizeEstimate]) -> tuple[SizeEstimate, ...]:
@@ -59,67 +53,6 @@ def pool_estimates(
     """One size from the estimates of several maps, made again where they are of another mass; see `pool_answers`."""
     same = one_mass(found)
     return replace(pool_answers([one.answer for one in same], settings, names=names, inputs=inputs), maps=same)
-
-
-def elsewhere(reports: Sequence[EstimateReport]) -> dict[int, MapPlace]:
-    """Maps that report another mass than the common one, with the place of that one on each, mm.
-
-    Empty where a map with a lump has no landmarks, or no two maps show a mass at one place.
-    """
-    maps = _masses(reports)
-    common = _common(maps)
-    there = {} if common is None else {i: _nearest(masses, common) for i, masses in maps.items()}
-    return {i: one.centre_mm.median for i, one in there.items() if one is not None and not one.reported}
-
-
-def apart_from_others(reports: Sequence[EstimateReport]) -> dict[int, str]:
-    """Maps whose reported mass lies elsewhere than the common one, in words; empty without landmarks."""
-    reported = {i: [one for one in masses if one.reported] for i, masses in _masses(reports).items()}
-    found = [one for masses in reported.values() for one in masses]
-    common = _common(reported) or max(found, key=_amplitude, default=None)
-    away = {i: _away_mm(one, common) for i, masses in reported.items() for one in masses if common is not None}
-    words = "its mass lies {:.0f} mm from that of the other maps and may be another one"
-    return {i: words.format(mm) for i, mm in away.items() if mm > MATCH_MM}
-
-
-def one_place(reports: Sequence[EstimateReport]) -> bool | None:
-    """Whether the reported masses of all maps lie at one place; None where that cannot be told."""
-    return None if len(_masses(reports)) < 2 else not apart_from_others(reports)
-
-
-def _masses(reports: Sequence[EstimateReport]) -> dict[int, tuple[MassReport, ...]]:
-    """Masses of the maps with a lump, by the map's place in the list; none where one has no place in the patient."""
-    found = {i: one.masses for i, one in enumerate(reports) if one.masses}
-    return {} if any(one.centre_patient_mm is None for masses in found.values() for one in masses) else found
-
-
-def _away_mm(one: MassReport, other: MassReport) -> float:
-    assert one.centre_patient_mm is not None  # see `_masses`
-    assert other.centre_patient_mm is not None
-    return float(np.hypot(*np.subtract(one.centre_patient_mm.median, other.centre_patient_mm.median)))
-
-
-def _amplitude(mass: MassReport) -> float:
-    return 0.0 if mass.amplitude is None else mass.amplitude.median
-
-
-def _common(maps: Mapping[int, Sequence[MassReport]]) -> MassReport | None:
-    """A mass at the place where most maps show one, sized by most, then reported by most; None where all are apart."""
-
-    def worth(common: MassReport) -> tuple[int, int, int, float]:
-        """On how many maps it is found, sized and reported, and the median of its amplitudes."""
-        there = [one for one in (_nearest(masses, common) for masses in maps.values()) if one is not None]
-        sized, reported = sum(one.max_size_mm is not None for one in there), sum(one.reported for one in there)
-        return len(there), sized, reported, float(np.median([_amplitude(one) for one in there]))
-
-    best = max((one for masses in maps.values() for one in masses), key=worth, default=None)
-    return best if best is not None and worth(best)[0] > 1 else None
-
-
-def _nearest(masses: Sequence[MassReport], common: MassReport) -> MassReport | None:
-    """The mass nearest to a place, if it lies within `MATCH_MM` of it."""
-    near = min(masses, key=lambda one: _away_mm(one, common), default=None)
-    return near if near is not None and _away_mm(near, common) <= MATCH_MM else None
 
 
 def place_of(report: EstimateReport) -> PatientPlace | None:
@@ -220,8 +153,6 @@ def pool_answers(
         probability=settings.interval,
         provenance=provenance,
         repeatability=settings.repeatability,
-        apart=apart_from_others(reports),
-        one_place=one_place(reports),
     )
     return PooledSize(pooled=pooled, pooled_report=report, provenance=provenance, settings=settings)
 

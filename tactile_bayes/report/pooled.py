@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
+import numpy as np
+
 from tactile_bayes.declarations import UNSET
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
-from tactile_bayes.files.reports import POOLED, EstimateReport, Interval, PooledMap, PooledReport
+from tactile_bayes.files.reports import POOLED, EstimateReport, Interval, MassReport, PooledMap, PooledReport
 from tactile_bayes.findings import Finding, by_weight, capital, finding_lines, finding_summary, verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.posterior.verdict import chance_text
-from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.presets import MATCH_MM, RESEARCH_USE
 from tactile_bayes.report import estimate_text
 from tactile_bayes.report.calibration import fat_text, site_words, unknowns_text
 from tactile_bayes.report.estimate_document import another_exam, supposed_line, supposed_lines, suppositions
@@ -20,6 +22,72 @@ from tactile_bayes.size.pooling import DISAGREE, PooledEstimate, Repeatability
 from tactile_bayes.size.terms import UNLIKE_LEARNED, unknown_head
 
 MOST_NAMED = 4
+
+# --- Which mass of each map is the one that is pooled: by its place in the patient.
+#
+# A report is about the surest mass of its map, so of two maps of one breast each may report another one. With
+# landmarks the masses of all maps have places in patient axes, and the one that most maps show is pooled.
+
+
+def elsewhere(reports: Sequence[EstimateReport]) -> dict[int, tuple[float, float]]:
+    """Maps that report another mass than the common one, with the place of that one on each, mm.
+
+    Empty where a map with a lump has no landmarks, or no two maps show a mass at one place.
+    """
+    maps = _masses(reports)
+    common = _common(maps)
+    there = {} if common is None else {i: _nearest(masses, common) for i, masses in maps.items()}
+    return {i: one.centre_mm.median for i, one in there.items() if one is not None and not one.reported}
+
+
+def apart_from_others(reports: Sequence[EstimateReport]) -> dict[int, str] | None:
+    """Maps whose reported mass lies elsewhere than the common one, in words; None where that cannot be told."""
+    reported = {i: [one for one in masses if one.reported] for i, masses in _masses(reports).items()}
+    if len(reported) < 2:
+        return None
+    found = [one for masses in reported.values() for one in masses]
+    common = _common(reported) or max(found, key=_amplitude, default=None)
+    away = {i: _away_mm(one, common) for i, masses in reported.items() for one in masses if common is not None}
+    words = "its mass lies {:.0f} mm from that of the other maps and may be another one"
+    return {i: words.format(mm) for i, mm in away.items() if mm > MATCH_MM}
+
+
+def _masses(reports: Sequence[EstimateReport]) -> dict[int, tuple[MassReport, ...]]:
+    """Masses of the maps with a lump, by the map's place in the list; none where one has no place in the patient."""
+    found = {i: one.masses for i, one in enumerate(reports) if one.masses}
+    return {} if any(one.centre_patient_mm is None for masses in found.values() for one in masses) else found
+
+
+def _away_mm(one: MassReport, other: MassReport) -> float:
+    assert one.centre_patient_mm is not None  # see `_masses`
+    assert other.centre_patient_mm is not None
+    return float(np.hypot(*np.subtract(one.centre_patient_mm.median, other.centre_patient_mm.median)))
+
+
+def _amplitude(mass: MassReport) -> float:
+    return 0.0 if mass.amplitude is None else mass.amplitude.median
+
+
+def _common(maps: Mapping[int, Sequence[MassReport]]) -> MassReport | None:
+    """A mass at the place where most maps show one, sized by most, then reported by most; None where all are apart."""
+
+    def worth(common: MassReport) -> tuple[int, int, int, float]:
+        """On how many maps it is found, sized and reported, and the median of its amplitudes."""
+        there = [one for one in (_nearest(masses, common) for masses in maps.values()) if one is not None]
+        sized, reported = sum(one.max_size_mm is not None for one in there), sum(one.reported for one in there)
+        return len(there), sized, reported, float(np.median([_amplitude(one) for one in there]))
+
+    best = max((one for masses in maps.values() for one in masses), key=worth, default=None)
+    return best if best is not None and worth(best)[0] > 1 else None
+
+
+def _nearest(masses: Sequence[MassReport], common: MassReport) -> MassReport | None:
+    """The mass nearest to a place, if it lies within `MATCH_MM` of it."""
+    near = min(masses, key=lambda one: _away_mm(one, common), default=None)
+    return near if near is not None and _away_mm(near, common) <= MATCH_MM else None
+
+
+# --- The report made.
 
 
 def pooled_report(
@@ -31,19 +99,12 @@ def pooled_report(
     probability: float,
     provenance: Provenance,
     repeatability: Repeatability | None = None,
-    apart: Mapping[int, str] | None = None,
-    one_place: bool | None = None,
 ) -> PooledReport:
-    """Report of a mass from what `estimate` says of its maps.
-
-    `repeatability`: the site's, where the size is by it; `apart`: what is to be said of maps whose mass lies elsewhere
-    than the others', by their place in the list; `one_place`: whether the masses of all maps lie at one place in the
-    patient; None where that cannot be told.
-    """
+    """Report of a mass from what `estimate` says of its maps; `repeatability`: the site's, where the size is by it."""
     size, used = pooled.size, pooled.calibration or calibration
     head = unknown_head(used.recipe.head)
     largest, smallest = (None if size is None else size.summarise(one, probability=probability) for one in EXTREMES)
-    findings = by_weight(_findings(pooled, reports, apart or {}, one_place=one_place))
+    findings = by_weight(_findings(pooled, reports))
     return PooledReport(
         schema=POOLED,
         status=pooled.status,
@@ -82,9 +143,7 @@ def _map(index: int, name: str, report: EstimateReport, pooled: PooledEstimate) 
     )
 
 
-def _findings(
-    pooled: PooledEstimate, reports: Sequence[EstimateReport], apart: Mapping[int, str], *, one_place: bool | None
-) -> Iterator[Finding]:
+def _findings(pooled: PooledEstimate, reports: Sequence[EstimateReport]) -> Iterator[Finding]:
     """What speaks against the size: of the maps in which a lump was found, and of the maps together."""
     if pooled.status == DISAGREE and pooled.one_place is not None and pooled.one_place < LEAST_PROBABILITY:
         yield disagreement(pooled.reason, pooled.one_place)
@@ -95,7 +154,8 @@ def _findings(
         for one in reports[index].findings:
             if one.kind != "outside_calibration":  # of the size alone
                 yield one.at(_number(index))
-    for index, words in apart.items():
+    apart = apart_from_others(reports)
+    for index, words in (apart or {}).items():
         yield Finding("another_mass", words, about=_number(index))
     for index, earlier in repeated_scans([scans_of(one.provenance) for one in reports]).items():
         words = f"a map of the same scan as {_number(earlier)} is no repeat: the interval is too narrow"
@@ -107,7 +167,7 @@ def _findings(
     for index in pooled.outlying:
         yield Finding("outlying", "lies apart from the others: look at this map", about=_number(index))
     for index, report in enumerate(reports):
-        for rise in () if one_place else report.other_rises:
+        for rise in () if apart == {} else report.other_rises:
             text = f"another rise stands at ({rise.x_mm:.1f}, {rise.y_mm:.1f}) mm"
             same = "check that every map was sized at the same mass"
             yield Finding("several_masses", text, same, same, _number(index))

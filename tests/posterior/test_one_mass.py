@@ -15,13 +15,13 @@ from posterior_maps import bump_values, correlated_field, grid_map
 from searched_once import searched_once  # noqa: F401 - all tests of this file use it
 
 import tactile_bayes as tb
-from tactile_bayes.api.pooled import apart_from_others, elsewhere, one_place
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import EstimateReport, MassReport, Place
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.report.pooled import apart_from_others, elsewhere
 
 FAST = ("--method", "laplace")
 CALIBRATION = "solid"
@@ -81,9 +81,9 @@ def test_without_landmarks_or_a_common_place_nothing_is_estimated_again() -> Non
     assert elsewhere(far) == {}
     bare = document((20.0, 29.0, True), (52.0, 7.0, False), landmarks=False)
     assert elsewhere([document((51.0, 6.0, True)), bare]) == {}
-    assert one_place([document((51.0, 6.0, True)), bare]) is None
+    assert apart_from_others([document((51.0, 6.0, True)), bare]) is None
     assert elsewhere([document(), document((10.0, 12.0, True))]) == {}
-    assert one_place([document(), document((10.0, 12.0, True))]) is None
+    assert apart_from_others([document(), document((10.0, 12.0, True))]) is None
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
@@ -94,7 +94,6 @@ def test_maps_whose_masses_lie_apart_are_told(order: tuple[int, int]) -> None:
     assert told == {order.index(0): "its mass lies 40 mm from that of the other maps and may be another one"}
     near = [document((10.0, 12.0, True)), document((24.0, 14.0, True))]
     assert apart_from_others(near) == {}
-    assert (one_place(far), one_place(near)) == (False, True)
 
 
 def of_breast(masses: Sequence[tuple[float, float, float]], *, seed: int, shift_mm: float) -> TactileMap:
