@@ -53,8 +53,7 @@ def estimate_pool(
     if settings.centre_mm is None:
         for i, place in elsewhere([one.report for one in same]).items():
             same[i] = estimate_file(maps[i], replace(settings, centre_mm=place)).answer
-    inputs = {f"map_{i + 1}": one for i, one in enumerate(maps)}
-    found = pool_answers(same, settings, names=[str(one) for one in maps], inputs=inputs)
+    found = pool_answers(same, settings, names=[str(one) for one in maps], files=maps)
     report = found.pooled_report.checked()
     text_of = json_text if as_json else pooled_text if verbose else pooled_summary
     try:

@@ -71,8 +71,7 @@ def compare_action(
             done.append([estimate_file(path, settings) for path in maps])
             progress(sum(map(len, done)), total)
     names = [[str(path) for path in maps] for maps in visits]
-    inputs = {f"visit_{v}_map_{i}": path for v, maps in enumerate(visits, 1) for i, path in enumerate(maps, 1)}
-    found = compare_estimates(done, settings, comparing, names=names, inputs=inputs)
+    found = compare_estimates(done, settings, comparing, names=names, files=visits)
     found = replace(found, dates=dates_of(dates))
     report = found.report.checked()
     text_of = json_text if as_json else compare_text if verbose else compare_summary

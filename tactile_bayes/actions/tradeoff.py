@@ -48,7 +48,7 @@ def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> t
         assert found[-1].answer.report is not None  # made here: its time is the estimate's, not the pooling's
         spent += clock() - begun
         begun = clock()
-        together = pool_estimates(found, settings, names=[one.stem for one in paths[:number]], inputs={})
+        together = pool_estimates(found, settings, names=[one.stem for one in paths[:number]])
         found = list(together.maps)
         pooling = clock() - begun
         rows.append(PooledRow(number, spent + pooling, *_pooled_answer(together.pooled, settings)))

@@ -178,11 +178,11 @@ class Comparison(Told, eq=False):
 
 
 Names = Sequence[Sequence[str]]  #: Of the maps of each visit, for the report.
-Files = Mapping[str, Path]  #: That the maps came from, by role, for the provenance.
+Files = Sequence[Sequence[Path]]  #: That the maps of each visit came from.
 
 
 def compare_answers(
-    visits: Sequence[Sequence[Answer]], settings: Settings, comparing: Comparing, *, names: Names, inputs: Files
+    visits: Sequence[Sequence[Answer]], settings: Settings, comparing: Comparing, *, names: Names, files: Files = ()
 ) -> Comparison:
     """Compare the visits of one mass, from answers for their maps in order of time."""
     if len(visits) < 2 or not all(visits):
@@ -192,6 +192,7 @@ def compare_answers(
         raise UsageError("a comparison needs a size calibration; leave out --size-calibration none")
     every = list(chain.from_iterable(visits))
     named = list(chain.from_iterable(names))
+    inputs = {f"visit_{v}_map_{i}": path for v, maps in enumerate(files, 1) for i, path in enumerate(maps, 1)}
     calibration, digests = common_calibration(every, settings, names=named, inputs=inputs)
     for index, earlier in repeated_scans([_scans([one]) for one in every]).items():  # they are no two exams
         raise UsageError(f"{named[index]} and {named[earlier]} are of one scan; give one map of each scan")
@@ -220,13 +221,18 @@ def compare_answers(
 
 
 def compare_estimates(
-    visits: Sequence[Sequence[SizeEstimate]], settings: Settings, comparing: Comparing, *, names: Names, inputs: Files
+    visits: Sequence[Sequence[SizeEstimate]],
+    settings: Settings,
+    comparing: Comparing,
+    *,
+    names: Names,
+    files: Files = (),
 ) -> Comparison:
     """Compare visits, maps estimated again where they are of another mass; see `compare_answers`."""
     every = iter(one_mass([one for visit in visits for one in visit]))
     same = tuple(tuple(next(every) for _ in visit) for visit in visits)
     answers = [[one.answer for one in visit] for visit in same]
-    return replace(compare_answers(answers, settings, comparing, names=names, inputs=inputs), visits=same)
+    return replace(compare_answers(answers, settings, comparing, names=names, files=files), visits=same)
 
 
 def _compared(
@@ -408,5 +414,5 @@ def compare(
     if len(set(prints)) < len(prints):
         raise UsageError("a map is given twice; give each map once, at its own visit")
     names = [[one.name or f"visit {v} map {i}" for i, one in enumerate(visit, 1)] for v, visit in enumerate(visits, 1)]
-    found = compare_estimates(visits, used, comparing, names=names, inputs={})
+    found = compare_estimates(visits, used, comparing, names=names)
     return replace(found, dates=tuple(map(str, dated or ())))

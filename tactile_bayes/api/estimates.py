@@ -118,7 +118,7 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
     if len(set(prints)) < len(prints):
         raise UsageError("a map is given twice; give each map once")
     names = [one.name or f"map {i}" for i, one in enumerate(found, start=1)]
-    return pool_estimates(found, used, names=names, inputs={})
+    return pool_estimates(found, used, names=names)
 
 
 def estimated(given: Iterable[Any], settings: Mapping[str, Any]) -> tuple[SizeEstimate, ...]:

@@ -48,11 +48,11 @@ def one_mass(found: Sequence[SizeEstimate]) -> tuple[SizeEstimate, ...]:
 
 
 def pool_estimates(
-    found: Sequence[SizeEstimate], settings: Settings, *, names: Sequence[str], inputs: Mapping[str, Path]
+    found: Sequence[SizeEstimate], settings: Settings, *, names: Sequence[str], files: Sequence[Path] = ()
 ) -> PooledSize:
     """One size from the estimates of several maps, made again where they are of another mass; see `pool_answers`."""
     same = one_mass(found)
-    return replace(pool_answers([one.answer for one in same], settings, names=names, inputs=inputs), maps=same)
+    return replace(pool_answers([one.answer for one in same], settings, names=names, files=files), maps=same)
 
 
 def place_of(report: EstimateReport) -> PatientPlace | None:
@@ -113,16 +113,13 @@ class PooledSize(SizedExam, eq=False, dict=True, kw_only=True):
 
 
 def pool_answers(
-    answers: Sequence[Answer], settings: Settings, *, names: Sequence[str], inputs: Mapping[str, Path]
+    answers: Sequence[Answer], settings: Settings, *, names: Sequence[str], files: Sequence[Path] = ()
 ) -> PooledSize:
-    """Pool the maps of one mass.
-
-    `answers`: of each map; `names`: of the maps, for the report; `inputs`: files that the maps came from, by role, for
-    the provenance.
-    """
+    """Pool the maps of one mass, from the answer for each, by their `names` in the report; `files` that they are of."""
     reports = [answer.report for answer in answers]
     scans = [scan for report in reports for scan in scans_of(report.provenance)]
     check_one_mass(scans)
+    inputs = {f"map_{i}": path for i, path in enumerate(files, start=1)}
     calibration, digests = common_calibration(answers, settings, names=names, inputs=inputs)
     # the maps' values in sorted order are part of the seed: their order on the command line leaves no trace
     words = sorted(answer.fingerprint for answer in answers)

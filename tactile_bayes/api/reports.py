@@ -70,16 +70,15 @@ def exam_of_files(
     for path in maps:
         tell = None if notice is None else lambda line, path=path: notice(f"{path}: {line}")
         found.append(estimate_file(path, settings, notice=tell))
-    inputs = {f"map_{number}": path for number, path in enumerate(maps, start=1)}
-    return exam_of(found, settings, inputs=inputs)
+    return exam_of(found, settings, files=maps)
 
 
-def exam_of(found: Sequence[SizeEstimate], settings: Settings, *, inputs: Mapping[str, Path] | None = None) -> Exam:
+def exam_of(found: Sequence[SizeEstimate], settings: Settings, *, files: Sequence[Path] = ()) -> Exam:
     """Exam of maps that were estimated; several are pooled."""
     if len(found) == 1:
         return found[0].exam()
     names = [f"map {number}" for number in range(1, len(found) + 1)]
-    return pool_estimates(found, settings, names=names, inputs=inputs or {}).exam()
+    return pool_estimates(found, settings, names=names, files=files).exam()
 
 
 def _from_estimate(source: Path, path: Path | None) -> Exam:

@@ -321,8 +321,7 @@ def make_page(folder: Path, expected: Mapping[str, str], *, report: str) -> Made
 def make_pool(folder: Path, names: Sequence[str], settings: Settings) -> Made:
     """Pool exams of a mass as `estimate --pool` does, from what their estimates left in their folders below this."""
     answers = [_answer(folder / name) for name in names]
-    inputs = {f"map_{i}": folder / name / layout.MAP for i, name in enumerate(names, start=1)}
-    found = pool_answers(answers, settings, names=names, inputs=inputs)
+    found = pool_answers(answers, settings, names=names, files=[folder / name / layout.MAP for name in names])
     report = found.pooled_report.checked()
     writes: Writes = {layout.POOLED: lambda path: write_text(path, json_text(report), force=True)}
     if found.pooled.size is not None:
@@ -347,18 +346,13 @@ def make_growth(
     answers = [[_answer(folder / name) for name in names] for names in visits]
     found = [one for maps in answers for one in maps if one.shape is not None]
     placed = all(one.report.centre_patient_mm is not None for one in found)
-    numbered = [(v, i, name) for v, names in enumerate(visits, 1) for i, name in enumerate(names, 1)]
-    compared = compare_answers(
-        answers,
-        settings,
-        Comparing(days=days, same_mass=not placed),
-        names=visits,
-        inputs={f"visit_{v}_map_{i}": folder / name / layout.MAP for v, i, name in numbered},
-    )
+    files = [[folder / name / layout.MAP for name in names] for names in visits]
+    comparing = Comparing(days=days, same_mass=not placed)
+    compared = compare_answers(answers, settings, comparing, names=visits, files=files)
     report = compared.report.checked()
     drawn = [
-        [DrawnMap.of(read_map(folder / name / layout.MAP), one.report) for name, one in zip(names, maps, strict=True)]
-        for names, maps in zip(visits, answers, strict=True)
+        [DrawnMap.of(read_map(path), one.report) for path, one in zip(paths, maps, strict=True)]
+        for paths, maps in zip(files, answers, strict=True)
     ]
     page = growth_page(compared.compared, report, drawn, course)
     writes: Writes = {
