@@ -22,8 +22,6 @@ from tactile_bayes.files.atomic import given_twice
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.reports import json_text
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.estimate_figures import draw_size
-from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.pooled import elsewhere, pooled_summary, pooled_text
 from tactile_bayes.shell import progress_bar
 
@@ -60,9 +58,7 @@ def estimate_pool(
         if found.pooled.size is not None and output is not None:
             found.write(output, force=force)
         if found.pooled.size is not None and figure is not None:
-            name = named_exam(f"{len(found.pooled_report.maps)} maps pooled", found.provenance.scans)
-            given: dict[str, Any] = {"probability": found.probability, "findings": found.findings}
-            draw_size(found.pooled.size, figure, name=name, force=force, **given)
+            found.plot(figure, force=force)
     finally:  # what was computed is not lost with a file
         click.echo(text_of(report), nl=False)
     return EXIT_DONE if found.pooled.size is not None else EXIT_NO_ESTIMATE

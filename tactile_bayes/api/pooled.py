@@ -23,7 +23,6 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.options import PRIORS
 from tactile_bayes.posterior.estimate import way_to_head
 from tactile_bayes.report.estimate_document import side_of
-from tactile_bayes.report.estimate_figures import draw_size
 from tactile_bayes.report.exam_words import Exam
 from tactile_bayes.report.pooled import elsewhere, pooled_report
 from tactile_bayes.size.bodies import BodyCalibration
@@ -97,10 +96,7 @@ class PooledSize(SizedExam, eq=False, dict=True, kw_only=True):
         size = self._size
         if size is None:
             raise UsageError(f"there is no size to draw: {self.why}")
-        name = self.name or f"{len(self.pooled_report.maps)} maps pooled"
-        return draw_size(
-            size, path_of(path), name=name, probability=self.probability, findings=self.findings, force=force
-        )
+        return self._draw_size(size, path_of(path), force=force)
 
     def write(self, path: Path, *, force: bool = False) -> None:
         """Write the draws of a size, with its report."""
@@ -151,7 +147,8 @@ def pool_answers(
         provenance=provenance,
         repeatability=settings.repeatability,
     )
-    return PooledSize(pooled=pooled, pooled_report=report, provenance=provenance, settings=settings)
+    name = f"{len(reports)} maps pooled"
+    return PooledSize(pooled=pooled, pooled_report=report, provenance=provenance, settings=settings, name=name)
 
 
 def _no_size(

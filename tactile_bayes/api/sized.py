@@ -249,6 +249,15 @@ class SizedExam(Sized, eq=False, dict=True, kw_only=True):
         """Of the intervals that are shown where none is asked for."""
         return self.settings.interval
 
+    @property
+    def _titled(self) -> str:
+        """Name for the titles of figures: what the scans say of the exam, and the map's own."""
+        return named_exam(self.name, self.provenance.scans)
+
+    def _draw_size(self, size: SizePosterior, path: Path | None, *, force: bool) -> Figure:
+        shown: dict[str, Any] = {"name": self._titled, "probability": self.probability, "findings": self.findings}
+        return draw_size(size, path, **shown, force=force)
+
     def exam(self) -> Exam:
         """What a page of the exam shows."""
         raise NotImplementedError
@@ -402,9 +411,7 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
         size = self.estimate.size
         if size is None:
             return self.plot_map(path, force=force)
-        return draw_size(
-            size, path_of(path), name=self._titled, probability=self.probability, findings=self.findings, force=force
-        )
+        return self._draw_size(size, path_of(path), force=force)
 
     @door
     def plot_map(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
@@ -423,11 +430,6 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
         if self.status != "estimate":
             return self.plot_map(path, force=force)
         return draw_fit(self.tactile_map, self.estimate, path_of(path), name=self._titled, force=force)
-
-    @property
-    def _titled(self) -> str:
-        """Name for the titles of figures: what the scans say of the exam, and the map's own."""
-        return named_exam(self.name, self.provenance.scans)
 
     @door
     def save(self, path: PathLike, *, force: bool = False) -> None:

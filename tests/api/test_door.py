@@ -164,7 +164,7 @@ def test_maps_are_pooled_as_on_the_command_line(folder: Path) -> None:
     pooled = tb.pool([folder / "other.nc", str(folder / "map.nc")], **FAST)
     assert pooled.document["max_size_mm"] == told["max_size_mm"]
     assert pooled.max_size_mm is not None
-    assert pooled.plot().axes
+    assert pooled.plot().axes[0].get_title(loc="left") == "Size of the lump: phantom (2 maps pooled)"
     assert "largest size" in repr(pooled)
 
 
