@@ -6,6 +6,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from tactile_bayes.declarations import Meta, Options, field, says
 from tactile_bayes.errors import UsageError
+from tactile_bayes.options import Above0, named
 from tactile_bayes.presets import Normalise
 
 Shape = tuple[str | int, ...]
@@ -70,14 +71,13 @@ class Stated(Options, kw_only=True):
         says("Scan: unit of the frames; counts are raw, others need no calibration. Default: the file's, else counts."),
     ] = None
     saturation: Annotated[
-        Annotated[float, Meta(gt=0)] | None,
-        says("Scan: reading from which on a taxel carries no pressure, in the frames' unit."),
+        Above0 | None, says("Scan: reading from which on a taxel carries no pressure, in the frames' unit.")
     ] = None
     frame_shape: Annotated[
         tuple[Annotated[int, Meta(ge=1)], Annotated[int, Meta(ge=1)]] | None,
-        says(
+        named(
+            "ROWS COLUMNS",
             "Scan: rows (across the head) and columns of frames that are one row of numbers. Default: the head's.",
-            extra={"metavar": "ROWS COLUMNS"},
         ),
     ] = None
     frame_order: Annotated[
@@ -92,9 +92,7 @@ class Stated(Options, kw_only=True):
         Literal["point", "comma"] | None,
         says("Scan: decimal sign of tables. Default: told by their numbers, where these can tell."),
     ] = None
-    rate_hz: Annotated[
-        Rate | None, says("Scan: frames a second, where they have no times.", extra={"metavar": "HZ"})
-    ] = None
+    rate_hz: Annotated[Rate | None, named("HZ", "Scan: frames a second, where they have no times.")] = None
     time_unit: Annotated[TimeUnit | None, says("Scan: unit of the frames' times. Default: the file's, else s.")] = None
     pose_layout: Annotated[
         PoseLayout | None,
@@ -111,18 +109,16 @@ class Stated(Options, kw_only=True):
         None
     )
     pose_rate_hz: Annotated[
-        Rate | None, says("Scan: poses a second, where they have frame numbers or no times.", extra={"metavar": "HZ"})
+        Rate | None, named("HZ", "Scan: poses a second, where they have frame numbers or no times.")
     ] = None
     pose_offset_s: Annotated[
         Annotated[float, Meta(ge=-1e10, le=1e10)] | None,
-        says("Scan: added to the poses' times, for the frames' clock. Default: 0.", extra={"metavar": "S"}),
+        named("S", "Scan: added to the poses' times, for the frames' clock. Default: 0."),
     ] = None
     pose_good: Annotated[
         str | None, says("Scan: value of the poses' status where the tool is seen. Default: OK, Enabled and the like.")
     ] = None
-    tool: Annotated[str | None, says("Scan: which tool or station of the poses' file.", extra={"metavar": "NAME"})] = (
-        None
-    )
+    tool: Annotated[str | None, named("NAME", "Scan: which tool or station of the poses' file.")] = None
 
 
 class ArrayMap(Stated, kw_only=True):
@@ -144,36 +140,27 @@ _LONGEST_UNITS: Final = 20
 class GridOptions(Options, kw_only=True):
     """What is stated of a grid of values that becomes a map."""
 
-    spacing_mm: Annotated[float | None, says("Map: side of the square cells, in mm.", extra={"metavar": "H"})] = None
+    spacing_mm: Annotated[float | None, named("H", "Map: side of the square cells, in mm.")] = None
     cell_mm: Annotated[
-        Annotated[float, Meta(gt=0)] | None,
-        says(
-            "Map: average finer cells into cells of up to this side. Default: 1 where they are finer than 0.5.",
-            extra={"metavar": "H"},
-        ),
+        Above0 | None,
+        named("H", "Map: average finer cells into cells of up to this side. Default: 1 where they are finer than 0.5."),
     ] = None
     normalise: Annotated[Normalise, says("Map: how the values are already normalised.")] = "none"
     level: Annotated[
-        Annotated[float, Meta(gt=0)] | Literal["fit"] | None,
-        says(
+        Above0 | Literal["fit"] | None,
+        named(
+            "L|fit",
             "Map: divide values such as kPa by their level beside the lump: a number, or fit, to take it from the map.",
-            extra={"metavar": "L|fit"},
         ),
     ] = None
     units: Annotated[
-        str | None,
-        says("Map: unit of values that are not normalised, such as kPa. Default: unknown.", extra={"metavar": "TEXT"}),
+        str | None, named("TEXT", "Map: unit of values that are not normalised, such as kPa. Default: unknown.")
     ] = None
     no_value: Annotated[
         tuple[str, ...],
-        says(
-            "Map: a number or text that stands for no value, such as -9999; none: every number is a value.",
-            extra={"metavar": "V"},
-        ),
+        named("V", "Map: a number or text that stands for no value, such as -9999; none: every number is a value."),
     ] = ()
-    array: Annotated[
-        str | None, says("Map: which array of SRC, where it holds several.", extra={"metavar": "NAME"})
-    ] = None
+    array: Annotated[str | None, named("NAME", "Map: which array of SRC, where it holds several.")] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
