@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Collection, Mapping, Sequence
 from itertools import compress
 from pathlib import Path
@@ -18,9 +17,8 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError, in_file
 from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.reading import open_input
 from tactile_bayes.files.size_json import SHIPPED, read_size_calibration, size_calibration_path, write_size_calibration
-from tactile_bayes.files.tables import Sheet, Table, read_table, separator_in
+from tactile_bayes.files.tables import Sheet, Table, header_of, read_table
 from tactile_bayes.forward.tissue import parse_seat
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.options import LearnOptions
@@ -79,7 +77,7 @@ def learn(
         why = "is for learning a calibration; leave it out with --correct"
         _refuse(given, why, "form", "against", "fit", "least_stiffness_ratio", "figure")
         return _corrected(table, correct, asked, progress)
-    if asked.form != "eq6" or {"body", "exam"} <= set(_header_of(table)):
+    if asked.form != "eq6" or {"body", "exam"} <= set(header_of(table)):
         why = "is for tables of lumps: a table of `population` fixes how its maps were made"
         _refuse(given, why, "fit", *_MAPS[1:], "least_stiffness_ratio", "figure", "seed")
         return _over_bodies(table, asked, against)
@@ -178,16 +176,6 @@ def _over_bodies(table: Path | Sheet, asked: LearnOptions, against: Path | None)
         source = f"{settings['other_masses']} lumps of {given.path.name}"
         found = learning.learn_other_sd(found, other_table, source=source)
     return Learned(found, settings, _files(table=table, against=against))
-
-
-def _header_of(source: Path | Sheet) -> list[str]:
-    """The names in a table's first line."""
-    if isinstance(source, Path):
-        with open_input(source) as file:
-            first = file.readline(4096).decode("utf-8-sig", errors="replace")
-    else:
-        first = source.text.partition("\n")[0]
-    return [name.strip() for name in next(csv.reader([first], delimiter=separator_in(first)), [])]
 
 
 def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
@@ -316,7 +304,7 @@ def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Pr
             f"{base} cannot be corrected: it was not learned over bodies; "
             "give --correct solid, solid-mean or eq6, or a file learned from a table of `population`"
         )
-    by_files, inputs = "file" in _header_of(table), {**_files(table=table), "size_calibration": path}
+    by_files, inputs = "file" in header_of(table), {**_files(table=table), "size_calibration": path}
     with in_file(table if isinstance(table, Path) else table.name):
         if by_files:
             for name in (name for name, value in declared.items() if value is not None):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,7 @@ from tactile_bayes.files.mcap_records import McapRecords
 from tactile_bayes.files.netcdf import Group, open_netcdf
 from tactile_bayes.files.reading import HDF5_MAGIC, MCAP_MAGIC, first_bytes, is_json
 from tactile_bayes.files.size_json import read_repeatability, read_size_calibration
-from tactile_bayes.files.tables import read_table, separator_in
+from tactile_bayes.files.tables import header_of, read_table
 from tactile_bayes.findings import finding_lines, findings_in
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.select import Span, with_times
@@ -43,7 +41,7 @@ def describe(path: Path) -> dict[str, Any]:
         return _map(path)
     if is_json(head):
         return _json(path)
-    return _table(path, head)
+    return _table(path)
 
 
 def _posterior(group: Group) -> dict[str, Any]:
@@ -181,13 +179,9 @@ def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, 
     }
 
 
-def _table(path: Path, head: bytes) -> dict[str, Any]:
+def _table(path: Path) -> dict[str, Any]:
     """Describe a CSV table whose header fits one of the schemas."""
-    try:
-        text = head.decode("utf-8-sig")
-        header = next(csv.reader(io.StringIO(text), delimiter=separator_in(text)), [])
-    except (UnicodeDecodeError, csv.Error):
-        raise _foreign(path) from None
+    header = header_of(path)
     for name in _TABLES:
         schema = load_schema(f"{name}.table.json")
         required = {f["name"] for f in schema["fields"] if f.get("constraints", {}).get("required")}

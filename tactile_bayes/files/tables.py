@@ -18,7 +18,7 @@ from typing import Any, Final
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.documents import load_schema
-from tactile_bayes.files.reading import TABLE_BYTES, ZIP_MAGIC, decoded, read_bytes
+from tactile_bayes.files.reading import TABLE_BYTES, ZIP_MAGIC, decoded, first_bytes, read_bytes
 from tactile_bayes.presets import MM_PER_UNIT
 
 # --- Cells of a CSV file as text: its encoding, its separator, its quotes, and the decimal commas of spreadsheets.
@@ -30,6 +30,7 @@ DECIMAL_COMMA: Final = re.compile(r"[+-]?[0-9]+,[0-9]+")
 _THOUSANDS: Final = re.compile(r"[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+")
 _QUOTED: Final = re.compile(r'"[^"]*"')
 _AS_UTF8: Final = "save it as CSV UTF-8"
+_LOOKED_AT: Final = 4096  # bytes of a file for its header
 _EXPORT: Final = "export the sheet as CSV UTF-8"
 _NOT_TEXT: Final = (
     ((ZIP_MAGIC,), "is a spreadsheet or another zip archive (xlsx, ods), not CSV", _EXPORT),
@@ -73,6 +74,14 @@ def separator_in(text: str) -> str:
         return 0 < count == second.count(separator), count
 
     return max(",;\t", key=trust)
+
+
+def header_of(source: Path | Sheet) -> list[str]:
+    """The names in a table's first line; none where the file is of anything else."""
+    text = source.text if isinstance(source, Sheet) else first_bytes(source, _LOOKED_AT).decode("utf-8-sig", "replace")
+    with contextlib.suppress(csv.Error):
+        return [name.strip() for name in next(csv.reader(io.StringIO(text), delimiter=separator_in(text)), [])]
+    return []
 
 
 def composed(text: str) -> str:

@@ -94,6 +94,14 @@ def test_a_file_goes_before_a_calibration_of_its_name(tmp_path: Path) -> None:
     assert json.loads(run_here("show", "solid", "--json", cwd=tmp_path).stdout)["kind"] == "table: trial"
 
 
+def test_a_table_is_known_with_a_letter_across_the_end_of_its_first_bytes(tmp_path: Path) -> None:
+    header = "patient,mass,modality,replicate,size_mm,status,reader\n"
+    rows = "".join(f"S{i},1,tactile,1,12.5,detected,{'å' * 2100}\n" for i in range(3))
+    for more in ("", "x"):  # a letter is two bytes: one of the two files has one at bytes 4095 and 4096
+        (tmp_path / "a.csv").write_text(header + more + rows, encoding="utf-8")
+        assert json.loads(run_here("show", "a.csv", "--json", cwd=tmp_path).stdout)["rows"] == 3
+
+
 @pytest.mark.parametrize(
     ("name", "data"),
     [
