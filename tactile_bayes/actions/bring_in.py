@@ -21,7 +21,7 @@ from tactile_bayes.files.imports import import_arrays, of_calibration, of_head, 
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, array_template, read_array_map
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.scan_mcap import read_scan_report, read_truth, write_scan
+from tactile_bayes.files.scan_mcap import read_scan_report, write_scan
 from tactile_bayes.findings import LEADS, finding_lines
 from tactile_bayes.mapping.arrangement import check_scan, corrected
 from tactile_bayes.presets import RESEARCH_USE
@@ -140,7 +140,7 @@ def _import_scan(source: Path, output: Path, wanted: Wanted) -> list[str]:
     truth = None
     if source.suffix.lower() == ".mcap":
         file = read_scan_report(source)
-        scan, lost, truth = file.scan, file.lost, read_truth(source)
+        scan, lost, truth = file.scan, file.lost, file.truth
     else:
         files = wanted.beside.items()
         beside = [of_poses(file, wanted.arrays) if name == "poses" else _BESIDE[name](file) for name, file in files]

@@ -20,7 +20,7 @@ from tactile_bayes.actions.record import record_action
 from tactile_bayes.actions.show import describe_scan
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, read_truth, refuse_recording, write_scan
+from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, refuse_recording, write_scan
 from tactile_bayes.hardware.emulated import Device, EmulatedHead, EmulatedNdi, EmulatedTracker, Faults
 from tactile_bayes.hardware.emulator import Emulator, Link, PtyLink, Stage, TcpLink
 from tactile_bayes.hardware.head import rotation_sense
@@ -183,6 +183,6 @@ def repair_action(*, scan: Path, output: Path | None, force: bool) -> None:
     made = {"was": dict(file.provenance), "lost": list(file.lost)}
     provenance = Provenance("repair", made, inputs=hash_inputs(scan=scan))
     target = output or scan
-    write_scan(target, file.scan, provenance=provenance, truth=read_truth(scan), force=force or output is None)
+    write_scan(target, file.scan, provenance=provenance, truth=file.truth, force=force or output is None)
     for line in (f"{target}: scan", *describe_scan(file.scan), *(f"lost: {one}" for one in file.lost), RESEARCH_USE):
         click.echo(line)

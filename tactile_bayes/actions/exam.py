@@ -21,7 +21,7 @@ from tactile_bayes.files.atomic import refuse_existing, unwritable, write_bytes
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.estimate_json import StatedSize, read_stated_size
 from tactile_bayes.files.instrument import write_head
-from tactile_bayes.files.scan_mcap import read_scan, read_truth
+from tactile_bayes.files.scan_mcap import read_scan, read_scan_report
 from tactile_bayes.mapping.arrangement import check_scan
 from tactile_bayes.presets import RESEARCH_USE
 
@@ -91,7 +91,7 @@ def demo_action(output: Path, method: str, force: bool) -> None:
 
     _prepare(output, force=force)
     tactile_map, posterior, paper_posterior = (output / f"{name}.nc" for name in ("map", "posterior", "posterior_eq6"))
-    recorded = read_truth(output / "scan.mcap")
+    recorded = read_scan_report(output / "scan.mcap").truth
     assert recorded is not None  # the embedded scan is simulated
     truth = float(recorded["lumps"][0]["d_mm"])
     click.echo(f"The scan is simulated: a ball of {truth:g} mm in a breast of fat and gland ({output / 'scene.toml'}).")

@@ -54,7 +54,7 @@ class ScanWriter:
     """Writer of one scan to a binary stream, which stays open: first its description, then messages in order of
     arrival.
 
-    `truth` is what a simulated scan was made from; `read_truth` returns it, `read_scan` does not. `findings` speak
+    `truth` is what a simulated scan was made from, which `read_scan_report` returns beside the scan. `findings` speak
     against a scan that is a copy of another file's.
     """
 
@@ -246,6 +246,7 @@ class ScanFile(Record, eq=False):
     damaged: bool  #: A checksum failed: bytes changed after they were written. An unfinished file is not damaged.
     lost: tuple[str, ...]  #: One line a loss, for people.
     provenance: Mapping[str, Any]  #: As `Provenance.as_dict` wrote it.
+    truth: Mapping[str, Any] | None  #: What a simulated scan was made from; None for any other.
 
 
 def read_scan_report(path: Path) -> ScanFile:
@@ -264,19 +265,15 @@ def read_scan_report(path: Path) -> ScanFile:
         places = _pose_table(messages)
         poses = scans.TrackerPoses(message_times(messages, topic="/pose"), places[:, :3], places[:, 3:])
         landmarks, findings = _landmarks(records), file_findings(records)
+        truth = records.metadata.get("truth")
         return ScanFile(
             scan=scans.Scan(frames, poses, head, calibration, landmarks, session, findings),
             complete=records.finished and not records.lost,
             damaged=records.damaged,
             lost=tuple(records.lost),
             provenance=provenance_of(records),
+            truth=None if truth is None else _json_object(truth.get("json", ""), name="truth"),
         )
-
-
-def read_truth(path: Path) -> dict[str, Any] | None:
-    """Read the truth of a simulated scan; None for a scan without one."""
-    truth = scan_records(path, keep=()).metadata.get("truth")
-    return None if truth is None else _json_object(truth.get("json", ""), name="truth")
 
 
 def scan_records(path: Path, *, keep: Collection[str]) -> McapRecords:

@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from tactile_bayes.actions import study as tables
 from tactile_bayes.actions.study import study_settings
 from tactile_bayes.cli import cli
-from tactile_bayes.files.scan_mcap import read_scan, read_truth
+from tactile_bayes.files.scan_mcap import read_scan, read_scan_report
 from tactile_bayes.options import SectionOptions, StudyOptions
 from tactile_bayes.presets import HEADS, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
 
@@ -45,7 +45,7 @@ def test_simulate_feels_another_head_and_its_default_by_name(fidelity: str, tmp_
         path = tmp_path / f"{head}.mcap"
         said = run("simulate", tmp_path / "s.toml", "-o", path, "--fidelity", fidelity, *head_words(head))
         assert f"head: {head or DEFAULTS[fidelity]}" in said
-        scans[head], truths[head] = read_scan(path), read_truth(path)
+        scans[head], truths[head] = read_scan(path), read_scan_report(path).truth
     default = DEFAULTS[fidelity]
     (other,) = (head for head in HEADS if head != default)
     named, plain = scans[default], scans[None]

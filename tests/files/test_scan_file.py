@@ -17,7 +17,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.scan_mcap import CHUNK_BYTES, ScanWriter, read_scan, read_scan_report, read_truth, write_scan
+from tactile_bayes.files.scan_mcap import CHUNK_BYTES, ScanWriter, read_scan, read_scan_report, write_scan
 from tactile_bayes.forward.scene import Lump, Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
@@ -117,10 +117,10 @@ def test_the_report_counts_topics_and_names_the_maker(whole: Path) -> None:
 
 
 def test_truth_is_kept_apart(scan: Scan, whole: Path, tmp_path: Path) -> None:
-    assert read_truth(whole) == {"lumps": [1, 2]}
+    assert read_scan_report(whole).truth == {"lumps": [1, 2]}
     assert "truth" not in read_scan(whole).session
     write_scan(tmp_path / "real.mcap", scan, provenance=MADE)
-    assert read_truth(tmp_path / "real.mcap") is None
+    assert read_scan_report(tmp_path / "real.mcap").truth is None
 
 
 def test_the_reference_reader_sees_the_same_counts_and_poses(scan: Scan, whole: Path) -> None:

@@ -16,7 +16,7 @@ from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_schema, parse_toml
 from tactile_bayes.files.instrument import read_scene, scene_of
-from tactile_bayes.files.scan_mcap import read_scan, read_truth
+from tactile_bayes.files.scan_mcap import read_scan, read_scan_report
 from tactile_bayes.forward.scene import (
     Background,
     Lump,
@@ -218,6 +218,6 @@ def test_the_shipped_scan_is_what_its_scene_gives() -> None:
     assert difference.max() <= 1
     assert np.mean(difference > 0) < 1e-3
     np.testing.assert_allclose(shipped.poses.position_mm, simulated.scan.poses.position_mm, atol=1e-9)
-    truth = read_truth(DEMO / "scan.mcap")
+    truth = read_scan_report(DEMO / "scan.mcap").truth
     assert truth is not None
     assert truth["lumps"][0]["d_mm"] == 15.0

@@ -12,7 +12,7 @@ import pytest
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.scan_mcap import read_truth
+from tactile_bayes.files.scan_mcap import read_scan_report
 from tactile_bayes.forward import scene as scene_types
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.plane import condense, kappa, press, press_layers
@@ -151,6 +151,6 @@ def test_the_command_says_what_its_model_is(run_cli: Run, tmp_path: Path) -> Non
     done = run_cli("simulate", "s.toml", "-o", "a.mcap", "--fidelity", "plane-strain", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "model plane-strain: a cylinder along y: each frame's profile across the head is repeated" in done.stdout
-    truth = read_truth(tmp_path / "a.mcap")
+    truth = read_scan_report(tmp_path / "a.mcap").truth
     assert truth is not None
     assert truth["model"] == "plane-strain"

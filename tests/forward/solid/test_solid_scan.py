@@ -16,7 +16,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import parse_toml
 from tactile_bayes.files.instrument import read_scene, scene_of
-from tactile_bayes.files.scan_mcap import read_scan, read_truth
+from tactile_bayes.files.scan_mcap import read_scan, read_scan_report
 from tactile_bayes.forward.scene import (
     Background,
     Head,
@@ -236,7 +236,7 @@ def test_the_command_makes_a_solid_scan_whose_truth_stays_in_the_file(run_cli: R
     assert done.returncode == 0, done.stderr
     assert "lump at 0, 0 mm: d 15 mm, h/d 1, 100 times as stiff as fat" in done.stdout
     assert "model solid" in done.stdout
-    truth = read_truth(tmp_path / "a.mcap")
+    truth = read_scan_report(tmp_path / "a.mcap").truth
     assert truth is not None
     assert truth["model"] == "solid"
     assert "solid" not in str(read_scan(tmp_path / "a.mcap").session)
