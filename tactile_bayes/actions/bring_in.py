@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -51,7 +50,7 @@ class Wanted(Record):
     @property
     def of_arrays(self) -> list[str]:
         """Options that were given and that only scans from arrays or tables have."""
-        return [f"--{name.replace('_', '-')}" for name in (*self.beside, *_stated(self.arrays))]
+        return [f"--{name.replace('_', '-')}" for name in (*self.beside, *self.arrays.given)]
 
 
 def import_action(
@@ -64,9 +63,8 @@ def import_action(
         return EXIT_DONE
     if not sources or output is None:
         raise UsageError(f"Missing {'option -o' if sources else 'argument SRC'}; `import --help` has examples")
-    stated = {name: given.pop(name) for name in names_of(Stated)}
-    arrays = ArrayMap() if columns is None else read_array_map(columns)
-    arrays = replace(arrays, **{name: value for name, value in stated.items() if value is not None})
+    stated = Stated(**{name: given.pop(name) for name in names_of(Stated)})
+    arrays = replace(ArrayMap() if columns is None else read_array_map(columns), **stated.given)
     beside = {name: path for name in ("poses", *_BESIDE) if (path := given.pop(name)) is not None}
     grid = GridOptions(**{name: given.pop(name) for name in names_of(GridOptions)})
     wanted = Wanted(**given, grid=grid, arrays=arrays, beside=beside)
@@ -135,30 +133,21 @@ def _import(source: Path, output: Path, wanted: Wanted) -> list[str]:
 
 
 def _import_scan(source: Path, output: Path, wanted: Wanted) -> list[str]:
-    lost: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-    truth = None
+    lost, truth, notes = tuple[str, ...](), None, list[str]()
     if source.suffix.lower() == ".mcap":
         file = read_scan_report(source)
         scan, lost, truth = file.scan, file.lost, file.truth
     else:
         files = wanted.beside.items()
-        beside = [of_poses(file, wanted.arrays) if name == "poses" else _BESIDE[name](file) for name, file in files]
-        made = import_arrays(source, wanted.arrays, beside)
-        scan, notes = made.scan, made.notes
+        beside = [of_poses(path, wanted.arrays) if name == "poses" else _BESIDE[name](path) for name, path in files]
+        scan, notes = import_arrays(source, wanted.arrays, beside)
     session = {} if wanted.session_file is None else {"session": wanted.session_file}
     inputs = hash_inputs(source=source, **session, **wanted.beside)
-    settings = {"as": "scan", "lost": list(lost), "correct": list(wanted.corrections), **_stated(wanted.arrays)}
+    settings = {"as": "scan", "lost": list(lost), "correct": list(wanted.corrections), **wanted.arrays.given}
     scan = corrected(with_session(scan, wanted.session_file), wanted.corrections)
     provenance = Provenance("import", settings, inputs=inputs)
     write_scan(output, scan, provenance=provenance, truth=truth, force=wanted.force)
     return [*describe_scan(scan), *notes, *(f"lost: {line}" for line in lost), *_arrangement_lines(scan)]
-
-
-def _stated(arrays: ArrayMap) -> Mapping[str, Any]:
-    """What was stated of the arrays, for the provenance; nothing where nothing was."""
-    held = {name: getattr(arrays, name) for name in names_of(ArrayMap)}
-    return {name: value for name, value in held.items() if value not in (None, {})}
 
 
 def _arrangement_lines(scan: Scan) -> list[str]:

@@ -36,8 +36,7 @@ def map_action(
     settings = to_plain(MapOptions(**options), digits=EXACT)
     marks = [("begun", time.perf_counter())]
     loaded = [read_scan(path) for path in scans]
-    read = zip(loaded, scans, strict=True)
-    facts = [scan_facts(scan.session, frames=scan.frames.sha256, file=sha256(path)) for scan, path in read]
+    facts = [scan_facts(scan, sha256(path)) for scan, path in zip(loaded, scans, strict=True)]
     inputs = {f"scan_{number}": fact["sha256"] for number, fact in enumerate(facts, start=1)}
     provenance = Provenance("map", settings, inputs, scans=facts)
     for later, earlier in repeated_scans([[facts] for facts in provenance.scans]).items():

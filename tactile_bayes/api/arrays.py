@@ -76,17 +76,19 @@ def scan(
     UsageError
         When an argument cannot be so.
     """
-    given = _stated(columns, stated)
+    columns = {} if columns is None else columns
+    named = ArrayMap(**columns) if isinstance(columns, Mapping) else read_array_map(path_of(columns))
+    given = replace(named, **{name: plain(value) for name, value in stated.items() if value is not None})
     beside = [_poses(poses, given), _head(head), _calibration(calibration), _landmarks(landmarks)]
     if isinstance(frames, str | Path):
-        made = imports.import_arrays(path_of(frames), given, beside)
+        made, notes = imports.import_arrays(path_of(frames), given, beside)
     else:
         times = {} if time is None else {"frame_time_s": _array(time)}
-        made = imports.combined([Source({"frames": _array(frames), **times}), *beside], given)
-    for note in made.notes:
+        made, notes = imports.combined([Source({"frames": _array(frames), **times}), *beside], given)
+    for note in notes:
         if note.startswith("CAUTION"):
             warnings.warn(note, stacklevel=4)
-    return corrected(with_session(made.scan, path_of(session)), correct)
+    return corrected(with_session(made, path_of(session)), correct)
 
 
 def _array(given: Any) -> Any:
@@ -97,14 +99,6 @@ def _array(given: Any) -> Any:
     if array.dtype.kind in "Mm":
         return array.astype(f"{array.dtype.kind}8[ns]").astype(np.int64) / 1e9
     return array
-
-
-def _stated(columns: PathLike | Mapping[str, Any] | None, stated: Mapping[str, Any]) -> ArrayMap:
-    values = {name: plain(value) for name, value in stated.items() if value is not None}
-    if columns is None:
-        return ArrayMap(**values)
-    named = ArrayMap(**columns) if isinstance(columns, Mapping) else read_array_map(path_of(columns))
-    return replace(named, **values)
 
 
 def _poses(given: Any, stated: ArrayMap) -> Source:

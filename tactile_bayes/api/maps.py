@@ -177,13 +177,9 @@ def build_map(
         When an option cannot be so, or a recording is given twice.
     """
     given = [scans] if isinstance(scans, str | Path) or not isinstance(scans, Sequence) else list(scans)
-    loaded: list[Scan] = []
-    facts: list[dict[str, str]] = []
-    for one in given:
-        path = path_of(one) if isinstance(one, str | Path) else None
-        loaded.append(scan_given(one) if path is None else read_scan(path))
-        digest = "" if path is None else sha256(path)
-        facts.append(scan_facts(loaded[-1].session, frames=loaded[-1].frames.sha256, file=digest))
+    loaded = [scan_given(one) for one in given]
+    digests = (sha256(path_of(one)) if isinstance(one, str | Path) else "" for one in given)
+    facts = [scan_facts(scan, digest) for scan, digest in zip(loaded, digests, strict=True)]
     for later, earlier in repeated_scans([[one] for one in facts]).items():
         raise UsageError(
             f"scan {later + 1} is the recording of scan {earlier + 1}, whose frames would count twice; give it once"
@@ -209,14 +205,12 @@ def check(scan: Any, *, pressure_window_kpa: tuple[float, float] = PRESSURE_WIND
     ArrangementCheck
         `words` says what its frames agree with, `lines()` in full; `too_short` where they are too few.
     """
-    return check_scan(
-        read_scan(scan) if isinstance(scan, str | Path) else scan_given(scan), pressure_window_kpa=pressure_window_kpa
-    )
+    return check_scan(scan_given(scan), pressure_window_kpa=pressure_window_kpa)
 
 
 def scan_given(given: Any) -> Scan:
-    """Return the scan given as a `Scan` or a simulated one; refuse anything else."""
-    scan = getattr(given, "scan", given)
+    """Return the scan given as a path, a `Scan` or a simulated one; refuse anything else."""
+    scan = read_scan(given) if isinstance(given, str | Path) else getattr(given, "scan", given)
     if not isinstance(scan, Scan):
         kind = type(given).__name__
         raise UsageError(f"a scan is wanted, not {kind}; read one with read_scan, or make one of arrays with tb.scan")

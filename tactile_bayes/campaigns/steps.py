@@ -226,7 +226,7 @@ def make_map(
     else:
         scan = read_scan(source)
         check_facts(expected, scan.session)
-    facts = scan_facts(scan.session, frames=scan.frames.sha256, file=source_sha256)
+    facts = scan_facts(scan, source_sha256)
     settings = to_plain(from_plain(MapOptions, {"normalise": normalise}), digits=EXACT)
     provenance = Provenance("map", settings, {"scan_1": source_sha256}, scans=[facts])
     tactile_map = build_map(scan, normalise=normalise)

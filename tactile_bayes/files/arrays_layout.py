@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
-from tactile_bayes.declarations import Meta, Options, field, says
+from tactile_bayes.declarations import Meta, Options, field, names_of, says
 from tactile_bayes.errors import UsageError
 from tactile_bayes.options import Above0, named
 from tactile_bayes.presets import Normalise
@@ -119,6 +119,11 @@ class Stated(Options, kw_only=True):
         str | None, says("Scan: value of the poses' status where the tool is seen. Default: OK, Enabled and the like.")
     ] = None
     tool: Annotated[str | None, named("NAME", "Scan: which tool or station of the poses' file.")] = None
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """What is stated, by its names."""
+        return {name: value for name in names_of(self) if (value := getattr(self, name)) not in (None, {})}
 
 
 class ArrayMap(Stated, kw_only=True):

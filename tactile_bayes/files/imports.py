@@ -13,7 +13,7 @@ from unicodedata import normalize
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tactile_bayes.declarations import Record, names_of, replace
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, in_file, meant
 from tactile_bayes.files.arrays_layout import KNOWN, LAYOUT, OPTIONAL, ArrayMap, Shape, Stated, in_words
 from tactile_bayes.files.instrument import read_array_calibration, read_head_geometry, read_landmarks
@@ -48,21 +48,15 @@ _TEMPLATE: Final = "`tactile-bayes import SRC --template` prints a MAP.toml for 
 _HELP: Final = "`tactile-bayes import --help` says what they are"
 
 
-class Imported(Record, eq=False):
-    """A scan, and a line for each thing that was guessed or left out."""
-
-    scan: Scan
-    notes: tuple[str, ...] = ()
-
-
 def read_arrays(path: Path) -> Scan:
     """Read a scan from a file of arrays that are called as in the layout."""
-    return import_arrays(path).scan
+    return import_arrays(path, ArrayMap())[0]
 
 
-def import_arrays(path: Path, given: ArrayMap | None = None, beside: Sequence[Source] = ()) -> Imported:
-    """Read a scan from a file of arrays, and from what stands beside it; errors name the file and the array."""
-    given = given or ArrayMap()
+def import_arrays(path: Path, given: ArrayMap, beside: Sequence[Source] = ()) -> tuple[Scan, list[str]]:
+    """Read a scan from a file of arrays, and from what stands beside it, and a line for each thing that was guessed or
+    left out; errors name the file and the array.
+    """
     with in_file(path):
         own = replace(_read(path, given, beside), path=str(path))
     try:
@@ -78,23 +72,20 @@ def _source_of(error: BadDataError, sources: Sequence[Source]) -> str:
     return next((one.path for one in reversed(sources) if one.path and same & set(one.arrays)), sources[0].path)
 
 
-def _stated_in(one: Stated) -> dict[str, Any]:
-    return {name: value for name in names_of(Stated) if (value := getattr(one, name)) is not None}
-
-
 def _over(given: Stated, said: Stated) -> Stated:
     """What is stated by the caller, and otherwise by a file."""
+    more = {name: value for name, value in said.given.items() if getattr(given, name) is None}
     if given.unit not in (None, said.unit):
-        said = replace(said, saturation=None)  # in the file's unit
-    return replace(said, **_stated_in(given))
+        more.pop("saturation", None)  # in the file's unit
+    return replace(given, **more)
 
 
 def _overridden(given: Stated, said: Stated) -> list[str]:
     """A line for each thing that the caller states and a file says otherwise."""
     return [
         f"{name.replace('_', '-')} {ours} as stated, where the file says {theirs}"
-        for name, ours in _stated_in(given).items()
-        if (theirs := getattr(said, name)) not in (None, ours)
+        for name, theirs in said.given.items()
+        if (ours := getattr(given, name)) not in (None, theirs)
     ]
 
 
@@ -181,8 +172,8 @@ def of_landmarks(given: Path | Landmarks) -> Source:
 # --- From arrays as people have them to those of the layout: axes, clocks, units.
 
 
-def combined(sources: Sequence[Source], given: Stated) -> Imported:
-    """A scan of arrays by the names in `KNOWN`; those of a later source stand in place of an earlier's."""
+def combined(sources: Sequence[Source], given: Stated) -> tuple[Scan, list[str]]:
+    """A scan of arrays by the names in `KNOWN`, of which the last source's stands, and the notes."""
     stated = given
     told: list[str] = []
     held: Arrays = {}
@@ -217,7 +208,7 @@ def combined(sources: Sequence[Source], given: Stated) -> Imported:
     facts = {"frames_unit": str(stated.unit)} if pressure else {}
     if told:
         facts["imported_as"] = "; ".join(told)[:2000]
-    return Imported(_scan(held, facts, checked_on), tuple(told))
+    return _scan(held, facts, checked_on), told
 
 
 def _refuse_missing(held: Arrays, others: Sequence[str]) -> None:

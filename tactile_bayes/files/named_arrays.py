@@ -272,7 +272,12 @@ def array_template(path: Path | None) -> str:
     shapes = {} if path is None else {name: one.shape for name, one in read_named(path, list).items()}
     held = [f"#   {name}: {' x '.join(map(str, shape)) or 'one value'}" for name, shape in shapes.items()]
     told = ["# The file has:", *held, ""] if held else []
-    return "\n".join([_HEADING.format(path=path or "a file"), *told, *_array_lines(shapes), _VALUES])
+    words = {name: f"{in_words(one.shape)}: {one.meaning}" for name, one in LAYOUT.items()}
+    words |= {name: f"may be left out; {words[name]}" for name in OPTIONAL}
+    words["pose_matrix"] = "m, 4, 4: in place of position_mm and quaternion_wxyz"
+    guessed = _guessed(shapes)
+    lines = [_line(name, guessed, shapes, meaning) for name, meaning in words.items()]
+    return "\n".join([_HEADING.format(path=path or "a file"), *told, "[arrays]", *lines, _VALUES])
 
 
 _PLAIN_WORDS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -312,15 +317,6 @@ def plain_names(
         if len(alike) == 1:
             found[here] = alike[0]
     return found
-
-
-def _array_lines(shapes: Mapping[str, Shape]) -> Iterator[str]:
-    yield "[arrays]"
-    guessed = _guessed(shapes)
-    for name, layout in LAYOUT.items():
-        told = f"{in_words(layout.shape)}: {layout.meaning}"
-        yield _line(name, guessed, shapes, f"may be left out; {told}" if name in OPTIONAL else told)
-    yield _line("pose_matrix", guessed, shapes, "m, 4, 4: in place of position_mm and quaternion_wxyz")
 
 
 def _line(name: str, guessed: Mapping[str, str], shapes: Mapping[str, Shape], told: str) -> str:

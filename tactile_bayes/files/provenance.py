@@ -9,6 +9,7 @@ from typing import Any, Final
 from tactile_bayes import __version__
 from tactile_bayes.declarations import Record, field
 from tactile_bayes.files.atomic import sha256
+from tactile_bayes.scans import Scan
 
 EXAM_FACTS: Final = ("subject", "side", "posture", "examiner", "visit", "mass", "array_calibration_days")
 """Facts of a scan's session on its exam and array calibration; codes only, see ``scan_session.schema.json``."""
@@ -48,12 +49,10 @@ def hash_inputs(**paths: Path) -> dict[str, str]:
     return {role: sha256(path) for role, path in paths.items()}
 
 
-def scan_facts(session: Mapping[str, str], *, frames: str, file: str = "") -> dict[str, str]:
-    """Digests of a scan and what its session says of the exam, for `Provenance.scans`: `frames` as
-    `PressureFrames.sha256` gives it, `file` the SHA-256 of its file, empty for a scan that is in none.
-    """
-    facts = {name: session[name] for name in EXAM_FACTS if session.get(name)}
-    return {**({"sha256": file} if file else {}), **facts, "frames_sha256": frames}
+def scan_facts(scan: Scan, file_sha256: str = "") -> dict[str, str]:
+    """Digests of a scan and what it says of the exam, for `Provenance.scans`; the first is empty without a file."""
+    facts = {name: scan.session[name] for name in EXAM_FACTS if scan.session.get(name)}
+    return {**({"sha256": file_sha256} if file_sha256 else {}), **facts, "frames_sha256": scan.frames.sha256}
 
 
 def scans_of(document: object) -> tuple[dict[str, str], ...]:

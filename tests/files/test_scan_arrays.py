@@ -117,7 +117,7 @@ def test_the_day_of_a_check_is_that_of_the_head_that_stands(good: Arrays, scan: 
     checked = replace(scan.head, checked_on="2026-03-01")
     for last in (checked, scan.head):
         heads = [of_head(checked), of_head(last)]
-        assert import_arrays(tmp_path / "exam.npz", ArrayMap(), heads).scan.head.checked_on == last.checked_on
+        assert import_arrays(tmp_path / "exam.npz", ArrayMap(), heads)[0].head.checked_on == last.checked_on
 
 
 def test_fields_of_a_structure_and_members_of_a_group_are_named(good: Arrays, scan: Scan, tmp_path: Path) -> None:
@@ -127,7 +127,7 @@ def test_fields_of_a_structure_and_members_of_a_group_are_named(good: Arrays, sc
             file[f"exam/{name}"] = one
     names = ArrayMap(arrays={name: f"exam.{name}" for name in good})
     for path in (tmp_path / "exam.mat", tmp_path / "exam.hdf5"):
-        same(import_arrays(path, names).scan, scan)
+        same(import_arrays(path, names)[0], scan)
 
 
 def test_the_layouts_own_names_are_found_within_groups(pressed: Arrays, scan: Scan, head: Path, tmp_path: Path) -> None:
@@ -148,10 +148,10 @@ def test_plain_words_are_taken_for_arrays_and_said(pressed: Arrays, scan: Scan, 
     words = {"frames": "Pressure", "frame_time_s": "time", "position_mm": "position", "quaternion_wxyz": "quat"}
     rest = {name: one for name, one in pressed.items() if name not in words}
     as_mat_73(tmp_path / "a.mat", {**{word: pressed[name] for name, word in words.items()}, **rest})
-    found = import_arrays(tmp_path / "a.mat", ArrayMap(unit="kPa"))
-    np.testing.assert_array_equal(found.scan.frames.time_s, scan.frames.time_s)
-    assert "Pressure is taken for counts" in found.notes
-    assert "time is taken for frame_time_s" in found.notes
+    found, notes = import_arrays(tmp_path / "a.mat", ArrayMap(unit="kPa"))
+    np.testing.assert_array_equal(found.frames.time_s, scan.frames.time_s)
+    assert "Pressure is taken for counts" in notes
+    assert "time is taken for frame_time_s" in notes
     with h5py.File(tmp_path / "b.h5", "w") as file:
         for name in ("frames", "frame_time_s"):
             file[f"mat/{'pressure' if name == 'frames' else 'time'}"] = pressed[name]
@@ -159,9 +159,9 @@ def test_plain_words_are_taken_for_arrays_and_said(pressed: Arrays, scan: Scan, 
             file[f"tracker/{word}"] = pressed[name]
         for name in ("pitch_mm", "array_from_tracker", "head_surface_mm"):
             file[name] = pressed[name]
-    found = import_arrays(tmp_path / "b.h5", ArrayMap(unit="kPa"))
-    np.testing.assert_array_equal(found.scan.poses.time_s, scan.poses.time_s)
-    np.testing.assert_array_equal(found.scan.frames.time_s, scan.frames.time_s)
+    found, notes = import_arrays(tmp_path / "b.h5", ArrayMap(unit="kPa"))
+    np.testing.assert_array_equal(found.poses.time_s, scan.poses.time_s)
+    np.testing.assert_array_equal(found.frames.time_s, scan.frames.time_s)
     with h5py.File(tmp_path / "b.h5", "a") as file:
         file["mat/readings"] = pressed["frames"]
     with pytest.raises(BadDataError, match="lacks counts"):
@@ -201,11 +201,11 @@ IN_KPA = {"kPa": 1.0, "Pa": 1e-3, "psi": 6.894757, "mmHg": 101.325 / 760, "N/cm2
 def test_pressures_in_every_unit_are_the_same_scan(pressed: Arrays, tmp_path: Path, unit: str) -> None:
     kpa = pressed["frames"]
     as_npz(tmp_path / "exam.npz", pressed | {"frames": kpa / IN_KPA[unit]})
-    found = import_arrays(tmp_path / "exam.npz", ArrayMap(unit=unit))  # type: ignore[arg-type]
-    np.testing.assert_allclose(found.scan.element_calibration.to_kpa(found.scan.frames.counts), kpa, atol=6e-4)
-    assert found.scan.session["frames_unit"] == unit
-    assert any(f"frames in {unit}, kept to 1 Pa" in note for note in found.notes)
-    assert not any(note.startswith("CAUTION") for note in found.notes)
+    found, notes = import_arrays(tmp_path / "exam.npz", ArrayMap(unit=unit))  # type: ignore[arg-type]
+    np.testing.assert_allclose(found.element_calibration.to_kpa(found.frames.counts), kpa, atol=6e-4)
+    assert found.session["frames_unit"] == unit
+    assert any(f"frames in {unit}, kept to 1 Pa" in note for note in notes)
+    assert not any(note.startswith("CAUTION") for note in notes)
 
 
 def test_whole_pressures_keep_their_numbers_and_the_unit_is_the_gain(pressed: Arrays) -> None:
@@ -269,12 +269,12 @@ def test_axes_of_frames_and_poses_are_found_by_the_times(pressed: Arrays, scan: 
         "frame_time_s": pressed["frame_time_s"][None] * 1000,
     }
     as_mat(tmp_path / "exam.mat", turned)
-    found = import_arrays(tmp_path / "exam.mat", ArrayMap(unit="kPa", time_unit="ms", pose_time_unit="s"))
-    np.testing.assert_allclose(found.scan.frames.time_s, scan.frames.time_s)
-    np.testing.assert_array_equal(found.scan.poses.position_mm, scan.poses.position_mm)
-    kpa = found.scan.element_calibration.to_kpa(found.scan.frames.counts)
+    found, notes = import_arrays(tmp_path / "exam.mat", ArrayMap(unit="kPa", time_unit="ms", pose_time_unit="s"))
+    np.testing.assert_allclose(found.frames.time_s, scan.frames.time_s)
+    np.testing.assert_array_equal(found.poses.position_mm, scan.poses.position_mm)
+    kpa = found.element_calibration.to_kpa(found.frames.counts)
     np.testing.assert_allclose(kpa, pressed["frames"], atol=6e-4)
-    assert "read along the last axis" in " ".join(found.notes)
+    assert "read along the last axis" in " ".join(notes)
 
 
 def test_frames_of_one_row_are_folded_and_it_is_said(pressed: Arrays) -> None:
@@ -507,7 +507,7 @@ def test_a_name_is_found_however_its_letters_are_spelled(pressed: Arrays, tmp_pa
     """A Mac may write an umlaut as two signs, and a TOML's editor as one."""
     pressed[unicodedata.normalize("NFD", "Größe")] = pressed.pop("frames")
     as_npz(tmp_path / "exam.npz", pressed)
-    found = import_arrays(tmp_path / "exam.npz", ArrayMap(arrays={"counts": "Größe"}, unit="kPa")).scan
+    found, _ = import_arrays(tmp_path / "exam.npz", ArrayMap(arrays={"counts": "Größe"}, unit="kPa"))
     assert len(found.frames) == len(pressed["frame_time_s"])
 
 
