@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from tactile_bayes.errors import UsageError
-from tactile_bayes.files.reading import open_input, special_kind, unreadable
+from tactile_bayes.files.reading import open_input, readable, special_kind
 
 # --- Names of files: whether two are one file, and whether one ends as the format that is written to it.
 
@@ -205,8 +205,5 @@ def unwritable(path: Path, error: OSError) -> UsageError:
 
 def sha256(path: Path) -> str:
     """Hex digest of a file's bytes."""
-    with open_input(path) as file:
-        try:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-        except OSError as error:
-            raise unreadable(path, error) from None
+    with open_input(path) as file, readable(path):
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -19,7 +19,7 @@ from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError, in_file
-from tactile_bayes.files.reading import MCAP_MAGIC, check_limit, not_a, open_input, unpacked_limit, unreadable
+from tactile_bayes.files.reading import MCAP_MAGIC, check_limit, not_a, open_input, readable, unpacked_limit
 
 # --- Decompression of MCAP chunks within the declared and the total size limit.
 
@@ -203,14 +203,11 @@ class McapRecords:
 def read_records(path: Path, *, keep: Collection[str] | None = None) -> McapRecords:
     """Read a file from front to back, with or without its index; of topics not in `keep` (None: all) only the times."""
     records = McapRecords(keep=keep)
-    with open_input(path) as stream, in_file(path):
-        try:
-            _check_magic(stream, path)
-            size = stream.seek(0, io.SEEK_END)
-            stream.seek(len(MCAP_MAGIC))
-            _collect(records, stream, size=size)
-        except OSError as error:
-            raise unreadable(path, error) from None
+    with open_input(path) as stream, in_file(path), readable(path):
+        _check_magic(stream, path)
+        size = stream.seek(0, io.SEEK_END)
+        stream.seek(len(MCAP_MAGIC))
+        _collect(records, stream, size=size)
     return records
 
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
-from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
+from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError, in_file
 
 # --- Safe reading of files: regular files only, up to a size limit; a decoder's errors become one line.
 #
@@ -46,10 +46,8 @@ _KINDS: Final = (
 
 def open_input(path: Path) -> io.BufferedReader:
     """Open a regular file for reading; a directory, a FIFO, a socket or a device is refused, never waited on."""
-    try:
+    with readable(path):
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
-    except OSError as error:
-        raise unreadable(path, error) from None
     kind = special_kind(os.fstat(descriptor).st_mode)
     if kind:
         os.close(descriptor)
@@ -75,14 +73,9 @@ def special_kind(mode: int) -> str:
 
 def read_bytes(path: Path, *, most: int) -> bytes:
     """All bytes of a regular file of up to `most` bytes (times ``TACTILE_BAYES_LIMITS``)."""
-    with open_input(path) as file:
-        try:
-            check_limit(os.fstat(file.fileno()).st_size, most, what="it has {} bytes")
-            return file.read()
-        except OSError as error:
-            raise unreadable(path, error) from None
-        except BadDataError as error:
-            raise error.at(path) from None
+    with open_input(path) as file, in_file(path), readable(path):
+        check_limit(os.fstat(file.fileno()).st_size, most, what="it has {} bytes")
+        return file.read()
 
 
 def read_text(path: Path, *, most: int, way_out: str) -> str:
@@ -170,10 +163,14 @@ _WAYS_OUT: Final = {
 }
 
 
-def unreadable(path: Path, error: OSError) -> BadDataError:
-    """Error for a file that cannot be opened."""
-    way_out = _WAYS_OUT.get(error.errno or 0, "copy it to another disk and read it there")
-    return BadDataError(f"cannot be read ({error.strerror or error})", way_out=way_out, path=str(path))
+@contextlib.contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """Turn what the system says of a file that it cannot read into a `BadDataError`."""
+    try:
+        yield
+    except OSError as error:
+        way_out = _WAYS_OUT.get(error.errno or 0, "copy it to another disk and read it there")
+        raise BadDataError(f"cannot be read ({error.strerror or error})", way_out=way_out, path=str(path)) from None
 
 
 # --- Kind of a file by its first bytes; a reader given another kind names the command to run instead.
