@@ -8,7 +8,7 @@ from typing import Final
 
 import click
 
-from tactile_bayes.commands.options import FORCE, JSON, SESSION, FilePath, command, figure, path_option, takes
+from tactile_bayes.commands.options import FORCE, JSON, SESSION, FilePath, command, figure, output, path_option, takes
 from tactile_bayes.declarations import names_of
 from tactile_bayes.files.arrays_layout import GridOptions, Stated, layout_lines
 from tactile_bayes.options import IdentityOptions, MapOptions, RecordOptions
@@ -16,15 +16,7 @@ from tactile_bayes.presets import CORRECTIONS, METHODS
 
 
 @command("demo", "exam.demo_action")
-@click.option(
-    "-o",
-    "--output",
-    type=FilePath(),
-    default=Path("tactile-bayes-demo"),
-    show_default=True,
-    metavar="DIR",
-    help="Folder for the files.",
-)
+@output("DIR", None, "Folder for the files.", default=Path("tactile-bayes-demo"), show_default=True)
 @click.option(
     "--method",
     type=click.Choice(METHODS[:3]),
@@ -98,12 +90,10 @@ import_command.help = f"{cleandoc(import_command.help or '')}\n\n{_ARRAYS}"
 @command("check", "exam.check_action")
 @click.argument("scans", nargs=-1, required=True, metavar="SCAN...", type=FilePath())
 @takes(MapOptions, "pressure_window_kpa")
-@click.option(
-    "-o",
-    "--output",
-    type=FilePath(),
-    metavar="HEAD.json",
-    help="Head of the scan with the day of this check, where the scan shows that it is right; for --head-geometry.",
+@output(
+    "HEAD.json",
+    None,
+    "Head of the scan with the day of this check, where the scan shows that it is right; for --head-geometry.",
 )
 @FORCE
 def check_command() -> None:
@@ -136,9 +126,7 @@ _FORMATS: Final = ("dicom", "fhir", "nrrd", "csv")
 @command("export", "pages.export_action")
 @click.argument("files", metavar="FILE...", nargs=-1, type=FilePath())
 @click.option("--to", required=True, type=click.Choice(_FORMATS), help="Format to write.")
-@click.option(
-    "-o", "--output", metavar="OUT", type=FilePath(), help="File to write; for dicom the folder of the files."
-)
+@output("OUT", None, "File to write; for dicom the folder of the files.")
 @path_option(
     "--worklist",
     "ITEM",

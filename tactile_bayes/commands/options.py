@@ -273,10 +273,12 @@ def _click_type(kind: Any) -> Any:
 FORCE = click.option("--force", is_flag=True, help="Overwrite existing outputs.")
 
 
-def output(metavar: str, writes: Format, meaning: str, *, required: bool = False) -> Decorator:
-    """``-o``: the file that a command writes."""
-    kind = FilePath(writes=writes)
-    return click.option("-o", "--output", required=required, metavar=metavar, type=kind, help=meaning)
+def output(
+    metavar: str, writes: Format | None, meaning: str, *, guarded: bool | None = None, **attributes: Any
+) -> Decorator:
+    """``-o``: what a command writes, see `FilePath`; a folder, or a file of several formats, is of none."""
+    kind = FilePath(writes=writes, guarded=guarded)
+    return click.option("-o", "--output", metavar=metavar, type=kind, help=meaning, **attributes)
 
 
 def figure(meaning: str, name: str = "--figure") -> Decorator:

@@ -77,14 +77,7 @@ def campaign_command() -> None:
 
 @options.command("init", "campaign.campaign_init_action", within=campaign_command)
 @click.argument("folder", metavar="FOLDER", type=options.FilePath(addresses=True))
-@click.option(
-    "-o",
-    "--output",
-    required=True,
-    metavar="EXAMS.csv",
-    type=options.FilePath(writes="CSV", guarded=False),
-    help="Where to write the table.",
-)
+@options.output("EXAMS.csv", "CSV", "Where to write the table.", guarded=False, required=True)
 @click.option(
     "--names",
     metavar="PATTERN",
