@@ -9,14 +9,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from tactile_bayes.declarations import Meta, Record
-from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import load_toml, parse_record
+from tactile_bayes.errors import BadDataError, in_file
+from tactile_bayes.files.documents import parse_record, parse_toml
+from tactile_bayes.files.reading import TOML_BYTES, read_text
 from tactile_bayes.files.tables import RawTable, Table, composed, parse_date, read_raw
 from tactile_bayes.presets import MM_PER_UNIT
 
+_WAY_OUT: Final = "see the column mapping in the tutorial"
 Unit = Literal["mm", "cm", "in"]
 Column = Annotated[str, Meta(min_length=1)]
 Modality = Annotated[
@@ -112,18 +114,10 @@ def _table(path: Path, rows: Sequence[Mapping[str, Any]], keys: Sequence[str], *
 
 
 def read_mapping(path: Path) -> ColumnMap:
-    """Read the mapping; for the errors see `files.documents.read_record`."""
-    document = load_toml(path, way_out="see the column mapping in the tutorial")
-    return parse_record(_composed_texts(document), ColumnMap, path=path)
-
-
-def _composed_texts(item: Any) -> Any:
-    """What stands in a document, with every text in one spelling."""
-    if isinstance(item, dict):
-        return {composed(key): _composed_texts(value) for key, value in item.items()}
-    if isinstance(item, list):
-        return [_composed_texts(value) for value in item]
-    return composed(item) if isinstance(item, str) else item
+    """Read the mapping, with every text in one spelling; for the errors see `files.documents.read_record`."""
+    with in_file(path):
+        text = composed(read_text(path, most=TOML_BYTES, way_out=_WAY_OUT))
+        return parse_record(parse_toml(text, way_out=_WAY_OUT), ColumnMap, path=path)
 
 
 class _Row(NamedTuple):

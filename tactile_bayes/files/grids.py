@@ -16,7 +16,7 @@ from tactile_bayes.files.arrays_layout import GridOptions
 from tactile_bayes.files.images import read_image
 from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, AXES, Grid, read_named, turned_by_axes
 from tactile_bayes.findings import Finding
-from tactile_bayes.geometry import BoolArray, FloatArray
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap, block_sums
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
@@ -237,9 +237,8 @@ def _of_arrays(path: Path, array: str) -> Grid:
             what = f"spacing_mm is {sides.dtype} of shape {sides.shape}"
             raise BadDataError(what, way_out="it must be one number")
         return Grid(arrays, (float(sides[0]), float(sides[-1])), notes=notes)
-    flat = {name: held for name, held in arrays.items() if held.ndim == 2 and min(held.shape) > 1}
-    if array:
-        flat = {name: held for name, held in flat.items() if name == array}
+    named = {name: held for name, held in arrays.items() if array in ("", name)}
+    flat = {name: held for name, held in named.items() if held.ndim == 2 and min(held.shape) > 1}
     if len(flat) == 1:
         ((name, values),) = flat.items()
         taken = () if array or len(arrays) == 1 else (f"the array {name!r} was taken",)
@@ -279,21 +278,18 @@ def without_values(values: FloatArray, no_value: Sequence[str]) -> tuple[FloatAr
 def _refuse_apart(values: FloatArray) -> None:
     """Refuse undeclared numbers that stand apart from all others, as fill values and dead lines do."""
     values = np.where(np.isfinite(values), values, np.nan)
-    found = _apart(values)
-    if found is None:
-        for axis, name in ((1, "column"), (0, "row")):
-            if line := _line_apart(values, axis):
-                what = f"{name} {line[0]} differs from those beside it by {line[1]:.3g}, others by up to {line[2]:.3g}"
-                way_out = f"leave its cells empty if that line is dead; if all are values, --no-value {ALL_ARE_VALUES}"
-                raise BadDataError(what, way_out=way_out)
-        return
-    number, where, rest = found
-    what = f"{number:g} in {where} stands apart from all other values"
-    if rest.size:
-        what += f", {rest.min():.4g} to {rest.max():.4g}"
-    way_out = f"if it means no value, give --no-value {number:.12g}"
-    way_out += "" if abs(number) > _BEYOND else f"; if all are values, --no-value {ALL_ARE_VALUES}"
-    raise BadDataError(what, way_out=way_out)
+    if found := _apart(values):
+        number, where, rest = found
+        what = f"{number:g} in {where} stands apart from all other values"
+        what += f", {rest.min():.4g} to {rest.max():.4g}" if rest.size else ""
+        way_out = f"if it means no value, give --no-value {number:.12g}"
+        way_out += "" if abs(number) > _BEYOND else f"; if all are values, --no-value {ALL_ARE_VALUES}"
+        raise BadDataError(what, way_out=way_out)
+    for axis, name in ((1, "column"), (0, "row")):
+        if line := _line_apart(values, axis):
+            what = f"{name} {line[0]} differs from those beside it by {line[1]:.3g}, others by up to {line[2]:.3g}"
+            way_out = f"leave its cells empty if that line is dead; if all are values, --no-value {ALL_ARE_VALUES}"
+            raise BadDataError(what, way_out=way_out)
 
 
 def _apart(values: FloatArray) -> tuple[float, str, FloatArray] | None:
@@ -539,7 +535,7 @@ def _first(wrong: BoolArray) -> tuple[int, ...]:
     return tuple(int(i) for i in np.argwhere(wrong)[0]) if wrong.any() else ()
 
 
-def _count(held: np.ndarray[Any, Any] | None, mean: FloatArray) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+def _count(held: np.ndarray[Any, Any] | None, mean: FloatArray) -> IndexArray:
     """Readings per cell: 1 where there is a value, unless the file has counts."""
     if held is None:
         count = np.isfinite(mean).astype(np.int64)
@@ -555,7 +551,7 @@ def _count(held: np.ndarray[Any, Any] | None, mean: FloatArray) -> np.ndarray[tu
     return count
 
 
-def _variance(held: np.ndarray[Any, Any] | None, count: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> FloatArray:
+def _variance(held: np.ndarray[Any, Any] | None, count: IndexArray) -> FloatArray:
     """Variance within a cell: 0 in a grid without variances, NaN where there is no data.
 
     It may also be NaN where a cell has a single reading: a sample variance, numpy's with ddof=1, does not exist there.

@@ -93,8 +93,9 @@ def _read(path: Path, given: ArrayMap, beside: Sequence[Source]) -> Source:
     if is_sequence(path):
         return read_sequence(path, given, frames=True)
     if is_text(path):
-        heads = [one.arrays["head_surface_mm"] for one in beside if "head_surface_mm" in one.arrays]
-        return read_frames(path, given, shape=heads[-1].shape[:2] if heads else None)
+        heads = (one.arrays["head_surface_mm"].shape[:2] for one in reversed(beside) if "head_surface_mm" in one.arrays)
+        shape = next(heads, None)
+        return read_frames(path, given if given.frame_shape else replace(given, frame_shape=shape))
     for name in (*given.arrays, *given.values):
         if name not in KNOWN:
             raise BadDataError(f"--columns: {name!r} is no array of a scan", way_out=meant(name, KNOWN))

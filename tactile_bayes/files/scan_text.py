@@ -366,15 +366,14 @@ _MOST_OF_POSES: Final = 24  # columns: a table of more holds readings, too
 _SAMPLED: Final = 50
 
 
-def read_frames(path: Path, given: Stated, *, shape: tuple[int, int] | None) -> Source:
-    """Read frames and, where the text has them, times, unit and rate; `shape` is the head's, where it is known."""
+def read_frames(path: Path, given: Stated) -> Source:
+    """Read frames and, where the text has them, times, unit and rate; the frames' shape is stated where it is known."""
     held, words = read_text_table(path, given.decimal)
     lines = _without_words(held)
-    shape = given.frame_shape or shape
     if header := next((line for line in lines if is_header_of_poses(line) and len(line.fields) < _MOST_OF_POSES), None):
         what = f"is a table of poses by line {header.number}"
         raise BadDataError(what, way_out="give the frames, and it as --poses")
-    blocks = _blocks(lines, None if shape is None else shape[0] * shape[1])
+    blocks = _blocks(lines, math.prod(given.frame_shape) if given.frame_shape else None)
     if beside := sum(one == NO_SENSEL for line in blocks[0] for one in line.fields):
         cells = f"{beside} cells {NO_SENSEL!r} from line {blocks[0][0].number} on"
         what = f"has {cells}, which Tekscan writes beside a sensor"
@@ -390,7 +389,7 @@ def read_frames(path: Path, given: Stated, *, shape: tuple[int, int] | None) -> 
         return _of_blocks(lines, blocks, stated, notes)
     rows = [line for block in blocks for line in block]
     names = before[-1].fields if before and len(before[-1].fields) == len(rows[0].fields) else []
-    return _of_rows(rows, names, shape, given, stated, notes)
+    return _of_rows(rows, names, given, stated, notes)
 
 
 def _without_words(lines: Sequence[Line]) -> Sequence[Line]:
@@ -512,19 +511,13 @@ def _times_between(titles: Sequence[Line], starts: Sequence[int]) -> FloatArray 
     return np.array(found)
 
 
-def _of_rows(
-    rows: Sequence[Line],
-    names: Sequence[str],
-    shape: tuple[int, int] | None,
-    given: Stated,
-    stated: Stated,
-    notes: list[str],
-) -> Source:
+def _of_rows(rows: Sequence[Line], names: Sequence[str], given: Stated, stated: Stated, notes: list[str]) -> Source:
     values = np.array([line.values for line in rows], dtype=np.float64)
     if counts_up(values[0][np.isfinite(values[0])]) and len(rows) > 1:
         notes.append(f"line {rows[0].number} counts {values[0, -2]:g}, {values[0, -1]:g}: taken for labels")
         values = values[1:]
-    taxels = None if shape is None else shape[0] * shape[1]
+    shape = given.frame_shape
+    taxels = math.prod(shape) if shape else None
     if taxels is not None and len(values) == taxels and values.shape[1] < taxels:
         notes.append(f"{taxels} rows of {values.shape[1]} numbers: rows are read as taxels, columns as frames")
         return Source({"frames": values.T}, stated, tuple(notes))
