@@ -13,6 +13,7 @@ from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.identify import describe
 from tactile_bayes.files.size_json import SHIPPED, size_calibration_path
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.mapping.select import intervals, missing_records
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scans import Scan
 from tactile_bayes.shell import padded, shown_columns
@@ -74,22 +75,12 @@ def describe_scan(scan: Scan) -> list[str]:
     return [
         f"{len(times)} frames of {scan.head.shape[0]} x {scan.head.shape[1]} taxels in {span:.3f} s, {_rate(times)}",
         f"{len(poses)} poses, {_rate(poses.time_s)}",
-        f"dropped frames {_dropped(times)}, dropped poses {_dropped(poses.time_s)}, "
+        f"dropped frames {missing_records(times)}, dropped poses {missing_records(poses.time_s)}, "
         f"duplicate pose stamps {duplicates}, saturated readings {saturated}",
         f"landmarks: {' and '.join(', '.join(marks).rsplit(', ', 1)) or 'not touched'}",
     ]
 
 
 def _rate(times: FloatArray) -> str:
-    steps = np.diff(times)
-    steps = steps[steps > 0]
-    return f"{1 / np.median(steps):.1f} Hz" if len(steps) else "no rate"
-
-
-def _dropped(times: FloatArray) -> int:
-    """Number of records missing, by the median period."""
-    steps = np.diff(times)
-    if not (steps > 0).any():
-        return 0
-    periods = np.rint(steps / np.median(steps[steps > 0]))
-    return int(np.clip(periods - 1, 0, None).sum())
+    steps, usual = intervals([times])
+    return f"{1 / usual:.1f} Hz" if len(steps) else "no rate"

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files import scan_mcap
@@ -19,7 +17,7 @@ from tactile_bayes.files.size_json import read_repeatability, read_size_calibrat
 from tactile_bayes.files.tables import header_of, read_table
 from tactile_bayes.findings import finding_lines, findings_in
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.select import Span, with_times
+from tactile_bayes.mapping.select import Span, missing_records, with_times
 from tactile_bayes.scans import HeadGeometry
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.pooling import Calibration
@@ -239,13 +237,10 @@ def _scan(path: Path) -> dict[str, Any]:
 
 def _recording(records: McapRecords, time_s: FloatArray) -> dict[str, Any]:
     """Losses: gaps between the frames' times, and the recorder's account if the file has one."""
-    steps = np.diff(time_s)
-    period = float(np.median(steps)) if len(steps) else 0.0
-    missing = int(np.clip(np.rint(steps / period) - 1, 0, None).sum()) if period > 0 else 0
     losses = ("frames_lost", "head_dropped", "poses_repeated", "poses_flagged", "flagged_why", "poses_missing")
     names = (*losses, "missing_why", "other_tools", "overrun_bytes", "ended_by", "fault")
     account = records.metadata.get("recording", {})
     told = {name: account[name] for name in names if account.get(name)}
     logs = [number for number, channel in records.channels.items() if channel.topic == "/log"]
     notes = sum(len(records.by_channel.get(number, ())) for number in logs)
-    return {"frames_missing": missing, "notes": notes} | ({"recording": told} if told else {})
+    return {"frames_missing": missing_records(time_s), "notes": notes} | ({"recording": told} if told else {})

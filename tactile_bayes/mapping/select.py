@@ -142,14 +142,14 @@ def timing_figures(scans: Sequence[Scan]) -> dict[str, float]:
     return {
         **_regularity("frame", frames),
         **_regularity("pose", poses),
-        "frames_missing": float(sum(_missing(time) for time in frames)),
+        "frames_missing": float(sum(missing_records(time) for time in frames)),
         "frames_repeated": float(sum(int((np.diff(time) == 0).sum()) for time in frames)),
         "pose_repeats": float(sum(len(scan.poses) - len(one) for scan, one in zip(scans, fresh, strict=True))),
         "pose_gap_ms": 1000.0 * max((float(np.diff(time).max(initial=0.0)) for time in poses), default=0.0),
     }
 
 
-def _intervals(times: list[FloatArray]) -> tuple[FloatArray, float]:
+def intervals(times: list[FloatArray]) -> tuple[FloatArray, float]:
     """Intervals above 0 between records, and the usual one; NaN without any."""
     steps = np.concatenate([np.diff(time) for time in times])
     steps = steps[steps > 0]
@@ -158,16 +158,16 @@ def _intervals(times: list[FloatArray]) -> tuple[FloatArray, float]:
 
 def _regularity(name: str, times: list[FloatArray]) -> dict[str, float]:
     """Rate, and standard deviation of the intervals that contain no gap."""
-    steps, usual = _intervals(times)
+    steps, usual = intervals(times)
     if not len(steps):
         return {}
     regular = steps[steps < _GAP_INTERVALS * usual]
     return {f"{name}_rate_hz": 1.0 / usual, f"{name}_jitter_ms": 1000.0 * float(regular.std())}
 
 
-def _missing(time_s: FloatArray) -> int:
-    """Number of frames missing in the gaps."""
-    steps, usual = _intervals([time_s])
+def missing_records(time_s: FloatArray) -> int:
+    """Number of frames, or poses, missing in the gaps."""
+    steps, usual = intervals([time_s])
     return int(np.rint(steps[steps >= _GAP_INTERVALS * usual] / usual - 1).sum())
 
 
