@@ -97,8 +97,7 @@ def _of_another_kind(path: Path, start: bytes) -> BadDataError:
     return BadDataError(what, way_out="save the arrays with numpy.savez_compressed")
 
 
-AXES: Final = ("x", "y")
-"""Places of the columns and rows of a grid, or of each of its cells."""
+AXES: Final = ("x", "y")  #: Places of the columns and rows of a grid, or of each of its cells.
 
 
 def turned_by_axes(arrays: Arrays) -> tuple[str, ...]:

@@ -58,14 +58,12 @@ class CoarseFrames(Record, eq=False):
     """(m, k) array: Mean over a block of frames and a block of taxels, each frame over its own mean."""
     frames: IndexArray  #: (n,) int array: The scan's frames that were averaged.
     first: IndexArray  #: (m,) int array: Where each block of frames begins among them.
-    weight: FloatArray
-    """(t, k) array: Share of each good taxel in each block of taxels; columns add up to 1."""
+    weight: FloatArray  #: (t, k) array: Share of each good taxel in each block of taxels; columns add up to 1.
     row: IndexArray
     block: IndexArray
     """`row`, `block` (k,) int arrays: Which rows of the head a block of taxels is of, and its number among all blocks
     of the head."""
-    basis: FloatArray
-    """(k, 6) array: Orthonormal: a level, two slopes and three curvatures over the head's blocks."""
+    basis: FloatArray  #: (k, 6) array: Orthonormal: a level, two slopes and three curvatures over the head's blocks.
 
     @classmethod
     def of(cls, selection: SelectedFrames, frames: IndexArray) -> CoarseFrames:

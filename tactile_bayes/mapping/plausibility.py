@@ -21,26 +21,18 @@ from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
 from tactile_bayes.mapping.select import SelectedFrames, frame_figures, refuse_without_frames, timing_figures
 from tactile_bayes.scans import HeadShape, Landmarks
 
-RATE_HZ: Final = (5.0, 2000.0)
-"""Of frames."""
+RATE_HZ: Final = (5.0, 2000.0)  #: Of frames.
 LEAST_FRAMES, LEAST_USED_SHARE = 30, 0.05
-LEAST_AREA: Final = 1.5
-"""Of a map, in areas of the array: a head that stood still covers its own and its noise."""
-MOST_SPAN_MM: Final = 600.0
-"""Of the places along one axis: a chest is narrower."""
+LEAST_AREA: Final = 1.5  #: Of a map, in areas of the array: a head that stood still covers its own and its noise.
+MOST_SPAN_MM: Final = 600.0  #: Of the places along one axis: a chest is narrower.
 IMPOSSIBLE_MM: Final = 3000.0
-SIDE_MM: Final = (5.0, 200.0)
-"""Of an array."""
-MOST_RATIO: Final = 1.5
-"""Of the distance between taxels to the pitch, or of the pitch to the distance."""
-MOST_ZIGZAG_MM: Final = 3.0
-"""Median distance of a pose from the middle of the two beside it."""
+SIDE_MM: Final = (5.0, 200.0)  #: Of an array.
+MOST_RATIO: Final = 1.5  #: Of the distance between taxels to the pitch, or of the pitch to the distance.
+MOST_ZIGZAG_MM: Final = 3.0  #: Median distance of a pose from the middle of the two beside it.
 FROZEN_S, MOST_FROZEN = 0.3, 0.1
 """Frames that repeat each other for so long are the array's last one; their share among those used."""
-MOST_FLICKER: Final = 0.7
-"""Of `_flicker`: 0.2 at most in 466 right scans, 1 in noise."""
-_STILL_TAXELS: Final = 0.01
-"""Share of the taxels that may change in a frame that repeats the last one."""
+MOST_FLICKER: Final = 0.7  #: Of `_flicker`: 0.2 at most in 466 right scans, 1 in noise.
+_STILL_TAXELS: Final = 0.01  #: Share of the taxels that may change in a frame that repeats the last one.
 MOST_REPEATED: Final = 0.4  # where each frame is there twice, half of them repeat the one before
 PLATEAU: Final = 30
 TAXEL_PLATEAU: Final = 10
@@ -48,20 +40,15 @@ TAXEL_PLATEAU: Final = 10
 it are fewer: 66 right scans have up to 5 of one taxel."""
 MOST_SATURATED, MOST_DROPPED = 0.02, 0.2
 """Share of the readings at full scale, and of the frames with too many taxels that are, or are faulty."""
-COARSEST_COUNT: Final = 0.1
-"""A count over the mean pressure: a lump's rise is a few tenths of it."""
-WRAPPED: Final = 2000
-"""So far below 65,536 a reading is one below 0, or stands for none."""
-LANDMARKS_MM: Final = (80.0, 350.0)
-"""From the sternal notch to the xiphoid."""
-MOST_REACH_MM: Final = 500.0
-"""From the xiphoid to the head."""
+COARSEST_COUNT: Final = 0.1  #: A count over the mean pressure: a lump's rise is a few tenths of it.
+WRAPPED: Final = 2000  #: So far below 65,536 a reading is one below 0, or stands for none.
+LANDMARKS_MM: Final = (80.0, 350.0)  #: From the sternal notch to the xiphoid.
+MOST_REACH_MM: Final = 500.0  #: From the xiphoid to the head.
 LEAST_GAP, LEAST_RANGE = 0.4, 12.0
 """Cells are far outside the rest where so large a share of the values' range is empty, in a range of so many quartile
 distances."""
 _MOST_LEVELS: Final = 9.0  # of a value that is taken for one: fill values would cover the rest
-LEAST_GRID_CM2: Final = 4.0
-"""Of a grid whose head is not known."""
+LEAST_GRID_CM2: Final = 4.0  #: Of a grid whose head is not known.
 DIP_MM, LEAST_DIP, DIP_OVER_RISE = 6.0, 0.15, 1.5
 """A map that in means of so large squares dips by so much of its level, and so many times what it rises by, is of
 readings that fall where pressure rises: right ones dip by less than they rise, or by 0.1."""
