@@ -72,8 +72,7 @@ def import_action(
         lines, failed = _import(sources[0], output, wanted), EXIT_DONE
     else:
         lines, failed = _import_each(sources, output, wanted)
-    for line in (*lines, RESEARCH_USE):
-        click.echo(line)
+    click.echo("\n".join([*lines, RESEARCH_USE]))
     return failed
 
 

@@ -23,11 +23,7 @@ def show_action(file: Path, as_json: bool) -> None:
     """Show what a file holds: schema, shape, units, quality, provenance."""
     shipped = size_calibration_path(file.name) if str(file) in SHIPPED and not file.exists() else None
     found = describe(shipped or file)
-    if as_json:
-        click.echo(dump_json(found), nl=False)
-        return
-    for line in (*shown(found), RESEARCH_USE):
-        click.echo(line)
+    click.echo(dump_json(found) if as_json else "\n".join([*shown(found), RESEARCH_USE, ""]), nl=False)
 
 
 _MOST_NUMBERS = 30  #: Of a list that is shown whole.
