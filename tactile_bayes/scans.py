@@ -48,8 +48,7 @@ class HeadShape(Record):
 
     @classmethod
     def of(cls, surface_mm: FloatArray, pitch_mm: float, *, rim_mm: float | None = None) -> HeadShape:
-        """Shape of a head from its (rows, columns, 3) taxel centres in `scanhead`: origin at the apex, z into the
-        tissue, mm.
+        """Shape of a head from its (rows, columns, 3) taxel centres, mm: origin at the apex, z into the tissue.
 
         Least squares of :math:`z = c + s_x x + s_y y - (x^2 + z^2)/(2 R_x) - y^2/(2 R_y)`, which holds to the digit for
         a cylinder, a sphere and a plane, tilted or not.

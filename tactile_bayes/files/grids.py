@@ -336,9 +336,7 @@ def _line_apart(values: FloatArray, axis: int) -> tuple[int, float, float] | Non
 
 
 def _steps(values: FloatArray, cells: BoolArray, which: np.ufunc) -> FloatArray:
-    """Absolute differences between neighbours: inside the given cells (`np.logical_and`), or across their border
-    (`np.logical_xor`).
-    """
+    """Absolute differences of neighbours: inside cells (`np.logical_and`) or across their border (`logical_xor`)."""
     across = np.abs(np.diff(values, axis=1))[which(cells[:, 1:], cells[:, :-1])]
     along = np.abs(np.diff(values, axis=0))[which(cells[1:], cells[:-1])]
     steps: FloatArray = np.concatenate([across, along])

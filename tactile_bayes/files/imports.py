@@ -54,9 +54,7 @@ def read_arrays(path: Path) -> Scan:
 
 
 def import_arrays(path: Path, given: ArrayMap, beside: Sequence[Source] = ()) -> tuple[Scan, list[str]]:
-    """Read a scan from a file of arrays, and from what stands beside it, and a line for each thing that was guessed or
-    left out; errors name the file and the array.
-    """
+    """A scan from a file of arrays and what stands beside it, and a line for each guess; errors name file and array."""
     with in_file(path):
         own = replace(_read(path, given, beside), path=str(path))
     try:

@@ -29,11 +29,7 @@ _HEADERS: Final = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.f
 
 
 def load_npz(path: Path, *, required: Sequence[str], optional: Sequence[str]) -> Arrays:
-    """Read the named arrays of an .npz file.
-
-    An encrypted file, one that unpacks to more than its limit and an array that only pickle could read are errors. They
-    name no path.
-    """
+    """Read the named arrays of an .npz file; errors, also of a file that is encrypted or too large, name no path."""
 
     def wanted(names: Sequence[str]) -> Sequence[str]:
         if missing := [name for name in required if name not in names]:

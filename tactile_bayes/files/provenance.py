@@ -67,10 +67,7 @@ def scans_of(document: object) -> tuple[dict[str, str], ...]:
 
 
 def recordings(scans: Sequence[Mapping[str, str]]) -> Iterator[str]:
-    """Digests of scans' frames and files, which tell their recordings from others.
-
-    Two exams are of one recording where they share any of them.
-    """
+    """Digests of scans' frames and files: two exams are of one recording where they share any of them."""
     for scan in scans:
         yield from (f"{name} {scan[name]}" for name in _DIGESTS if scan.get(name))
 

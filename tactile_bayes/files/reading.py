@@ -98,9 +98,7 @@ def other_encoding(data: bytes) -> str:
 def decoded(
     data: bytes, *, path: Path, way_out: str, as_utf8: str = "save it as UTF-8", may_be: Sequence[str] = ()
 ) -> str:
-    """Text of bytes in UTF-8, with or without a byte order mark, or in another encoding of those that it `may_be`;
-    other bytes are named with their line.
-    """
+    """Text of bytes in UTF-8, with or without a byte order mark, or in what it `may_be`; others are named by line."""
     other = other_encoding(data)
     if other and other not in may_be:
         raise BadDataError(f"is {other} text", way_out=as_utf8, path=str(path))
@@ -113,9 +111,7 @@ def decoded(
 
 
 def check_limit(size: int, most: int, *, what: str) -> None:
-    """Refuse a declared size over `most` times ``TACTILE_BAYES_LIMITS``; `what` is a sentence with ``{}`` for the
-    number: ``"mean has {} cells"``.
-    """
+    """Refuse a declared size over `most` times ``TACTILE_BAYES_LIMITS``, in words such as ``"mean has {} cells"``."""
     allowed = most * limit_factor()
     if size > allowed:
         over = f"{what.format(f'{size:,}')}, over the limit of {int(allowed):,}"
@@ -141,8 +137,7 @@ def limit_factor() -> float:
 
 @contextlib.contextmanager
 def decoding(what: str, *, way_out: str) -> Iterator[None]:
-    """Turn any error of a decoder on damaged bytes into one `BadDataError`; `what` is the fault: ``"cannot be
-    decoded"``.
+    """Turn any error of a decoder on damaged bytes into one `BadDataError`; `what` it says: ``"cannot be decoded"``.
 
     Only calls into decoders of other packages belong inside: each of them has error classes of its own, and damaged
     bytes bring out others as well.

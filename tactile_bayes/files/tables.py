@@ -245,9 +245,7 @@ def csv_cell(value: object, digits: int | None = None) -> str:
 
 
 def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Table]) -> None:
-    """Check by the schema's ``foreignKeys`` that each row refers to an existing row of `targets`, which has the other
-    tables by the schema's names (``excision``).
-    """
+    """Check by the schema's ``foreignKeys`` that each row refers to one of `targets`, tables by the names in there."""
     for key in load_schema(schema_name).get("foreignKeys", []):
         target = targets[key["reference"]["resource"]]
         known = set(_keys(target, key["reference"]["fields"]))

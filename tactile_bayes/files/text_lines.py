@@ -80,8 +80,7 @@ def read_lines(path: Path) -> list[str]:
 def read_text_table(path: Path, decimal: str | None = None) -> tuple[list[Line], str]:
     """The lines of a text that are not blank, and how their fields are separated: so that most of them are numbers.
 
-    `decimal` is ``"point"`` or ``"comma"`` where it is stated, without which commas that may separate thousands are
-    refused.
+    Where no `decimal` (``"point"`` or ``"comma"``) is stated, commas that may separate thousands are refused.
     """
     texts = read_lines(path)
     separator = separator_of(texts)
