@@ -44,8 +44,7 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
     texts = text_lines.read_lines(path)
     separator = text_lines.separator_of(texts, words) or ","
     rows = [text_lines.fields_of(one, separator) for one in texts]
-    commas = text_lines.with_comma(rows, words)
-    text_lines.refuse_thousands(commas, way_out="write numbers without commas")
+    commas = text_lines.with_comma(rows, words, way_out="write numbers without commas")
     decimal = {one for one in commas if one.count(",") == 1}
     rows = [[field.replace(",", ".") if field in decimal else field for field in row] for row in rows]
     first, last = _numbers_within(rows, no_value)

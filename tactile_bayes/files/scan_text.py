@@ -501,12 +501,10 @@ def _times_between(titles: Sequence[Line], starts: Sequence[int]) -> FloatArray 
     for start in starts:
         texts = [line.text for line in titles if before < line.number < start]
         match = next((one for text in reversed(texts) if (one := _TIME_LINE.search(text))), None)
-        if match is None:
+        time = None if match is None else number(match[1], decimal_comma=True)
+        if match is None or time is None:
             return None
-        try:
-            found.append(number(match[1], decimal_comma=True) * (0.001 if (match[2] or "").lower() == "ms" else 1.0))
-        except ValueError:
-            return None
+        found.append(time * (0.001 if (match[2] or "").lower() == "ms" else 1.0))
         before = start
     return np.array(found)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import re
 from collections.abc import Iterable, Sequence
@@ -49,20 +50,21 @@ class Line(Record):
         return None not in self.values
 
 
-def number(text: str, *, decimal_comma: bool = False) -> float:
-    """A number, a time of day in s, or a date and time in s since 1970; NaN for no value, else a ValueError."""
+def number(text: str, *, decimal_comma: bool) -> float | None:
+    """A number, a time of day in s, or a date and time in s since 1970; NaN for no value, None for anything else."""
     text = text.strip(_AROUND)
     try:
         return float(text.replace(",", ".") if decimal_comma and _DECIMAL_COMMA.fullmatch(text) else text)
     except ValueError:
         if text.lower() in _NO_VALUE:
             return float("nan")
-    if _DATED.fullmatch(text):
-        found = datetime.fromisoformat(text)
-        return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
     if clock := _CLOCK.fullmatch(text.replace(",", ".")):
         return 3600 * int(clock[1] or 0) + 60 * int(clock[2]) + float(clock[3])
-    raise ValueError(text)
+    with contextlib.suppress(ValueError):  # of a day that there is not
+        if _DATED.fullmatch(text):
+            found = datetime.fromisoformat(text)
+            return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
+    return None
 
 
 def read_lines(path: Path) -> list[str]:
@@ -96,22 +98,14 @@ def read_text_table(path: Path, decimal: str | None = None) -> tuple[list[Line],
                 fields.pop()
             split.append((i, one, fields, i > before + 1))
             before = i
-    commas = with_comma(fields for _, _, fields, _ in split)
-    if decimal is None:
-        refuse_thousands(commas, way_out="state which, --decimal comma")
+    way_out = "state which, --decimal comma" if decimal is None else ""
+    commas = with_comma((fields for _, _, fields, _ in split), way_out=way_out)
     comma = decimal != "point" and bool(commas)
     lines = [
-        Line(i, text, fields, [_value(one, decimal_comma=comma) for one in fields], after)
+        Line(i, text, fields, [number(one, decimal_comma=comma) for one in fields], after)
         for i, text, fields, after in split
     ]
     return lines, f"fields between {_SEPARATORS[separator]}{', decimal commas' if comma else ''}"
-
-
-def _value(text: str, *, decimal_comma: bool) -> float | None:
-    try:
-        return number(text, decimal_comma=decimal_comma)
-    except ValueError:
-        return None
 
 
 def separator_of(texts: Sequence[str], marks: Sequence[str] = ()) -> str:
@@ -137,7 +131,7 @@ def _of_numbers(fields: Sequence[str], marks: Sequence[str]) -> bool:
 
 
 def _is_number(text: str, marks: Sequence[str]) -> bool:
-    return text in marks or may_be_thousands(text) or _value(text, decimal_comma=True) is not None
+    return text in marks or may_be_thousands(text) or number(text, decimal_comma=True) is not None
 
 
 def fields_of(text: str, separator: str) -> list[str]:
@@ -147,18 +141,18 @@ def fields_of(text: str, separator: str) -> list[str]:
         return [one.strip() for one in next(csv.reader([text], delimiter=separator, skipinitialspace=True), [])]
 
 
-def with_comma(rows: Iterable[Sequence[str]], marks: Sequence[str] = ()) -> list[str]:
-    """Fields of the table's lines that are numbers with a decimal comma, or with commas between thousands."""
+def with_comma(rows: Iterable[Sequence[str]], marks: Sequence[str] = (), *, way_out: str) -> list[str]:
+    """Fields of the table's lines that are numbers with a decimal comma, or with commas between thousands.
+
+    All of them may not be of the latter, where there is a way out of that.
+    """
     fields = (field for row in rows if _of_numbers(row, marks) for field in row)
-    return [one for one in fields if _DECIMAL_COMMA.fullmatch(one) or may_be_thousands(one)]
-
-
-def refuse_thousands(commas: Sequence[str], *, way_out: str) -> None:
-    """Refuse numbers with commas all of which may separate thousands."""
-    if commas and all(map(may_be_thousands, commas)):
+    commas = [one for one in fields if _DECIMAL_COMMA.fullmatch(one) or may_be_thousands(one)]
+    if way_out and commas and all(map(may_be_thousands, commas)):
         first = commas[0]
         what = f"holds {first!r}, which is {first.replace(',', '')} or {first.replace(',', '.', 1)}"
         raise BadDataError(what, way_out=way_out)
+    return commas
 
 
 def counts_up(line: FloatArray) -> bool:
