@@ -57,15 +57,9 @@ class HeadShape(Record):
         terms = np.stack([np.ones_like(x), x, y, -(x * x + z * z) / 2, -(y * y) / 2], axis=1)
         coefficients = np.linalg.lstsq(terms, z, rcond=None)[0]
         uneven = float(np.sqrt(np.mean((terms @ coefficients - z) ** 2)))
-        return cls(
-            surface_mm.shape[0],
-            surface_mm.shape[1],
-            round(float(pitch_mm), 4),
-            _radius(float(coefficients[3])),
-            _radius(float(coefficients[4])),
-            round(uneven, 3) + 0.0,
-            rim_mm,
-        )
+        rows, columns, _ = surface_mm.shape
+        across, along = (_radius(float(curvature)) for curvature in coefficients[3:])
+        return cls(rows, columns, round(float(pitch_mm), 4), across, along, round(uneven, 3) + 0.0, rim_mm)
 
     def differences(self, other: HeadShape) -> list[str]:
         """In what another head departs from this one by more than a calibration bears, in words; empty without any."""
@@ -75,9 +69,8 @@ class HeadShape(Record):
         sides = zip(self.sides_mm, other.sides_mm, strict=True)
         if not all(_near(ours, theirs, SIDE_SHARE) for ours, theirs in sides):
             pairs.append(("array", self._array(), other._array()))
-        for axis, ours, theirs, side in zip(
-            ("across", "along"), self._curvatures(), other._curvatures(), self.sides_mm, strict=True
-        ):
+        curved = zip(("across", "along"), self._curvatures(), other._curvatures(), self.sides_mm, strict=True)
+        for axis, ours, theirs, side in curved:
             if abs(ours - theirs) * side**2 / 8 > RISE_MM:
                 pairs.append((f"face {axis} the head", _arc(ours), _arc(theirs)))
         if abs(self.uneven_mm - other.uneven_mm) > UNEVEN_MM:
@@ -135,19 +128,16 @@ CountArray = NDArray[np.uint16]
 def _check_finite(array: FloatArray, *, name: str, shape: tuple[int | None, ...]) -> FloatArray:
     """Return the array as float64 after checking shape (None is any length) and finiteness."""
     values = np.asarray(array, dtype=np.float64)
-    fits = values.ndim == len(shape) and all(
-        want in (None, have) for want, have in zip(shape, values.shape, strict=True)
-    )
-    if not fits:
+    if values.ndim != len(shape) or any(
+        want not in (None, have) for want, have in zip(shape, values.shape, strict=True)
+    ):
         wanted = "(" + ", ".join("n" if want is None else str(want) for want in shape) + ")"
         raise BadDataError(f"{name} has shape {values.shape}", way_out=f"it must be {wanted}")
     bad = np.argwhere(~np.isfinite(values))
     if len(bad):
         index = tuple(int(i) for i in bad[0])
-        raise BadDataError(
-            f"{name} has {len(bad)} values that are not finite (first at {index}: {values[index]})",
-            way_out="mask or repair them before import",
-        )
+        what = f"{name} has {len(bad)} values that are not finite (first at {index}: {values[index]})"
+        raise BadDataError(what, way_out="mask or repair them before import")
     view = values.view()
     view.flags.writeable = False
     return view
@@ -158,10 +148,8 @@ def _check_times(time_s: FloatArray, *, name: str) -> FloatArray:
     back = np.flatnonzero(np.diff(values) < 0)
     if len(back):
         i = int(back[0]) + 1
-        raise BadDataError(
-            f"{name} runs backwards at index {i} ({values[i]:.6f} after {values[i - 1]:.6f})",
-            way_out="sort by time; where a clock began anew, cut the scan there",
-        )
+        what = f"{name} runs backwards at index {i} ({values[i]:.6f} after {values[i - 1]:.6f})"
+        raise BadDataError(what, way_out="sort by time; where a clock began anew, cut the scan there")
     if len(values) and values[0] < 0:
         raise BadDataError(f"{name} starts at {values[0]:.6f} s", way_out="times must not be negative")
     return values
@@ -204,10 +192,8 @@ class ElementCalibration(Record, eq=False):
         offset = _check_finite(self.offset_kpa, name="offset_kpa", shape=gain.shape)
         if gain.size and not gain.min() >= 0:
             index = tuple(int(i) for i in np.argwhere(gain < 0)[0])
-            raise BadDataError(
-                f"gain_kpa_per_count is negative at {index} ({gain[index]:.4g})",
-                way_out="correct it, or calibrate anew",
-            )
+            what = f"gain_kpa_per_count is negative at {index} ({gain[index]:.4g})"
+            raise BadDataError(what, way_out="correct it, or calibrate anew")
         settle(self, gain_kpa_per_count=gain, offset_kpa=offset)
 
     def linear_kpa(self, counts: CountArray | FloatArray) -> FloatArray:
@@ -230,10 +216,8 @@ class PressureFrames(Record, eq=False):
     def __post_init__(self) -> None:
         time = _check_times(self.time_s, name="frame_time_s")
         if self.counts.dtype != np.uint16 or self.counts.ndim != 3 or len(self.counts) != len(time):
-            raise BadDataError(
-                f"counts is {self.counts.dtype} of shape {self.counts.shape} for {len(time)} frame times",
-                way_out="it must be uint16 (n, rows, columns), one frame per time",
-            )
+            what = f"counts is {self.counts.dtype} of shape {self.counts.shape} for {len(time)} frame times"
+            raise BadDataError(what, way_out="it must be uint16 (n, rows, columns), one frame per time")
         view = self.counts.view()
         view.flags.writeable = False
         settle(self, time_s=time, counts=view)
@@ -264,10 +248,8 @@ class TrackerPoses(Record, eq=False):
         off = np.flatnonzero(np.abs(norm - 1.0) > 1e-2)
         if len(off):
             i = int(off[0])
-            raise BadDataError(
-                f"quaternion_wxyz has norm {norm[i]:.4g} at index {i} ({len(off)} in all depart from 1 by over 1 %)",
-                way_out="give unit quaternions, scalar first",
-            )
+            what = f"quaternion_wxyz has norm {norm[i]:.4g} at index {i} ({len(off)} in all depart from 1 by over 1 %)"
+            raise BadDataError(what, way_out="give unit quaternions, scalar first")
         settle(self, time_s=time, position_mm=position, quaternion_wxyz=quaternion)
 
     def __len__(self) -> int:

@@ -48,9 +48,8 @@ def check_action(
         if output is not None:
             doubted = any(one.kind not in _OF_RECORDING for one in check.doubts)
             if check.too_short or check.findings or doubted:
-                raise BadDataError(
-                    "the scan does not show that its head is right", way_out="scan a phantom with a lump"
-                )
+                what = "the scan does not show that its head is right"
+                raise BadDataError(what, way_out="scan a phantom with a lump")
             day = datetime.now(tz=UTC).date().isoformat()
             write_head(output, replace(scan.head, checked_on=day), force=force)
             click.echo(f"{output}: the head, checked on {day}")

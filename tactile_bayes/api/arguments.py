@@ -45,11 +45,8 @@ def _keyword(found: re.Match[str]) -> str:
         return name
     if value.lstrip("-")[0] in "0123456789.":
         return f"{name}={value}"
-    return (
-        f'{name}="{value}"'
-        if name in (*_CHOICES, "size_calibration") and value not in ("or", "is")
-        else f"{name} {value}"
-    )
+    chosen = name in (*_CHOICES, "size_calibration") and value not in ("or", "is")
+    return f'{name}="{value}"' if chosen else f"{name} {value}"
 
 
 def door(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:

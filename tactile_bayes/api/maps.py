@@ -85,15 +85,9 @@ class Map(Record, eq=False):
 
         found = self.tactile_map
         rows, columns = np.nonzero(found.covered)
-        return pandas.DataFrame(
-            {
-                "x_mm": found.x_mm[columns],
-                "y_mm": found.y_mm[rows],
-                "mean": found.mean[rows, columns],
-                "variance": found.variance[rows, columns],
-                "count": found.count[rows, columns],
-            }
-        )
+        places = {"x_mm": found.x_mm[columns], "y_mm": found.y_mm[rows]}
+        values = {name: getattr(found, name)[rows, columns] for name in ("mean", "variance", "count")}
+        return pandas.DataFrame({**places, **values})
 
     @door
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:

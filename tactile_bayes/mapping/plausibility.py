@@ -318,10 +318,8 @@ def _of_cells(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
     readings = frames * (1 if head is None else head.rows * head.columns)
     if saturated > MOST_SATURATED * readings:
         share = 100 * saturated / readings
-        yield (
-            f"{share:.1f} % of the readings were at full scale and left out, where a lump would press",
-            "press less hard",
-        )
+        text = f"{share:.1f} % of the readings were at full scale and left out, where a lump would press"
+        yield text, "press less hard"
     if head is None and area < LEAST_GRID_CM2 * 100:
         text = f"the grid covers {area / 100:.2g} cm2: a lump and what lies beside it need more"
         yield text, "scan with strokes side by side"
