@@ -113,14 +113,11 @@ def _site_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
     site = calibration.site
     middle, low, high = site.percent(site.phantoms_log_width)
     kept = ("base", "phantoms", "maps", "mean", "covariance", "uses_fat", "fit", "cautions", "left_out")
+    told = {name: document["site"][name] for name in kept}
     return {
         "schema": document["schema"],
         "kind": "size calibration corrected by phantoms",
-        "correction": {
-            "percent": middle,
-            "percent_interval": [low, high],
-            **{name: document["site"][name] for name in kept},
-        },
+        "correction": {"percent": middle, "percent_interval": [low, high], **told},
         "base": _described(calibration, document["base"]),
         "provenance": document["provenance"],
     }

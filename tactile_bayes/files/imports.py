@@ -13,7 +13,7 @@ from unicodedata import normalize
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import BadDataError, in_file, meant
 from tactile_bayes.files.arrays_layout import KNOWN, LAYOUT, OPTIONAL, ArrayMap, Shape, Stated, in_words
 from tactile_bayes.files.instrument import read_array_calibration, read_head_geometry, read_landmarks
@@ -148,13 +148,7 @@ def of_head(given: Path | HeadGeometry) -> Source:
 def of_calibration(given: Path | ElementCalibration) -> Source:
     """Arrays of a scan that are the calibration of its array."""
     found = given if isinstance(given, ElementCalibration) else read_array_calibration(given).calibration
-    return Source(
-        {
-            "gain_kpa_per_count": found.gain_kpa_per_count,
-            "offset_kpa": found.offset_kpa,
-            "saturation_count": np.asarray(found.saturation_count),
-        }
-    )
+    return Source({name: np.asarray(getattr(found, name)) for name in names_of(found)})
 
 
 def of_landmarks(given: Path | Landmarks) -> Source:
