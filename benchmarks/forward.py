@@ -25,7 +25,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,9 +34,10 @@ from scipy.sparse.linalg import splu
 
 from benchmarks.measure import environment
 from tactile_bayes.forward.contact import ContactStiffness, Head, solve_contact
-from tactile_bayes.forward.mesh import QuadMesh, body_mesh, disc_mesh, joined, rectangle_mesh
+from tactile_bayes.forward.mesh import QuadMesh, body_mesh, disc_mesh
 from tactile_bayes.forward.plane import assemble, build_line, condense, head_positions, press, skin_average
 from tactile_bayes.forward.tissue import Body
+from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import MEAN_KPA
 from tactile_bayes.studies.paper import fit_line
 
@@ -108,6 +109,25 @@ def growth() -> list[dict[str, float]]:
             {"fineness": fineness, "dofs": dofs, "seconds": spent, "amplitude": fit.amplitude, "sigma_mm": fit.sigma_mm}
         )
     return rows
+
+
+def rectangle_mesh(x_mm: FloatArray, z_mm: FloatArray) -> QuadMesh:
+    """A grid of quadrilaterals with corners at `x_mm` and `z_mm`, all of them fat: for bodies without a lump."""
+    x, z = (np.interp(np.arange(2 * len(one) - 1) / 2, np.arange(len(one)), one) for one in (x_mm, z_mm))
+    number, (n, m) = np.arange(len(x) * len(z)).reshape(len(x), -1), (len(x), len(z))
+    parts = [number[i : n - 2 + i : 2, j : m - 2 + j : 2].reshape(-1) for i in range(3) for j in range(3)]
+    nodes = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
+    return QuadMesh(nodes, np.stack(parts, axis=1), np.zeros(len(parts[0]), dtype=bool))
+
+
+def joined(meshes: Sequence[QuadMesh], *, scale_mm: float) -> QuadMesh:
+    """Merge several meshes into one; nodes nearer than 1e-8 of `scale_mm` become one."""
+    offsets = np.cumsum([0] + [len(mesh.nodes) for mesh in meshes])
+    points = np.concatenate([mesh.nodes for mesh in meshes])
+    key = np.round(points / (1e-8 * scale_mm)).astype(np.int64)
+    _, first, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    elements = [number.reshape(-1)[mesh.elements + offset] for mesh, offset in zip(meshes, offsets, strict=False)]
+    return QuadMesh(points[first], np.concatenate(elements), np.concatenate([mesh.gland for mesh in meshes]))
 
 
 class PlainBody:

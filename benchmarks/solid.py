@@ -17,18 +17,19 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, condense_lump, taxel_compliance
+from tactile_bayes.declarations import replace
+from tactile_bayes.forward.axisymmetric import CondensedLump, condense_lump, taxel_compliance
 from tactile_bayes.forward.contact import ContactStiffness, solve_contact
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize, lump_mesh
 from tactile_bayes.forward.scene import Head
-from tactile_bayes.forward.simulate import PlacedLump, SolidHead, face_of, skin_perturbation, solid_head
-from tactile_bayes.forward.tissue import SceneBody
+from tactile_bayes.forward.simulate import SkinPerturbation, SolidHead, head_face, skin_perturbation, solid_head
+from tactile_bayes.forward.tissue import Layers
 
 SCHEMA = "tactile-bayes/benchmarks/solid/1"
 LUMPS = {
-    "centred, h/d 1": LumpGeometry(7.5, 7.5, 15.0, 15.0, 70.0),
-    "resting, h/d 1": LumpGeometry(7.5, 7.5, 15.0, 24.0, 70.0),
-    "shallow, h/d 0.6": LumpGeometry(5.0, 5.0, 6.0, 6.0, 70.0),
+    "centred, h/d 1": LumpGeometry(7.5, 7.5, 15.0, Layers(15.0)),
+    "resting, h/d 1": LumpGeometry(7.5, 7.5, 15.0, Layers(24.0)),
+    "shallow, h/d 0.6": LumpGeometry(5.0, 5.0, 6.0, Layers(6.0)),
 }
 MESHES = {
     "coarse": MeshSize(arc=12, rings=4, core=2, grade=1.6),
@@ -50,17 +51,17 @@ def least_cpu(work: Callable[[], Any], runs: int) -> float:
 
 def head_on(geometry: LumpGeometry) -> SolidHead:
     """The default head on the body of a lump."""
-    layers = (geometry.fat_mm, geometry.thickness_mm - geometry.fat_mm)
-    return solid_head(face_of(Head()), LayeredBody((5.0, 50.0), layers))
+    return solid_head(head_face(Head()), geometry.layers)
 
 
-def sweep(head: SolidHead, lumps: Sequence[PlacedLump], count: int = 60) -> list[Any]:
+def sweep(head: SolidHead, lumps: Sequence[SkinPerturbation], count: int = 60) -> list[Any]:
     """Frames of one stroke across the lump, each from the contact of the one before."""
     frames: list[Any] = []
     touching = None
     for x in np.linspace(-30.0, 30.0, count):
-        frames.append(head.frame(lumps, rotation=np.eye(3), x_mm=float(x), y_mm=2.0, mean_kpa=9.5, touching=touching))
-        touching = frames[-1].contact.touching
+        frame, contact = head.frame(lumps, rotation=np.eye(3), x_mm=float(x), y_mm=2.0, mean_kpa=9.5, touching=touching)
+        frames.append(frame)
+        touching = contact.touching
     return frames
 
 
@@ -69,38 +70,37 @@ def mesh_rows(name: str, geometry: LumpGeometry, runs: int) -> list[dict[str, An
     head, made = head_on(geometry), dict[str, CondensedLump]()
     rows = []
     for mesh, size in MESHES.items():
-        seconds = least_cpu(lambda size=size: condense_lump(geometry, SceneBody(), size=size), runs)
-        made[mesh] = condense_lump(geometry, SceneBody(), size=size)
+        seconds = least_cpu(lambda size=size: condense_lump(geometry, size=size), runs)
+        made[mesh] = condense_lump(geometry, size=size)
         nodes = len(lump_mesh(geometry, size).node_mm)
         rows.append({"lump": name, "mesh": mesh, "unknowns": 3 * nodes, "orders": len(made[mesh].modes), "s": seconds})
     plain = over(head, [])
-    frames = {mesh: over(head, [PlacedLump(skin_perturbation(lump, 500.0), 0.0, 0.0)]) for mesh, lump in made.items()}
+    frames = {mesh: over(head, [skin_perturbation(lump, 500.0)]) for mesh, lump in made.items()}
     bump = np.abs(frames["finest"] - plain).max()
     for row in rows:
         row["off"] = float(np.abs(frames[row["mesh"]] - frames["finest"]).max() / bump)
     return rows
 
 
-def over(head: SolidHead, lumps: Sequence[PlacedLump]) -> Any:
+def over(head: SolidHead, lumps: Sequence[SkinPerturbation]) -> Any:
     """The frame centred on the lump."""
-    return head.frame(lumps, rotation=np.eye(3), x_mm=0.0, y_mm=0.0, mean_kpa=9.5).pressure_kpa
+    return head.frame(lumps, rotation=np.eye(3), x_mm=0.0, y_mm=0.0, mean_kpa=9.5)[0]
 
 
 def frame_rows(runs: int) -> list[dict[str, Any]]:
     """Milliseconds a frame without a lump, with one and with two, and for a plain inverse of the whole compliance."""
     geometry = LUMPS["centred, h/d 1"]
     head = head_on(geometry)
-    ball = skin_perturbation(condense_lump(geometry, SceneBody()), 500.0)
-    placed = [PlacedLump(ball, 0.0, 0.0), PlacedLump(ball, 30.0, 5.0)]
+    ball = skin_perturbation(condense_lump(geometry), 500.0)
+    placed = [ball, replace(ball, x_mm=30.0, y_mm=5.0)]
     rows = []
     for count in (0, 1, 2):
         lumps = placed[:count]
         seconds = least_cpu(lambda lumps=lumps: sweep(head, lumps), runs)
         rows.append({"what": f"frame, {count} lumps", "ms": 1000 * seconds / 60})
-    face = face_of(Head())
+    face = head_face(Head())
     rows_, columns = face.sensing.shape
-    layers = (geometry.fat_mm, geometry.thickness_mm - geometry.fat_mm)
-    compliance = taxel_compliance(LayeredBody((5.0, 50.0), layers), rows=rows_, columns=columns, pitch_mm=1.5)
+    compliance = taxel_compliance(geometry.layers, rows=rows_, columns=columns, pitch_mm=1.5)
     height = -face.surface_mm[..., 2].ravel()
     plain = least_cpu(lambda: solve_contact(ContactStiffness.of(compliance), height, mean_kpa=9.5), runs)
     return [*rows, {"what": "frame, inverse anew", "ms": 1000 * plain}]
@@ -109,7 +109,7 @@ def frame_rows(runs: int) -> list[dict[str, Any]]:
 def other_rows(runs: int) -> list[dict[str, Any]]:
     """What is done once a body and once a stiffness."""
     geometry = LUMPS["centred, h/d 1"]
-    lump = condense_lump(geometry, SceneBody())
+    lump = condense_lump(geometry)
     return [
         {"what": "body and head", "ms": 1000 * least_cpu(lambda: head_on(geometry), runs)},
         {"what": "another stiffness", "ms": 1000 * least_cpu(lambda: skin_perturbation(lump, 50.0), runs)},

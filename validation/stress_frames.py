@@ -29,20 +29,18 @@ from typing import Any
 import numpy as np
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.forward.axisymmetric import LayeredBody, skin_flexibility, taxel_compliance
-from tactile_bayes.forward.contact import ContactStiffness
+from tactile_bayes.forward.axisymmetric import skin_flexibility, taxel_compliance
+from tactile_bayes.forward.contact import Contact, ContactStiffness
 from tactile_bayes.forward.scene import Scene, frame_times, head_positions, level_kpa, record, rotation_from_vector
 from tactile_bayes.forward.simulate import (
-    PlacedLump,
-    SolidFrame,
+    SkinPerturbation,
     SolidHead,
     condensed_lump,
-    face_of,
-    layers_of,
+    head_face,
     skin_perturbation,
     solid_head,
 )
-from tactile_bayes.forward.tissue import SceneBody, fat_thickness
+from tactile_bayes.forward.tissue import Layers, SceneBody, fat_thickness
 from tactile_bayes.geometry import FloatArray, apply, inverse, quaternion_from_rotation, rotation_from_quaternion
 from tactile_bayes.scans import Scan, TrackerPoses
 
@@ -135,13 +133,13 @@ def stressed_frames(
     pressure = np.empty((len(time_s), scene.head.rows, scene.head.columns))
     depth, before = np.empty(len(time_s)), None
     for i in range(len(time_s)):
-        frame = model.frame(rotation[i], origin[i], kpa=float(level[i]), way=float(way[i]), before=before)
-        pressure[i], depth[i], before = frame.pressure_kpa, frame.depth_mm, frame
+        pressure[i], before = model.frame(rotation[i], origin[i], kpa=float(level[i]), way=float(way[i]), before=before)
+        depth[i] = before.depth_mm
     return pressure, depth
 
 
-def _nothing(lump: PlacedLump) -> PlacedLump:
-    return replace(lump, perturbation=replace(lump.perturbation, table=0.0 * lump.perturbation.table))
+def _nothing(lump: SkinPerturbation) -> SkinPerturbation:
+    return replace(lump, table=0.0 * lump.table)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,7 +161,7 @@ class _Model:
     """
 
     physics: Physics
-    stages: Sequence[tuple[SolidHead, PlacedLump]]
+    stages: Sequence[tuple[SolidHead, SkinPerturbation]]
     stage_kpa: Sequence[float]
     grid: tuple[FloatArray, Sequence[SolidHead]] | None
     shear: tuple[FloatArray, ...]
@@ -184,17 +182,17 @@ class _Model:
                 lump.stiffness_ratio * factor * body.fat_kpa,
                 square_mm=scene.head.pitch_mm,
             )
-            stages.append((_plain_head(scene, stiffened, fat), PlacedLump(change, lump.x_mm, lump.y_mm)))
+            stages.append((_plain_head(scene, stiffened, fat), replace(change, x_mm=lump.x_mm, y_mm=lump.y_mm)))
         grid = None if physics.varying is None else _grid(scene, body, fat, physics.varying, stages[0][0])
         face = stages[0][0].face
         shear: tuple[FloatArray, ...] = ()
         if physics.friction:
-            shear = _shear_sinking(layers_of(body, fat), face.sensing.shape, face.pitch_mm)
+            shear = _shear_sinking(body.layers(fat), face.sensing.shape, face.pitch_mm)
         return cls(physics, stages, [float(one) for one in kpa], grid, shear, _near(face.surface_mm))
 
     def frame(
-        self, rotation: FloatArray, origin: FloatArray, *, kpa: float, way: float, before: SolidFrame | None
-    ) -> SolidFrame:
+        self, rotation: FloatArray, origin: FloatArray, *, kpa: float, way: float, before: Contact | None
+    ) -> tuple[FloatArray, Contact]:
         """The frame at a pose, after the frame `before`; `way` is -1 to 1 along the strokes."""
         head, lumps = self._mixed(kpa)
         if self.grid is not None:
@@ -202,20 +200,21 @@ class _Model:
         lumps = [replace(one, x_mm=one.x_mm + self.physics.lag_mm * way) for one in lumps]
         head = replace(head, face=replace(head.face, surface_mm=self._surface(head, way * rotation[0], before)))
 
-        def solved(head: SolidHead, lumps: Sequence[Any]) -> SolidFrame:
-            touching = None if before is None else before.contact.touching
+        def solved(head: SolidHead, lumps: Sequence[Any]) -> tuple[FloatArray, Contact]:
+            touching = None if before is None else before.touching
             return head.frame(lumps, rotation=rotation, x_mm=origin[0], y_mm=origin[1], mean_kpa=kpa, touching=touching)
 
         k = self.physics.local_stiffening
         if not k or kpa <= 0:
             return solved(head, lumps)
-        frame = before or solved(head, lumps)
+        contact = before or solved(head, lumps)[1]
         for _ in range(2):
-            factor = np.clip(1.0 - k + k * (self.near @ frame.contact.pressure_kpa) / REFERENCE_KPA, *FACTORS)
-            frame = solved(_scaled_head(head, np.sqrt(factor)), [_scaled_lump(one, np.sqrt(factor)) for one in lumps])
-        return frame
+            factor = np.clip(1.0 - k + k * (self.near @ contact.pressure_kpa) / REFERENCE_KPA, *FACTORS)
+            root = np.sqrt(factor)
+            pressure, contact = solved(_scaled_head(head, root), [_Scaled(one, root) for one in lumps])
+        return pressure, contact
 
-    def _mixed(self, kpa: float) -> tuple[SolidHead, list[PlacedLump]]:
+    def _mixed(self, kpa: float) -> tuple[SolidHead, list[SkinPerturbation]]:
         """Head and lumps at a mean pressure: compliance and stiffness are linear between the two stages."""
         if len(self.stages) == 1:
             return self.stages[0][0], [self.stages[0][1]]
@@ -223,11 +222,7 @@ class _Model:
         share = float(np.clip((kpa - self.stage_kpa[0]) / (self.stage_kpa[1] - self.stage_kpa[0]), 0.0, 1.0))
         plain = (1.0 - share) * low.plain.plain + share * high.plain.plain
         parts = [(low_lump, 1.0 - share), (high_lump, share)]
-        lumps = [
-            replace(one, perturbation=replace(one.perturbation, table=one.perturbation.table * np.sqrt(weight)))
-            for one, weight in parts
-            if weight > 0
-        ]
+        lumps = [replace(one, table=one.table * np.sqrt(weight)) for one, weight in parts if weight > 0]
         return replace(low, plain=replace(low.plain, plain=plain)), lumps
 
     def _on_grid(self, origin: FloatArray) -> SolidHead:
@@ -244,7 +239,7 @@ class _Model:
         plain = (1.0 - share) * heads[below].plain.plain + share * heads[below + 1].plain.plain
         return replace(heads[below], plain=replace(heads[below].plain, plain=plain))
 
-    def _surface(self, head: SolidHead, way: FloatArray, before: SolidFrame | None) -> FloatArray:
+    def _surface(self, head: SolidHead, way: FloatArray, before: Contact | None) -> FloatArray:
         """(rows, columns, 3) face of the head, with what the skin's curvature and the shear add to its distance.
 
         `way` is the direction of the stroke in the head's axes.
@@ -252,7 +247,7 @@ class _Model:
         surface = head.face.surface_mm.copy()
         surface[..., 2] -= (surface[..., 0] ** 2 + surface[..., 1] ** 2) / (2.0 * self.physics.skin_radius_mm)
         if self.shear and before is not None:
-            along_x, along_y = (one @ before.contact.pressure_kpa for one in self.shear)
+            along_x, along_y = (one @ before.pressure_kpa for one in self.shear)
             sunk = self.physics.friction * (way[0] * along_x + way[1] * along_y)
             surface[..., 2] -= sunk.reshape(surface.shape[:2])
         return surface
@@ -260,7 +255,7 @@ class _Model:
 
 @lru_cache(maxsize=8)
 def _kept_head(head: Any, body: SceneBody, fat_mm: float) -> SolidHead:
-    return solid_head(face_of(head), layers_of(body, fat_mm))
+    return solid_head(head_face(head), body.layers(fat_mm))
 
 
 def _plain_head(scene: Scene, body: SceneBody, fat_mm: float) -> SolidHead:
@@ -282,10 +277,6 @@ class _Scaled:
 def _scaled_head(head: SolidHead, root: FloatArray) -> SolidHead:
     plain = head.plain.plain * root[:, None] * root[None, :]
     return replace(head, plain=ContactStiffness(plain, head.plain.factor, head.plain.core))
-
-
-def _scaled_lump(lump: PlacedLump, root: FloatArray) -> Any:
-    return replace(lump, perturbation=_Scaled(lump.perturbation, root))  # type: ignore[arg-type]
 
 
 def _grid(
@@ -328,17 +319,17 @@ def _grid(
     return place, heads
 
 
-def _with_depth(body: SceneBody, fat_mm: float, layer: str, depth_mm: float) -> LayeredBody:
+def _with_depth(body: SceneBody, fat_mm: float, layer: str, depth_mm: float) -> Layers:
     depth_mm = float(depth_mm)
-    return layers_of(body, depth_mm) if layer == "fat" else layers_of(replace(body, thickness_mm=depth_mm), fat_mm)
+    return body.layers(depth_mm) if layer == "fat" else replace(body, thickness_mm=depth_mm).layers(fat_mm)
 
 
-def _by_offset(body: LayeredBody, rows: int, columns: int, pitch_mm: float) -> FloatArray:
+def _by_offset(layers: Layers, rows: int, columns: int, pitch_mm: float) -> FloatArray:
     """(rows * columns,) compliance by how many rows and columns two squares are apart."""
-    return np.asarray(taxel_compliance(body, rows=rows, columns=columns, pitch_mm=pitch_mm)[0])
+    return np.asarray(taxel_compliance(layers, rows=rows, columns=columns, pitch_mm=pitch_mm)[0])
 
 
-def shear_sinking(r_mm: FloatArray, body: LayeredBody) -> FloatArray:
+def shear_sinking(r_mm: FloatArray, layers: Layers) -> FloatArray:
     r"""Sinking straight ahead at distance r of a unit shear force along the skin, in mm / (kPa mm^2).
 
     Parameters
@@ -357,26 +348,26 @@ def shear_sinking(r_mm: FloatArray, body: LayeredBody) -> FloatArray:
     """
     from scipy.special import j1
 
-    r, nu, modulus = np.asarray(r_mm, dtype=np.float64), body.nu, body.modulus_kpa[0]
+    r, nu, modulus = np.asarray(r_mm, dtype=np.float64), layers.poisson, layers.fat_kpa
     limit = -(1.0 - 2.0 * nu) * (1.0 + nu) / modulus
-    most = 18.0 / (body.thickness_mm[0] if body.thickness_mm else 10.0)
+    most = 18.0 / layers.fat_mm
     node, weight = np.polynomial.legendre.leggauss(24)
     edges = np.linspace(0.0, most, 2 + int(np.ceil(most * float(r.max()) / 8.0)))
     half = np.diff(edges)[:, None] / 2
     k, weights = (edges[:-1, None] + half * (1.0 + node)).ravel(), (half * weight).ravel()
-    safe = np.maximum(k, 1e-3 / max(sum(body.thickness_mm), 1.0))
-    bracket = skin_flexibility(safe, body)[:, 1, 0] * safe - limit
+    safe = np.maximum(k, 1e-3 / max(layers.thickness_mm, 1.0))
+    bracket = skin_flexibility(safe, layers)[:, 1, 0] * safe - limit
     return np.asarray(-(j1(np.multiply.outer(r, k)) @ (weights * bracket) + limit / r) / (2.0 * np.pi))
 
 
-def _shear_sinking(body: LayeredBody, shape: tuple[int, ...], pitch_mm: float) -> tuple[FloatArray, FloatArray]:
+def _shear_sinking(layers: Layers, shape: tuple[int, ...], pitch_mm: float) -> tuple[FloatArray, FloatArray]:
     """Two (n, n) arrays: sinking of square i for unit shear along the head's x and y on square j, in mm / kPa."""
     rows, columns = shape
     row, column = np.divmod(np.arange(rows * columns), columns)
     dx, dy = (row[:, None] - row) * pitch_mm, (column[:, None] - column) * pitch_mm
     r = np.maximum(np.hypot(dx, dy), pitch_mm)
     table_mm = np.linspace(pitch_mm, float(r.max()) + pitch_mm, 300)
-    value = np.interp(r, table_mm, shear_sinking(table_mm, body)) * pitch_mm**2 / r
+    value = np.interp(r, table_mm, shear_sinking(table_mm, layers)) * pitch_mm**2 / r
     return np.asarray(value * dx), np.asarray(value * dy)
 
 

@@ -30,15 +30,13 @@ from tactile_bayes.forward.mesh import (
     quadrature,
     stiffness_factor,
 )
-from tactile_bayes.forward.tissue import Layers, SceneBody
+from tactile_bayes.forward.tissue import Layers
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.presets import POISSON
 
 # --- Sinking of a layered body's skin under normal loads: its exact Green's function, and means over taxels.
 #
-# The body is a stack of elastic layers, bonded to each other, on a rigid base to which the lowest is bonded, or
-# with a half-space as its lowest layer. z runs into the body; a displacement is positive downwards, a pressure into
-# the skin.
+# The layers are bonded to each other and to the rigid base. z runs into the body; a displacement is positive downwards,
+# a pressure into the skin.
 
 # Beyond this wave number times the top layer's thickness the layers below have no effect: exp(-2 x 18) = 2e-16.
 _DEEPEST: Final = 18.0
@@ -48,35 +46,15 @@ _POINTS: Final = 24
 _LEAST: Final = 1e-3
 
 
-class LayeredBody(Record):
-    """Flat isotropic layers from the skin down."""
-
-    modulus_kpa: tuple[float, ...]  #: Young's modulus of each layer.
-    thickness_mm: tuple[float, ...]
-    """Of each layer on a rigid base; one entry fewer than `modulus_kpa` when the last is a half-space."""
-    nu: float = POISSON  #: Poisson's ratio of all, above -1 and up to 0.5 (incompressible).
-
-    @classmethod
-    def of(cls, layers: Layers) -> LayeredBody:
-        """Fat over gland on a rigid chest wall."""
-        moduli = (layers.fat_kpa, layers.fat_kpa * layers.gland_ratio)
-        return cls(moduli, (layers.fat_mm, layers.thickness_mm - layers.fat_mm), layers.poisson)
-
-    @property
-    def on_rigid_base(self) -> bool:
-        """True when the lowest layer is bonded to a rigid base rather than being a half-space."""
-        return len(self.modulus_kpa) == len(self.thickness_mm)
-
-
-def surface_flexibility(wave_number: FloatArray, body: LayeredBody) -> FloatArray:
+def surface_flexibility(wave_number: FloatArray, layers: Layers) -> FloatArray:
     r"""Sinking of the skin under a pressure that varies as J0(k r), in mm per kPa, for k in 1/mm above 0.
 
     :math:`2(1-\nu^2)/(E k)` for a half-space.
     """
-    return np.asarray(skin_flexibility(wave_number, body)[:, 1, 1], dtype=np.float64)
+    return np.asarray(skin_flexibility(wave_number, layers)[:, 1, 1], dtype=np.float64)
 
 
-def skin_flexibility(wave_number: FloatArray, body: LayeredBody) -> FloatArray:
+def skin_flexibility(wave_number: FloatArray, layers: Layers) -> FloatArray:
     r"""Displacements of the skin under shear and pressure of one wave number k (1/mm, above 0), in mm per kPa.
 
     The (n, 2, 2) array takes the factors of a radial shear traction :math:`J_1(kr)` and a pressure :math:`J_0(kr)` to
@@ -88,24 +66,13 @@ def skin_flexibility(wave_number: FloatArray, body: LayeredBody) -> FloatArray:
     faces (the static limit of Kausel & Roesset 1981), and the stiffness felt at a face is carried upwards. All
     exponentials decay, so no k overflows, and nothing is singular at nu = 0.5.
     """
-    k = np.asarray(wave_number, dtype=np.float64)
-    below: FloatArray | None = None
-    layers = list(zip(body.modulus_kpa, body.thickness_mm, strict=False))
-    if not body.on_rigid_base:
-        # tractions on the face of a half-space for unit displacements of it
-        displacement, traction = _waves(np.zeros_like(k), body.nu)
-        scale = (body.modulus_kpa[-1] / (1.0 + body.nu)) * k
-        below = np.asarray(-scale[:, None, None] * traction @ np.linalg.inv(displacement))
-    for modulus, thickness in reversed(layers):
-        stiffness = _layer_stiffness(k, modulus, thickness, body.nu)
-        upper, across = stiffness[:, :2, :2], stiffness[:, :2, 2:]
-        if below is None:
-            below = np.asarray(upper, dtype=np.float64)
-        else:
-            lower = stiffness[:, 2:, 2:] + below
-            below = np.asarray(upper - across @ np.linalg.solve(lower, stiffness[:, 2:, :2]), dtype=np.float64)
-    assert below is not None
-    return np.asarray(np.linalg.inv(below), dtype=np.float64)
+    k, fat_mm = np.asarray(wave_number, dtype=np.float64), layers.fat_mm
+    gland_kpa, gland_mm = layers.fat_kpa * layers.gland_ratio, layers.thickness_mm - fat_mm
+    gland = _layer_stiffness(k, gland_kpa, gland_mm, layers.poisson)[:, :2, :2]  # its lower face does not move
+    fat = _layer_stiffness(k, layers.fat_kpa, fat_mm, layers.poisson)
+    across, lower = fat[:, :2, 2:], fat[:, 2:, 2:] + gland
+    felt = fat[:, :2, :2] - across @ np.linalg.solve(lower, fat[:, 2:, :2])
+    return np.asarray(np.linalg.inv(felt), dtype=np.float64)
 
 
 def _waves(depth: FloatArray, nu: float) -> tuple[FloatArray, FloatArray]:
@@ -134,7 +101,7 @@ def _layer_stiffness(k: FloatArray, modulus_kpa: float, thickness_mm: float, nu:
     return np.asarray(scale[:, None, None] * stiffness)
 
 
-def layering_compliance(r_mm: FloatArray, body: LayeredBody) -> FloatArray:
+def layering_compliance(r_mm: FloatArray, layers: Layers) -> FloatArray:
     r"""Sinking at distances r from a unit normal force, less that of a half-space of the top layer, in mm / (kPa mm^2).
     Smooth through r = 0.
 
@@ -144,21 +111,17 @@ def layering_compliance(r_mm: FloatArray, body: LayeredBody) -> FloatArray:
     singular at r = 0 is left to the closed forms for the half-space.
     """
     r = np.asarray(r_mm, dtype=np.float64)
-    if not body.thickness_mm:
-        return np.zeros_like(r)
-    k, weight = _wave_numbers(body, reach_mm=float(r.max(initial=0.0)))
-    # Lower wave numbers than the layer matrices can stand take the limit: F is constant over a rigid base, F k is over
-    # a half-space.
-    safe = np.maximum(k, _LEAST / sum(body.thickness_mm))
-    top = 2.0 * (1.0 - body.nu**2) / body.modulus_kpa[0]
-    bracket = surface_flexibility(safe, body) * (k if body.on_rigid_base else safe) - top
+    k, weight = _wave_numbers(layers, reach_mm=float(r.max(initial=0.0)))
+    # lower wave numbers than the layer matrices can stand take the limit: F is constant
+    safe = np.maximum(k, _LEAST / layers.thickness_mm)
+    top = 2.0 * (1.0 - layers.poisson**2) / layers.fat_kpa
+    bracket = surface_flexibility(safe, layers) * k - top
     return np.asarray(j0(np.multiply.outer(r, k)) @ (weight * bracket) / (2.0 * np.pi))
 
 
-def _wave_numbers(body: LayeredBody, *, reach_mm: float) -> tuple[FloatArray, FloatArray]:
+def _wave_numbers(layers: Layers, *, reach_mm: float) -> tuple[FloatArray, FloatArray]:
     """Gauss-Legendre points and weights over wave numbers, fine enough for J0 at `reach_mm`."""
-    top = _DEEPEST / body.thickness_mm[0]
-    slowest = 0.05 / sum(body.thickness_mm)
+    top, slowest = _DEEPEST / layers.fat_mm, 0.05 / layers.thickness_mm
     edges = np.concatenate([[0.0], np.geomspace(slowest, top, 1 + int(np.ceil(4 * np.log10(top / slowest))))])
     most = 10.0 / max(reach_mm, 1.0)  # rad of J0 in a panel: ten, for 24 points
     parts = [np.linspace(a, b, 1 + int(np.ceil((b - a) / most)))[:-1] for a, b in pairwise(edges)]
@@ -193,7 +156,7 @@ def _corner(x: FloatArray, y: FloatArray) -> FloatArray:
     return np.asarray(np.where(size > 0, x * np.arcsinh(y / safe), 0.0))
 
 
-def taxel_compliance(body: LayeredBody, *, rows: int, columns: int, pitch_mm: float) -> FloatArray:
+def taxel_compliance(layers: Layers, *, rows: int, columns: int, pitch_mm: float) -> FloatArray:
     """Mean sinking of every taxel under unit pressure on every other, in mm / kPa, symmetric and positive definite.
 
     Taxels are in row-major order. Both the load and the displacement are averaged over the square of a taxel
@@ -206,10 +169,10 @@ def taxel_compliance(body: LayeredBody, *, rows: int, columns: int, pitch_mm: fl
     x = dx[:, None, None, None] + shift[:, None]
     y = dy[None, :, None, None] + shift[None, :]
     share = np.multiply.outer(weight, weight) / 4
-    half_space = square_compliance(x, y, side_mm=pitch_mm, modulus_kpa=body.modulus_kpa[0], nu=body.nu)
+    half_space = square_compliance(x, y, side_mm=pitch_mm, modulus_kpa=layers.fat_kpa, nu=layers.poisson)
     by_offset = np.einsum("rcij,ij->rc", half_space, share)
     r = np.linspace(0.0, np.hypot(dx[-1] + 2 * pitch_mm, dy[-1] + 2 * pitch_mm), 400)
-    smooth = CubicSpline(r, layering_compliance(r, body), bc_type=("clamped", "not-a-knot"))
+    smooth = CubicSpline(r, layering_compliance(r, layers), bc_type=("clamped", "not-a-knot"))
     by_offset += pitch_mm**2 * _mean_over_two_squares(smooth, dx, dy, pitch_mm)
     row, column = np.divmod(np.arange(rows * columns), columns)
     return np.asarray(
@@ -260,18 +223,16 @@ class CondensedLump(Record, eq=False):
         return [(0.5 if m == 0 else 1.0) / np.pi * mode.change(lump_kpa) for m, mode in enumerate(self.modes)]
 
 
-def condense_lump(
-    geometry: LumpGeometry, body: SceneBody, *, size: MeshSize | None = None, orders: int | None = None
-) -> CondensedLump:
+def condense_lump(geometry: LumpGeometry, *, size: MeshSize | None = None, orders: int | None = None) -> CondensedLump:
     """Condense the body around a lump onto the lump's boundary and the skin.
 
     The default mesh is held by a test to 1 % in amplitude and 0.5 % in width; the lump's depth decides the number of
-    Fourier orders where none is given (`orders_needed`). Of the `body` the moduli and Poisson's ratio are used.
+    Fourier orders where none is given (`orders_needed`).
     """
-    mesh = lump_mesh(geometry, size)
-    elements = element_stiffness(mesh, nu=body.nu)
-    fat, gland = body.fat_kpa, body.fat_kpa * body.gland_ratio
-    modulus = np.where((mesh.region == EXTERIOR_GLAND) | (mesh.region == INTERIOR_GLAND), gland, fat)
+    mesh, layers = lump_mesh(geometry, size), geometry.layers
+    elements = element_stiffness(mesh, nu=layers.poisson)
+    gland = (mesh.region == EXTERIOR_GLAND) | (mesh.region == INTERIOR_GLAND)
+    modulus = np.where(gland, layers.fat_kpa * layers.gland_ratio, layers.fat_kpa)
     count = orders_needed(geometry) if orders is None else orders
     modes = [_condense(mesh, elements, modulus, order) for order in range(count)]
     return CondensedLump(mesh.node_mm[_skin(mesh), 0], tuple(modes))

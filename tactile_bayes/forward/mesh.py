@@ -13,7 +13,7 @@ from scipy.sparse.linalg import splu
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.tissue import Body
+from tactile_bayes.forward.tissue import Body, Layers
 from tactile_bayes.geometry import FloatArray
 
 # --- Quadrilateral meshes of half the body, graded and with every material boundary on element edges.
@@ -62,7 +62,7 @@ def body_mesh(body: Body, *, fineness: int) -> QuadMesh:
     blocks = [ring, _grid(across, rows), _grid(box.bottom_x_mm, box.below_mm)]
     if len(box.above_mm) > 1:
         blocks.append(_grid(box.top_x_mm, box.above_mm))
-    return _join(blocks, boundary_mm=body.layers.fat_mm, scale_mm=body.d_mm)
+    return _join(blocks, body)
 
 
 def disc_mesh(body: Body, *, fineness: int, layered: bool) -> QuadMesh:
@@ -74,20 +74,7 @@ def disc_mesh(body: Body, *, fineness: int, layered: bool) -> QuadMesh:
     depth = body.layers.fat_mm if layered else body.centre_mm
     middle = np.broadcast_to([0.0, depth], circle.shape)
     block = _blend(middle, circle, np.linspace(0.0, 1.0, 2 * _IN * fineness + 1))
-    return _join([block], boundary_mm=body.layers.fat_mm, scale_mm=body.d_mm)
-
-
-def rectangle_mesh(x_mm: FloatArray, z_mm: FloatArray) -> QuadMesh:
-    """A grid of quadrilaterals with corners at `x_mm` and `z_mm`, all of them fat: for bodies without a lump."""
-    return _join([_grid(_with_middles(x_mm), _with_middles(z_mm))], boundary_mm=np.inf, scale_mm=1.0)
-
-
-def joined(meshes: Sequence[QuadMesh], *, scale_mm: float) -> QuadMesh:
-    """Merge several meshes into one; nodes nearer than 1e-8 of `scale_mm` become one."""
-    offsets = np.cumsum([0] + [len(mesh.nodes) for mesh in meshes])
-    points, number = _merged(np.concatenate([mesh.nodes for mesh in meshes]), scale_mm)
-    elements = [number[mesh.elements + offset] for mesh, offset in zip(meshes, offsets, strict=False)]
-    return QuadMesh(points, np.concatenate(elements), np.concatenate([mesh.gland for mesh in meshes]))
+    return _join([block], body)
 
 
 class _Box(Record, eq=False):
@@ -179,42 +166,29 @@ def _graded(begin_mm: float, end_mm: float, first_mm: float, fineness: int) -> F
     return _graded_line(begin_mm, end_mm, first=first_mm, grade=_GROWTH ** (1.0 / fineness), least=fineness)
 
 
-def _with_middles(corners: FloatArray) -> FloatArray:
-    """Corners, with the midpoint of each pair between them."""
-    points = np.empty(2 * len(corners) - 1)
-    points[::2] = corners
-    points[1::2] = 0.5 * (corners[1:] + corners[:-1])
-    return points
-
-
-def _join(blocks: Sequence[FloatArray], *, boundary_mm: float, scale_mm: float) -> QuadMesh:
+def _join(blocks: Sequence[FloatArray], body: Body) -> QuadMesh:
     """Merge blocks into one mesh; coinciding points become one node, elements without area are dropped."""
-    nodes, elements = _numbered(blocks, scale_mm)
+    nodes, elements = _numbered(blocks, body.d_mm)
     corners = nodes[elements[:, [0, 2, 8, 6]]]
     x, z = corners[..., 0], corners[..., 1]
     area = 0.5 * np.abs(np.sum(x * np.roll(z, -1, axis=1) - z * np.roll(x, -1, axis=1), axis=1))
-    kept = area > 1e-10 * scale_mm**2
+    kept = area > 1e-10 * body.d_mm**2
     used, numbers = np.unique(elements[kept], return_inverse=True)
-    return QuadMesh(nodes[used], numbers.reshape(-1, 9), corners[kept, :, 1].mean(axis=1) > boundary_mm)
+    return QuadMesh(nodes[used], numbers.reshape(-1, 9), corners[kept, :, 1].mean(axis=1) > body.layers.fat_mm)
 
 
 def _numbered(blocks: Sequence[FloatArray], scale_mm: float) -> tuple[FloatArray, IndexArray]:
     """Nodes, and (k, 9) their numbers in the elements of all (n, m, 2) blocks of points, n and m odd, in order."""
-    nodes, number = _merged(np.concatenate([block.reshape(-1, 2) for block in blocks]), scale_mm)
+    points = np.concatenate([block.reshape(-1, 2) for block in blocks])
+    key = np.round(points / (1e-8 * scale_mm)).astype(np.int64)  # points that coincide
+    _, first, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
     elements, start = [], 0
     for n, m, _ in (block.shape for block in blocks):
-        index = number[start : start + n * m].reshape(n, m)
+        index = number.reshape(-1)[start : start + n * m].reshape(n, m)
         start += n * m
         parts = [index[i : n - 2 + i : 2, j : m - 2 + j : 2].reshape(-1) for i in range(3) for j in range(3)]
         elements.append(np.stack(parts, axis=1))
-    return nodes, np.concatenate(elements)
-
-
-def _merged(points: FloatArray, scale_mm: float) -> tuple[FloatArray, IndexArray]:
-    """Distinct points, and the index of each given point among them."""
-    key = np.round(points / (1e-8 * scale_mm)).astype(np.int64)
-    _, first, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    return points[first], np.asarray(number.reshape(-1), dtype=np.intp)
+    return points[first], np.concatenate(elements)
 
 
 # --- Meshes of a layered body with a spheroid on its vertical axis: nine-node quadrilaterals in the (r, z) half-plane.
@@ -235,24 +209,23 @@ class LumpGeometry(Record):
     half_height_mm: float
     """`radius_mm`, `half_height_mm`: Half axes of the spheroid, across and along the vertical."""
     depth_mm: float  #: Of its centre below the skin.
-    fat_mm: float  #: Depth of the boundary between fat and gland.
-    thickness_mm: float  #: Depth of the rigid base.
+    layers: Layers  #: The body without it.
 
     def __post_init__(self) -> None:
         """Refuse what the mesh cannot resolve; bodies and scenes have refused all else."""
         bottom = self.depth_mm + self.half_height_mm
-        if bottom > self.thickness_mm - 0.02 * self.half_height_mm:
+        if bottom > self.layers.thickness_mm - 0.02 * self.half_height_mm:
             raise BadDataError(
-                f"the lump reaches {bottom:.4g} mm deep, the base lies at {self.thickness_mm:g} mm",
+                f"the lump reaches {bottom:.4g} mm deep, the base lies at {self.layers.thickness_mm:g} mm",
                 way_out="give a thicker body or a shallower lump",
             )
 
     def boundary_mm(self) -> float:
         """Depth of the layer boundary, moved by up to 4 % of the half height where it nearly touches the lump."""
-        offset = (self.fat_mm - self.depth_mm) / self.half_height_mm
+        offset = (self.layers.fat_mm - self.depth_mm) / self.half_height_mm
         gap = abs(offset) - 1.0
         if abs(gap) >= LEAST_CAP:
-            return self.fat_mm
+            return self.layers.fat_mm
         moved = np.sign(offset) * (1.0 + (LEAST_CAP if gap >= 0 else -LEAST_CAP))
         return float(self.depth_mm + moved * self.half_height_mm)
 
@@ -303,8 +276,8 @@ def _box(g: LumpGeometry, boundary: float) -> tuple[float, float, float]:
         top = boundary
     if low < boundary < bottom + 0.5 * margin:
         bottom = boundary
-    if bottom > g.thickness_mm - 0.5 * margin:
-        bottom = g.thickness_mm
+    if bottom > g.layers.thickness_mm - 0.5 * margin:
+        bottom = g.layers.thickness_mm
     return max(g.radius_mm + margin, 0.8 * (g.depth_mm - top)), top, bottom
 
 
@@ -350,7 +323,10 @@ def _fan(g: LumpGeometry, boundary: float, *, cut: bool, elements: int) -> tuple
 def _graded_share(count: int, ratio: float) -> FloatArray:
     """(2 count + 1,) shares 0 to 1 whose elements grow by `ratio`, each with its mid-side node in the middle."""
     ends = np.concatenate([[0.0], np.cumsum(ratio ** np.arange(count))])
-    return _with_middles(ends / ends[-1])
+    ends /= ends[-1]
+    share = np.empty(2 * count + 1)
+    share[::2], share[1::2] = ends, 0.5 * (ends[1:] + ends[:-1])
+    return share
 
 
 def _blend(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:
@@ -377,7 +353,7 @@ def _beyond_box(
     side = np.concatenate([sides[0][:1, 1], *(part[1:, 1] for part in sides)])
     reach = max(size.reach_mm, 2.0 * corner_r, 4.0 * g.depth_mm)
     right = _graded_line(corner_r, reach, first=float(corner_r - lid[-3, 0]), grade=size.grade)
-    below = _down_from(bottom, g.thickness_mm, boundary, first=float(side[-1] - side[-3]), grade=size.grade)
+    below = _down_from(bottom, g.layers.thickness_mm, boundary, first=float(side[-1] - side[-3]), grade=size.grade)
     above = _down_from(0.0, top, boundary, first=float(side[2] - side[0]), grade=1.0 + 1e-9)
     patches: list[tuple[FloatArray, int]] = []
     for r, z in ((right, above), (right, side), (right, below), (floor[::-1, 0], below), (lid[:, 0], above)):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tactile_bayes.declarations import Record, as_dict, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward import mesh, plane
-from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, condense_lump, skin_spline, taxel_compliance
+from tactile_bayes.forward.axisymmetric import CondensedLump, condense_lump, skin_spline, taxel_compliance
 from tactile_bayes.forward.contact import Contact, ContactStiffness, solve_contact
 from tactile_bayes.forward.contact import Head as Section
 from tactile_bayes.forward.scene import (
@@ -29,15 +29,13 @@ from tactile_bayes.forward.scene import (
 from tactile_bayes.forward.tissue import (
     MOST_SEAT,
     Body,
-    HeadFace,
     Layers,
     SceneBody,
     SolidLump,
     fat_thickness,
-    head_face,
 )
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.presets import HEAD_PITCH_MM, SHOULDERS_INSIDE
+from tactile_bayes.presets import HEAD_PITCH_MM, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
 from tactile_bayes.progress import Progress, untold
 
 FIDELITIES: Final = ("empirical-gaussian", "empirical", "plane-strain", "solid")
@@ -210,7 +208,6 @@ class PlaneSection(Record, eq=False):
             )
         body = scene.body or SceneBody()
         fat = fat_thickness(body, scene.solid_lumps)
-        layers = Layers(fat, body.thickness_mm, body.fat_kpa, body.gland_ratio, body.nu)
         lump = _cylinder(scene.solid_lumps[0], body, fat, fidelity) if scene.solid_lumps else None
         width = scene.head.rows * scene.head.pitch_mm
         if shoulders == SHOULDERS_INSIDE and scene.head.rim_mm > width / 2:
@@ -218,7 +215,7 @@ class PlaneSection(Record, eq=False):
                 f"head.rim_mm is {scene.head.rim_mm:g}",
                 way_out=f"in two dimensions the rim is cut into the array: give at most {width / 2:g} mm",
             )
-        return cls(scene, fidelity, scene.head.section(shoulders), layers, lump)
+        return cls(scene, fidelity, scene.head.section(shoulders), body.layers(fat), lump)
 
     @property
     def x_mm(self) -> float:
@@ -353,12 +350,16 @@ class SkinPerturbation(Record, eq=False):
     """(t, k) array: functions of the distance from the lump's axis, every 0.05 mm, in mm (kPa mm^2)^(-1/2)."""
     order: NDArray[np.int64]  #: (k,) array: angular order of each.
     sign: FloatArray  #: (k,) array: -1 where the lump stiffens.
+    x_mm: float = 0.0
+    y_mm: float = 0.0
+    """`x_mm`, `y_mm`: Place of the lump's axis in the scene's `plane`."""
 
     def vectors(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(n, c) values at points relative to the axis, and (c,) signs: the change is ``values diag(signs) values^T``.
+        """(n, c) values at points of the plane, and (c,) signs: the change is ``values diag(signs) values^T``.
 
         Orders above 0 give two columns, for the cosine and the sine of the angle.
         """
+        x_mm, y_mm = x_mm - self.x_mm, y_mm - self.y_mm
         distance = np.hypot(x_mm, y_mm) / STEP_MM
         below = np.minimum(distance.astype(np.int64), len(self.table) - 2)
         share = np.clip(distance - below, 0.0, 1.0)[:, None]
@@ -410,20 +411,47 @@ def square_mean(
     return np.asarray((2.0 * function(np.minimum(r_mm, last_mm)) + 5.0 * ring) / 7.0)
 
 
-class PlacedLump(Record, eq=False):
-    """A perturbation and the place of its axis in the scene's `plane`, mm."""
+class HeadFace(Record, eq=False):
+    """Squares of the face of a rigid head that can touch the skin: the taxels and the rounded rim around them.
 
-    perturbation: SkinPerturbation
-    x_mm: float
-    y_mm: float
+    A flat end without a rim would press like a punch, with a singular pressure along its edge that no taxel array
+    shows.
+    """
+
+    surface_mm: FloatArray
+    """(rows, columns, 3) array: centres in `scanhead`: origin at the apex of the face, z into the tissue."""
+    sensing: NDArray[np.bool_]  #: (rows, columns) bool array: true for taxels, False for the rim.
+    pitch_mm: float
 
 
-class SolidFrame(Record, eq=False):
-    """The solved frame of a head at one pose."""
+def head_face(head: Head) -> HeadFace:
+    """The taxels of a head and its rim: a quarter round at the edge, tangent to the face; none where shoulders lie
+    inside the array.
 
-    pressure_kpa: FloatArray  #: (rows, columns) array: Mean pressure on each taxel.
-    depth_mm: float  #: z of the head's origin in the scene's `plane`, whose z = 0 is the undisturbed skin.
-    contact: Contact  #: Of the whole face, rim included.
+    Across the head the face is the section `contact.Head` with its shoulders outside. Along the head the rim is tangent
+    to a line. Squares whose centres lie on the rim are added.
+    """
+    rows, columns, pitch_mm, radius_mm = head.rows, head.columns, head.pitch_mm, head.radius_mm
+    rim_mm = 0.0 if head.shoulder_mm > 0 else head.rim_mm
+    if not 0 <= rim_mm < radius_mm:
+        raise BadDataError(f"rim_mm is {rim_mm:g}", way_out=f"it must lie in 0 to below radius_mm, {radius_mm:g} mm")
+    half_x, half_y = rows * pitch_mm / 2, columns * pitch_mm / 2
+    section = Section(2 * half_x, radius_mm, rim_mm, SHOULDERS_OUTSIDE)
+    more_x = _squares(half_x, section.half_face_mm, pitch_mm)
+    more_y = _squares(half_y, half_y + rim_mm, pitch_mm)
+    x, y = ((np.arange(float(n)) - (n - 1) / 2) * pitch_mm for n in (rows + 2 * more_x, columns + 2 * more_y))
+    across = -section.profile_mm(x)
+    along = np.sqrt(np.maximum(rim_mm**2 - np.clip(np.abs(y) - half_y, 0.0, None) ** 2, 0.0)) - rim_mm
+    surface = np.stack(np.broadcast_arrays(x[:, None], y[None, :], across[:, None] + along[None, :]), axis=-1).copy()
+    sensing = np.zeros(surface.shape[:2], dtype=bool)
+    sensing[more_x : more_x + rows, more_y : more_y + columns] = True
+    surface[sensing] = head.surface_mm().reshape(-1, 3)
+    return HeadFace(surface, sensing, pitch_mm)
+
+
+def _squares(half_mm: float, reach_mm: float, pitch_mm: float) -> int:
+    """Number of squares beyond `half_mm` whose centres are nearer than `reach_mm`."""
+    return max(0, int(np.ceil((reach_mm - half_mm) / pitch_mm - 0.5 - 1e-9)))
 
 
 class SolidHead(Record, eq=False):
@@ -434,19 +462,19 @@ class SolidHead(Record, eq=False):
 
     def frame(
         self,
-        lumps: Sequence[PlacedLump],
+        lumps: Sequence[SkinPerturbation],
         *,
         rotation: FloatArray,
         x_mm: float,
         y_mm: float,
         mean_kpa: float,
         touching: NDArray[np.bool_] | None = None,
-    ) -> SolidFrame:
-        """Pressures of the head at a pose and a mean over the taxels: what the examiner's tone holds, and the gate of a
-        map looks at.
+    ) -> tuple[FloatArray, Contact]:
+        """(rows, columns) mean pressure on each taxel, and the contact of the whole face, at a pose and a mean over the
+        taxels: what the examiner's tone holds, and the gate of a map looks at.
 
-        ``p_plane = rotation @ p_scanhead + (x, y, depth)``. The head keeps its rotation; only the depth adapts.
-        `touching` is where to start: `contact.touching` of a neighbouring frame.
+        ``p_plane = rotation @ p_scanhead + (x, y, contact.depth_mm)``: z = 0 is the undisturbed skin. The head keeps
+        its rotation; only the depth adapts. `touching` is where to start: `contact.touching` of a neighbouring frame.
         """
         place = self.face.surface_mm.reshape(-1, 3) @ rotation.T
         stiffness = self.plain
@@ -457,25 +485,27 @@ class SolidHead(Record, eq=False):
         contact = solve_contact(
             stiffness, -place[:, 2], mean_kpa=mean_kpa, counted=self.face.sensing.ravel(), touching=touching
         )
-        return SolidFrame(self.face.taxel_frame(contact.pressure_kpa), contact.depth_mm, contact)
+        sensing = self.face.sensing
+        shape = int(sensing.any(axis=1).sum()), -1
+        return contact.pressure_kpa[sensing.ravel()].reshape(shape), contact
 
-    def _vectors(self, lump: PlacedLump, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _vectors(self, lump: SkinPerturbation, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Change by one lump under the face, per unit pressure on a square; negligible parts are dropped."""
-        values, signs = lump.perturbation.vectors(x_mm - lump.x_mm, y_mm - lump.y_mm)
+        values, signs = lump.vectors(x_mm, y_mm)
         values = values * self.face.pitch_mm  # a pressure of 1 kPa on a square is a force of pitch^2
         weight = np.einsum("nk,nk->k", values, values)
         kept = weight > _LEAST_WEIGHT * float(np.diag(self.plain.plain).mean()) ** -1
         return values[:, kept], signs[kept]
 
 
-def solid_head(face: HeadFace, body: LayeredBody) -> SolidHead:
+def solid_head(face: HeadFace, layers: Layers) -> SolidHead:
     """Prepare a head on a body without lumps.
 
     The compliance is that of the squares on the flat skin: the head's curvature and tilt enter as heights, as the
     linear theory has it (Johnson 1985, ch. 4).
     """
     rows, columns = face.sensing.shape
-    compliance = taxel_compliance(body, rows=rows, columns=columns, pitch_mm=face.pitch_mm)
+    compliance = taxel_compliance(layers, rows=rows, columns=columns, pitch_mm=face.pitch_mm)
     return SolidHead(face, ContactStiffness.of(compliance))
 
 
@@ -497,7 +527,7 @@ def frames_at_poses(
     pressure = np.empty((count, scene.head.rows, scene.head.columns))
     depth, touching = np.empty(count), None
     for i in range(count):
-        frame = head.frame(
+        pressure[i], contact = head.frame(
             lumps,
             rotation=rotation[i],
             x_mm=float(origin_mm[i, 0]),
@@ -505,26 +535,14 @@ def frames_at_poses(
             mean_kpa=float(mean_kpa[i]),
             touching=touching,
         )
-        pressure[i], depth[i], touching = frame.pressure_kpa, frame.depth_mm, frame.contact.touching
+        depth[i], touching = contact.depth_mm, contact.touching
         progress(i + 1, count)
     return pressure, depth
 
 
-def face_of(head: Head) -> HeadFace:
-    """Face of the head that can touch the skin; shoulders inside the array leave no room for a rim."""
-    rim = 0.0 if head.shoulder_mm > 0 else head.rim_mm
-    return head_face(head.surface_mm(), pitch_mm=head.pitch_mm, radius_mm=head.radius_mm, rim_mm=rim)
-
-
-def layers_of(body: SceneBody, fat_mm: float) -> LayeredBody:
-    """The layered body without lumps."""
-    return LayeredBody((body.fat_kpa, body.fat_kpa * body.gland_ratio), (fat_mm, body.thickness_mm - fat_mm), body.nu)
-
-
 def condensed_lump(lump: SolidLump, body: SceneBody, fat_mm: float) -> CondensedLump:
     """Condense the body around a lump; the lump's stiffness and place do not matter here."""
-    geometry = mesh.LumpGeometry(lump.d_mm / 2, lump.vertical_mm / 2, lump.depth_mm, fat_mm, body.thickness_mm)
-    return _condensed(geometry, body)
+    return _condensed(mesh.LumpGeometry(lump.d_mm / 2, lump.vertical_mm / 2, lump.depth_mm, body.layers(fat_mm)))
 
 
 # Exams of one body, and lumps of one size and depth in it, share these; a scene has few.
@@ -534,10 +552,10 @@ _condensed = lru_cache(maxsize=_BODIES_KEPT)(condense_lump)
 
 @lru_cache(maxsize=_BODIES_KEPT)
 def _head(head: Head, body: SceneBody, fat_mm: float) -> SolidHead:
-    return solid_head(face_of(head), layers_of(body, fat_mm))
+    return solid_head(head_face(head), body.layers(fat_mm))
 
 
-def _placed(scene: Scene) -> list[PlacedLump]:
+def _placed(scene: Scene) -> list[SkinPerturbation]:
     """The scene's lumps with their places."""
     body = scene.body or SceneBody()
     fat = fat_thickness(body, scene.solid_lumps)
@@ -545,5 +563,5 @@ def _placed(scene: Scene) -> list[PlacedLump]:
     for lump in scene.stiff_balls:
         around = condensed_lump(lump, body, fat)
         change = skin_perturbation(around, lump.stiffness_ratio * body.fat_kpa, square_mm=scene.head.pitch_mm)
-        placed.append(PlacedLump(change, lump.x_mm, lump.y_mm))
+        placed.append(replace(change, x_mm=lump.x_mm, y_mm=lump.y_mm))
     return placed

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.forward.axisymmetric import LayeredBody
 from tactile_bayes.forward.plane import LineFrames, build_line
-from tactile_bayes.forward.simulate import PlacedLump, SolidHead, face_of, solid_head
+from tactile_bayes.forward.simulate import SkinPerturbation, SolidHead, head_face, solid_head
 from tactile_bayes.forward.tissue import Layers
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
@@ -228,7 +227,7 @@ def _frames_of_balls(left: Axes, right: Axes, settings: SolidSettings, seat: flo
     """Fig 5: frames through the middle of the head, far from the lump on fat of several thicknesses, and over balls."""
     s = settings.head.surface_mm()[:, 0, 0]
     for colour, fat in zip(COLOURS, _FAT_MM, strict=False):
-        plain = solid_head(face_of(settings.head), LayeredBody.of(_plain_layers(settings, fat)))
+        plain = solid_head(head_face(settings.head), _plain_layers(settings, fat))
         left.plot(s, _middle_frame(plain, [], settings), color=colour, label=f"fat {fat:g} mm")
     for colour, (d, h) in zip(COLOURS, _BALLS, strict=False):
         body = settings.body(d, h, seat=seat)
@@ -239,9 +238,9 @@ def _frames_of_balls(left: Axes, right: Axes, settings: SolidSettings, seat: flo
     finish(right, "(b) over the ball, middle of the head", where, "pressure (kPa)", headroom=0.15)
 
 
-def _middle_frame(head: SolidHead, lumps: Sequence[PlacedLump], settings: SolidSettings) -> FloatArray:
+def _middle_frame(head: SolidHead, lumps: Sequence[SkinPerturbation], settings: SolidSettings) -> FloatArray:
     """(rows,) the mean of the two middle columns of a level head over the lump."""
-    frame = head.frame(lumps, rotation=np.eye(3), x_mm=0.0, y_mm=0.0, mean_kpa=settings.mean_kpa).pressure_kpa
+    frame = head.frame(lumps, rotation=np.eye(3), x_mm=0.0, y_mm=0.0, mean_kpa=settings.mean_kpa)[0]
     middle = frame.shape[1] // 2
     return np.asarray(frame[:, middle - 1 : middle + 1].mean(axis=1))
 

@@ -10,12 +10,19 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from tactile_bayes.declarations import Record, as_dict, field, replace
-from tactile_bayes.forward.axisymmetric import CondensedLump, LayeredBody, condense_lump
+from tactile_bayes.forward.axisymmetric import CondensedLump, condense_lump
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize
 from tactile_bayes.forward.plane import FINENESS
 from tactile_bayes.forward.scene import Head
-from tactile_bayes.forward.simulate import RANK_TOLERANCE, PlacedLump, SolidHead, face_of, skin_perturbation, solid_head
-from tactile_bayes.forward.tissue import Body, SceneBody
+from tactile_bayes.forward.simulate import (
+    RANK_TOLERANCE,
+    SkinPerturbation,
+    SolidHead,
+    head_face,
+    skin_perturbation,
+    solid_head,
+)
+from tactile_bayes.forward.tissue import Body
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.accumulate import FlatField
 from tactile_bayes.mapping.build import build_map
@@ -168,13 +175,11 @@ class SolidSettings(CaseSettings, kw_only=True):
 
     def geometry(self, body: Body) -> LumpGeometry:
         """The ball in the body."""
-        layers, radius = body.layers, body.radius_mm
-        return LumpGeometry(radius, radius, body.centre_mm, layers.fat_mm, layers.thickness_mm)
+        return LumpGeometry(body.radius_mm, body.radius_mm, body.centre_mm, body.layers)
 
     def condensed(self, body: Body) -> CondensedLump:
         """The body around the ball, condensed."""
-        tissue = SceneBody(body.fat_kpa, body.gland_ratio, nu=body.poisson)
-        return condense_lump(self.geometry(body), tissue, size=self.mesh_size)
+        return condense_lump(self.geometry(body), size=self.mesh_size)
 
     @property
     def mesh_size(self) -> MeshSize:
@@ -190,14 +195,13 @@ class SolidSettings(CaseSettings, kw_only=True):
 
     def on(self, body: Body) -> SolidHead:
         """The head on the body without a lump."""
-        return solid_head(face_of(self.head), LayeredBody.of(body.layers))
+        return solid_head(head_face(self.head), body.layers)
 
-    def placed(self, condensed: CondensedLump, stiffness_ratio: float) -> PlacedLump:
+    def placed(self, condensed: CondensedLump, stiffness_ratio: float) -> SkinPerturbation:
         """The lump under the middle of the raster."""
-        change = skin_perturbation(
+        return skin_perturbation(
             condensed, stiffness_ratio * self.fat_kpa, square_mm=self.head.pitch_mm, tolerance=self.rank_tolerance
         )
-        return PlacedLump(change, 0.0, 0.0)
 
 
 class RasterFrames(Record, eq=False):
@@ -232,7 +236,7 @@ class RasterFit(Record):
         return self.sigma_x_mm, self.sigma_y_mm
 
 
-def raster_frames(head: SolidHead, lump: PlacedLump | None, settings: SolidSettings) -> RasterFrames:
+def raster_frames(head: SolidHead, lump: SkinPerturbation | None, settings: SolidSettings) -> RasterFrames:
     """Frames of the raster over a lump, or over the plain body.
 
     The lump is symmetric about both axes of the level head, so the frame at (-x, y) is the one at (x, y) with its rows
@@ -246,7 +250,7 @@ def raster_frames(head: SolidHead, lump: PlacedLump | None, settings: SolidSetti
     for line in settings.lines_mm:
         y = pitch * round(line / pitch)
         for x in pitch * np.arange(count + 1.0):
-            one = head.frame(
+            pressure, contact = head.frame(
                 [] if lump is None else [lump],
                 rotation=_LEVEL,
                 x_mm=float(x),
@@ -254,14 +258,14 @@ def raster_frames(head: SolidHead, lump: PlacedLump | None, settings: SolidSetti
                 mean_kpa=settings.mean_kpa,
                 touching=touching,
             )
-            touching = one.contact.touching
+            touching = contact.touching
             for side in (1, -1) if x > 0 else (1,):
                 for end in (1, -1) if y > 0 else (1,):
                     places.append((side * x, end * y))
-                    depths.append(one.depth_mm)
-                    frames.append(one.pressure_kpa[::side, ::end])
+                    depths.append(contact.depth_mm)
+                    frames.append(pressure[::side, ::end])
     plain = None
     if settings.flat_field:
-        plain = head.frame([], rotation=_LEVEL, x_mm=0.0, y_mm=0.0, mean_kpa=settings.mean_kpa).pressure_kpa
+        plain = head.frame([], rotation=_LEVEL, x_mm=0.0, y_mm=0.0, mean_kpa=settings.mean_kpa)[0]
     place = np.array(places)
     return RasterFrames(place[:, 0], place[:, 1], np.array(depths), np.stack(frames), settings.head, plain)

@@ -9,10 +9,10 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.sparse.linalg import splu
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.axisymmetric import (
     CondensedLump,
-    LayeredBody,
     _assemble,
     condense_lump,
     element_stiffness,
@@ -22,27 +22,27 @@ from tactile_bayes.forward.axisymmetric import (
     skin_spline,
 )
 from tactile_bayes.forward.mesh import EXTERIOR_GLAND, INTERIOR_FAT, LumpGeometry, LumpMesh, MeshSize, lump_mesh
-from tactile_bayes.forward.tissue import SceneBody
+from tactile_bayes.forward.tissue import Layers
 
-CENTRED = LumpGeometry(7.5, 7.5, 15.0, 15.0, 70.0)
-RESTING = LumpGeometry(7.5, 7.5, 15.0, 24.0, 70.0)
-SHALLOW = LumpGeometry(5.0, 5.0, 6.0, 6.0, 70.0)
+CENTRED = LumpGeometry(7.5, 7.5, 15.0, Layers(15.0))
+RESTING = LumpGeometry(7.5, 7.5, 15.0, Layers(24.0))
+SHALLOW = LumpGeometry(5.0, 5.0, 6.0, Layers(6.0))
 GEOMETRIES = {
     "centred": CENTRED,
     "resting": RESTING,
     "shallow": SHALLOW,
-    "half seated": LumpGeometry(7.5, 7.5, 15.0, 18.75, 70.0),
-    "touching": LumpGeometry(7.5, 7.5, 15.0, 22.5, 70.0),
-    "in the gland": LumpGeometry(7.5, 7.5, 25.0, 12.0, 70.0),
-    "deep": LumpGeometry(12.5, 12.5, 50.0, 50.0, 70.0),
-    "flat": LumpGeometry(7.5, 4.0, 15.0, 15.0, 70.0),
-    "tall": LumpGeometry(4.0, 7.5, 12.0, 14.0, 70.0),
+    "half seated": LumpGeometry(7.5, 7.5, 15.0, Layers(18.75)),
+    "touching": LumpGeometry(7.5, 7.5, 15.0, Layers(22.5)),
+    "in the gland": LumpGeometry(7.5, 7.5, 25.0, Layers(12.0)),
+    "deep": LumpGeometry(12.5, 12.5, 50.0, Layers(50.0)),
+    "flat": LumpGeometry(7.5, 4.0, 15.0, Layers(15.0)),
+    "tall": LumpGeometry(4.0, 7.5, 12.0, Layers(14.0)),
 }
 
 
 @cache
 def condensed(name: str) -> CondensedLump:
-    return condense_lump(GEOMETRIES[name], SceneBody())
+    return condense_lump(GEOMETRIES[name])
 
 
 def point_change(lump: CondensedLump, kpa: float, r1: float, r2: float, angle: float) -> float:
@@ -60,7 +60,7 @@ def test_a_mesh_fills_the_body_without_gap_or_overlap(name: str) -> None:
     mesh = lump_mesh(geometry)
     area = cell_areas(mesh)
     assert (area > 0).all()
-    assert area.sum() == pytest.approx(mesh.node_mm[:, 0].max() * geometry.thickness_mm, rel=1e-9)
+    assert area.sum() == pytest.approx(mesh.node_mm[:, 0].max() * geometry.layers.thickness_mm, rel=1e-9)
     inside = area[mesh.region >= INTERIOR_FAT].sum()
     assert inside == pytest.approx(np.pi / 2 * geometry.radius_mm * geometry.half_height_mm, rel=1e-4)
     # every edge is shared by two elements or lies on the rim: a crack would show as an edge with one
@@ -71,7 +71,7 @@ def test_a_mesh_fills_the_body_without_gap_or_overlap(name: str) -> None:
     alone = mesh.node_mm[found[times == 1]]
     low, high = alone.min(axis=1), alone.max(axis=1)
     on_rim = (high[:, 0] == 0) | (low[:, 0] == mesh.node_mm[:, 0].max())
-    assert (on_rim | (high[:, 1] == 0) | (low[:, 1] == geometry.thickness_mm)).all()
+    assert (on_rim | (high[:, 1] == 0) | (low[:, 1] == geometry.layers.thickness_mm)).all()
 
 
 def cell_areas(mesh: LumpMesh) -> np.ndarray:
@@ -185,15 +185,15 @@ def test_without_a_lump_the_elements_sink_as_the_exact_layers() -> None:
         sinkings.append(splu(matrix).solve(force)[skin])
     r = np.array([0.0, 5.0, 15.0, 40.0])
     by_elements = CubicSpline(mesh.node_mm[mesh.surface[:-1], 0], sinkings[0] - sinkings[1])(r)
-    stiff, even = (LayeredBody((5.0, gland), (15.0, 55.0), 0.495) for gland in (50.0, 5.0))
+    stiff, even = (Layers(15.0, gland_ratio=ratio) for ratio in (10.0, 1.0))
     exact = layering_compliance(r, stiff) - layering_compliance(r, even)
     np.testing.assert_allclose(by_elements, exact, atol=0.002 * np.abs(exact).max())
 
 
 def test_two_meshes_of_one_body_agree() -> None:
     """With one tissue throughout, where the layers "meet" moves the mesh and nothing else."""
-    meshes = [LumpGeometry(7.5, 7.5, 15.0, boundary, 70.0) for boundary in (15.0, 20.0, 40.0)]
-    lumps = [condense_lump(geometry, SceneBody(gland_ratio=1.0)) for geometry in meshes]
+    meshes = [LumpGeometry(7.5, 7.5, 15.0, Layers(boundary, gland_ratio=1.0)) for boundary in (15.0, 20.0, 40.0)]
+    lumps = [condense_lump(geometry) for geometry in meshes]
     for angle in (0.0, 1.5):
         first, *others = (point_change(lump, 500.0, 6.0, 6.0, angle) for lump in lumps)
         np.testing.assert_allclose(others, first, rtol=0.01)
@@ -208,8 +208,7 @@ def test_a_small_sphere_is_eshelbys() -> None:
     """
     radius, depth, nu = 1.0, 12.0, 0.4999
     lump = condense_lump(
-        LumpGeometry(radius, radius, depth, 60.0, 400.0),
-        SceneBody(fat_kpa=5.0, gland_ratio=1.0, nu=nu),
+        LumpGeometry(radius, radius, depth, Layers(60.0, 400.0, 5.0, 1.0, nu)),
         size=MeshSize(arc=20, rings=12, core=4, reach_mm=600.0),
     )
     shear = 5.0 / (2 * (1 + nu))
@@ -234,7 +233,7 @@ def boussinesq_strain(x: np.ndarray, shear: float) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", GEOMETRIES)
 def test_the_change_converges_with_the_mesh(name: str) -> None:
-    fine = condense_lump(GEOMETRIES[name], SceneBody(), size=MeshSize(arc=36, rings=12, core=6, grade=1.25))
+    fine = condense_lump(GEOMETRIES[name], size=MeshSize(arc=36, rings=12, core=6, grade=1.25))
     h = GEOMETRIES[name].depth_mm
     largest = abs(point_change(fine, 500.0, 0.3 * h, 0.3 * h, 0.0))
     for r1, r2, angle in ((0.3 * h, 0.3 * h, 0.0), (0.5 * h, 0.5 * h, 0.0), (h, 0.5 * h, 1.0), (2 * h, 0.3 * h, 0.0)):
@@ -246,7 +245,8 @@ def test_the_change_converges_with_the_mesh(name: str) -> None:
 @pytest.mark.slow
 def test_nearly_incompressible_does_not_lock() -> None:
     soft, hard = (
-        point_change(condense_lump(CENTRED, SceneBody(nu=nu)), 500.0, 5.0, 5.0, 0.0) for nu in (0.499, 0.49999)
+        point_change(condense_lump(replace(CENTRED, layers=Layers(15.0, poisson=nu))), 500.0, 5.0, 5.0, 0.0)
+        for nu in (0.499, 0.49999)
     )
     assert hard == pytest.approx(soft, rel=0.02)
 
@@ -255,7 +255,7 @@ def test_nearly_incompressible_does_not_lock() -> None:
 @pytest.mark.parametrize("name", ["centred", "shallow"])
 def test_two_more_orders_change_nothing(name: str) -> None:
     geometry = GEOMETRIES[name]
-    more = condense_lump(geometry, SceneBody(), orders=orders_needed(geometry) + 2)
+    more = condense_lump(geometry, orders=orders_needed(geometry) + 2)
     r = 0.7 * geometry.depth_mm
     a, b = point_change(condensed(name), 500.0, r, r, 0.0), point_change(more, 500.0, r, r, 0.0)
     assert a == pytest.approx(b, rel=3e-3)
@@ -263,7 +263,7 @@ def test_two_more_orders_change_nothing(name: str) -> None:
 
 def test_a_lump_out_of_the_body_is_refused() -> None:
     with pytest.raises(BadDataError, match=r"reaches 72\.5 mm deep, the base lies at 70 mm"):
-        LumpGeometry(7.5, 7.5, 65.0, 15.0, 70.0)
+        LumpGeometry(7.5, 7.5, 65.0, Layers(15.0))
 
 
 def test_a_lump_without_stiffness_is_refused() -> None:

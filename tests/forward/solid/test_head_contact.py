@@ -9,13 +9,14 @@ from hypothesis import strategies as st
 from scipy.optimize import nnls
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.axisymmetric import LayeredBody, taxel_compliance
+from tactile_bayes.forward.axisymmetric import taxel_compliance
 from tactile_bayes.forward.contact import ContactStiffness, solve_contact
 from tactile_bayes.forward.scene import Head
-from tactile_bayes.forward.tissue import head_face
+from tactile_bayes.forward.simulate import head_face
+from tactile_bayes.forward.tissue import Layers
 
 NU = 0.495
-HALF_SPACE = LayeredBody((5.0,), (), NU)
+HALF_SPACE = Layers(4000.0, 9000.0, 5.0, 1.0, NU)  # as good as one under a head of a few millimetres
 E_STAR = 5.0 / (1 - NU**2)
 
 
@@ -26,7 +27,7 @@ def squares(n: int, pitch: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def small_body(n: int = 7) -> np.ndarray:
-    return taxel_compliance(LayeredBody((5.0, 50.0), (8.0, 30.0), NU), rows=n, columns=n, pitch_mm=1.5)
+    return taxel_compliance(Layers(8.0, 38.0, poisson=NU), rows=n, columns=n, pitch_mm=1.5)
 
 
 def test_a_sphere_presses_as_hertz_says() -> None:
@@ -134,16 +135,15 @@ def test_a_head_that_is_not_pressed_hangs_over_the_skin() -> None:
 
 def test_the_rim_is_tangent_to_the_face_and_feels_nothing() -> None:
     taxels = Head().surface_mm()
-    face = head_face(taxels, pitch_mm=1.5, radius_mm=35.0, rim_mm=3.0)
+    face = head_face(Head(radius_mm=35.0, rim_mm=3.0))
     assert face.sensing.shape == (18, 30)
-    assert face.taxels == (16, 26)
     np.testing.assert_array_equal(face.surface_mm[face.sensing].reshape(16, 26, 3), taxels)
-    across = head_face(taxels, pitch_mm=1.5, radius_mm=35.0, rim_mm=3.0).surface_mm[:, 15]
+    across = face.surface_mm[:, 15]
     centre = 32.0 * np.array([12 / 35, np.sqrt(1 - (12 / 35) ** 2)]) - [0.0, 35.0]
     assert np.hypot(*(across[-1, [0, 2]] - centre)) == pytest.approx(3.0)
     along = face.surface_mm[9, :, 2] - face.surface_mm[9, 15, 2]
     np.testing.assert_allclose(along[:3], [np.sqrt(9 - 2.25**2) - 3, np.sqrt(9 - 0.75**2) - 3, 0.0], atol=1e-12)
-    bare = head_face(taxels, pitch_mm=1.5, radius_mm=35.0)
+    bare = head_face(Head(radius_mm=35.0, rim_mm=0.0))
     np.testing.assert_array_equal(bare.surface_mm, taxels)
     with pytest.raises(BadDataError, match="rim_mm is 40"):
-        head_face(taxels, pitch_mm=1.5, radius_mm=35.0, rim_mm=40.0)
+        head_face(Head(radius_mm=35.0, rim_mm=40.0))

@@ -31,12 +31,11 @@ from tactile_bayes.forward.scene import (
     level_kpa,
 )
 from tactile_bayes.forward.simulate import (
-    PlacedLump,
+    SkinPerturbation,
     SolidHead,
     condensed_lump,
-    face_of,
     frames_at_poses,
-    layers_of,
+    head_face,
     simulate,
     skin_perturbation,
     solid_head,
@@ -174,8 +173,8 @@ def test_a_rib_is_a_row_of_balls_and_no_lump() -> None:
 
 
 def test_shoulders_inside_the_array_leave_no_rim() -> None:
-    assert face_of(Head()).sensing.shape == (18, 30)
-    assert face_of(Head(shoulder_mm=3.0)).sensing.shape == (16, 26)
+    assert head_face(Head()).sensing.shape == (18, 30)
+    assert head_face(Head(shoulder_mm=3.0)).sensing.shape == (16, 26)
 
 
 LUMP = "[[lump]]\nd_mm = 15\n"
@@ -282,9 +281,9 @@ def test_another_programs_frames_are_met_one_by_one(
         shared_data / "scans" / f"{name}.npz", skin, float(row["tracker_latency_ms"])
     ):
         mean = float(pressure.mean())
-        frame = head.frame([placed], rotation=pose[:3, :3], x_mm=pose[0, 3], y_mm=pose[1, 3], mean_kpa=mean)
-        residual.append((frame.pressure_kpa - pressure) / mean)
-        ratio.append(frame.depth_mm / pose[2, 3])
+        frame, contact = head.frame([placed], rotation=pose[:3, :3], x_mm=pose[0, 3], y_mm=pose[1, 3], mean_kpa=mean)
+        residual.append((frame - pressure) / mean)
+        ratio.append(contact.depth_mm / pose[2, 3])
     assert len(residual) > 25
     assert np.sqrt(np.mean(np.square(residual))) <= limit  # s11 has 0.2 kPa of noise, s01 0.02
     assert np.median(ratio) == pytest.approx(1.0, abs=depth_limit)
@@ -298,23 +297,23 @@ def test_another_programs_rib_is_met_frame_by_frame(shared_data: Path) -> None:
     assert (rib.d_mm, rib.spacing_mm) == (float(row["d_mm"]), 8.0)
     lump = SolidLump(d_mm=12.0, depth_ratio=1.0)
     head, placed = one_ball(lump)
-    balls = [placed, *(PlacedLump(placed.perturbation, ball.x_mm, ball.y_mm) for ball in rib.balls())]
+    balls = [placed, *(replace(placed, x_mm=ball.x_mm, y_mm=ball.y_mm) for ball in rib.balls())]
     skin = np.array([float(row[f"base_{axis}_mm"]) for axis in "xyz"])
     found = poses_and_frames(shared_data / "scans" / "s07_rib_edge.npz", skin, float(row["tracker_latency_ms"]))
     residual, alone = [], []
     for pose, pressure in found[::3]:
         pressed = {"rotation": pose[:3, :3], "x_mm": pose[0, 3], "y_mm": pose[1, 3], "mean_kpa": float(pressure.mean())}
-        residual.append((head.frame(balls, **pressed).pressure_kpa - pressure) / pressure.mean())
-        alone.append((head.frame([placed], **pressed).pressure_kpa - pressure) / pressure.mean())
+        residual.append((head.frame(balls, **pressed)[0] - pressure) / pressure.mean())
+        alone.append((head.frame([placed], **pressed)[0] - pressure) / pressure.mean())
     assert np.sqrt(np.mean(np.square(residual))) <= 0.04
     assert np.sqrt(np.mean(np.square(alone))) >= 0.08  # without the rib
 
 
-def one_ball(lump: SolidLump) -> tuple[SolidHead, PlacedLump]:
+def one_ball(lump: SolidLump) -> tuple[SolidHead, SkinPerturbation]:
     body = SceneBody()
     fat = fat_thickness(body, [lump])
     change = skin_perturbation(condensed_lump(lump, body, fat), lump.stiffness_ratio * body.fat_kpa)
-    return solid_head(face_of(Head()), layers_of(body, fat)), PlacedLump(change, 0.0, 0.0)
+    return solid_head(head_face(Head()), body.layers(fat)), change
 
 
 def poses_and_frames(path: Path, skin: np.ndarray, latency_ms: float) -> list[tuple[np.ndarray, np.ndarray]]:
