@@ -50,7 +50,6 @@ from tactile_bayes.report.paper_head import (
 from tactile_bayes.report.study import (
     frames_text,
     lookalikes_text,
-    solid_figures,
     study_figures,
     study_table,
     study_text,
@@ -133,15 +132,14 @@ def study_action(
         unfinished(output).unlink(missing_ok=True)
     click.echo(study_text(rows), err=output is None)
     told = [RESEARCH_USE]
-    if paths and isinstance(settings, SolidSettings):
-        solid_figures(rows, settings, paths, seat=chosen, force=force)
-        told.insert(0, f"figures 5 to 8 are in {figures}")
-    elif paths and isinstance(settings, paper.StudySettings):
-        d, h = phantom or PHANTOMS["phantom 12.5 mm"]  # without a phantom and its frames figure 6 shows the paper's
-        compared = compare_frames(frames, d_mm=d, depth_ratio=h, seat=chosen, settings=settings) if frames else []
-        found = study_figures(rows, settings, paths, seat=chosen, phantom=(d, h), measured=compared, force=force)
-        where = f"figures 5 to 8 and the frames of four lumps are in {figures}"
-        told = [lookalikes_text(found), *frames_text(compared), where, *told]
+    if paths:
+        lump = phantom or PHANTOMS["phantom 12.5 mm"]  # without a phantom and its frames figure 6 shows the paper's
+        flat = settings if isinstance(settings, paper.StudySettings) else None
+        compared = compare_frames(frames, *lump, seat=chosen, settings=flat) if frames and flat else []
+        found = study_figures(rows, settings, paths, seat=chosen, phantom=lump, measured=compared, force=force)
+        four = " and the frames of four lumps" if flat else ""
+        told = [f"figures 5 to 8{four} are in {figures}", RESEARCH_USE]
+        told = [lookalikes_text(found), *frames_text(compared), *told] if flat else told
     for line in told:
         click.echo(line, err=output is None)
 

@@ -544,17 +544,17 @@ def fit_shape(shape: Callable[[float], FloatArray], data: FloatArray, *, grid: F
     """
 
     def left(parameter: float) -> float:
-        return _fit_height(shape(parameter), data)[1]
+        return fit_height(shape(parameter), data)[1]
 
     k = int(np.argmin([left(value) for value in grid]))
     bounds = (grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)])
     refined = float(minimize_scalar(left, bounds=bounds, method="bounded", options={"xatol": 1e-11}).x)
     best = min((refined, float(grid[k])), key=left)
-    height, sse = _fit_height(shape(best), data)
+    height, sse = fit_height(shape(best), data)
     return ShapeFit(height, best, sse)
 
 
-def _fit_height(shape: FloatArray, data: FloatArray) -> tuple[float, float]:
+def fit_height(shape: FloatArray, data: FloatArray) -> tuple[float, float]:
     """The best multiple of `shape` and the sum of squares it leaves of `data`."""
     height = float(shape @ data / (shape @ shape))
     return height, float(np.sum((data - height * shape) ** 2))

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.forward.plane import LineFrames, build_line
-from tactile_bayes.forward.simulate import SkinPerturbation, SolidHead, head_face, solid_head
+from tactile_bayes.forward.plane import LineFrames
 from tactile_bayes.forward.tissue import Layers
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
@@ -34,7 +33,6 @@ from tactile_bayes.studies.paper import (
     StudyRow,
     StudySettings,
     find_lookalikes,
-    fit_line,
     hard_cases,
     learn_as_printed,
     seat_name,
@@ -42,7 +40,7 @@ from tactile_bayes.studies.paper import (
     width_changes,
     widths,
 )
-from tactile_bayes.studies.paper_solid import SolidSettings, fit_raster, raster_frames, raster_map
+from tactile_bayes.studies.paper_solid import SolidSettings
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -104,12 +102,10 @@ _RATIOS = (2.0, 5.0, 8.0, 10.0, 100.0)
 _AXES = {"x": "across the head", "y": "along it"}
 _ON_HEAD, _ON_SKIN, _SHARE = "position on the head (mm)", "place on the skin (mm)", "pressure / mean of its frame"
 
-Curve = tuple[FloatArray, FloatArray, str]  #: Places, values and the name of a line.
-
 
 def study_figures(
     rows: Sequence[StudyRow],
-    settings: StudySettings,
+    settings: StudySettings | SolidSettings,
     paths: Sequence[Path],
     *,
     seat: float,
@@ -117,23 +113,33 @@ def study_figures(
     measured: Sequence[FrameAgreement] = (),
     force: bool = False,
 ) -> Lookalikes | None:
-    """Draw figures 5 to 8, and the frames of four lumps, as PNG files; returns the pair of lumps that figure 5b shows.
+    """Draw figures 5 to 8, and in two dimensions the frames of four lumps, as PNG files; returns the pair of lumps that
+    figure 5b shows there.
 
     Figures 7b and 8 show what the table holds of this seat, which is that of the lumps in figures 5b to 7a as well.
     `phantom` is the diameter in mm and h/d of the lump of figure 6; `measured` are frames for figure 6a, in place of
     the places drawn without any.
     """
     of_seat = [row for row in rows if row.seat == seat_name(seat)]
-    found = find_lookalikes(settings, seat=seat)
+    found = find_lookalikes(settings, seat=seat) if isinstance(settings, StudySettings) else None
     with _panels(paths[0], _caption("Figure 5", settings, seat), force=force) as panels:
         _frames_of_lumps(*panels, settings, seat, found)
     with _panels(paths[1], _caption("Figure 6", settings, seat), force=force) as panels:
-        _frames_and_maps(*panels, settings, TableScene(PHANTOM, *phantom, seat), measured)
+        if isinstance(settings, StudySettings):
+            _frames_and_maps(*panels, settings, TableScene(PHANTOM, *phantom, seat), measured)
+        else:
+            _map_of_ball(*panels, settings, seat)
     with _panels(paths[2], _caption("Figure 7", settings, seat), force=force) as panels:
-        _figure_7(*panels, of_seat, _lines_by_stiffness(settings, seat), "(a) maps, d {:g} mm, h/d {:g}", _SMALL)
+        _figure_7(*panels, of_seat, settings, seat)
     figure_8(of_seat, paths[3], force=force)
-    with figure_file(paths[4], size_in=(10.0, 7.6), foot=_caption("Dotted: Eq 3", settings, seat), force=force) as four:
-        # frame by frame for the phantoms of section 2.3: its curves "for four lumps"
+    if isinstance(settings, StudySettings):
+        _four_lumps(settings, paths[4], seat=seat, force=force)
+    return found
+
+
+def _four_lumps(settings: StudySettings, path: Path, *, seat: float, force: bool) -> None:
+    """Both models frame by frame for the phantoms of section 2.3: its curves "for four lumps"."""
+    with figure_file(path, size_in=(10.0, 7.6), foot=_caption("Dotted: Eq 3", settings, seat), force=force) as four:
         for axes, (d, h) in zip(four.subplots(2, 2).ravel(), PHANTOMS.values(), strict=True):
             curves = scene_curves(TableScene("", d, h, seat), settings)
             ours, theirs = curves.empirical.as_taxels(HEAD_PITCH_MM), curves.elastic.as_taxels(HEAD_PITCH_MM)
@@ -141,22 +147,6 @@ def study_figures(
             _draw_frames(axes, theirs, ours)
             title = f"d {d:g} mm, h/d {h:g}; MSD of all frames {share:.1f} %"
             finish(axes, title, _ON_HEAD, "pressure (kPa)", headroom=0.15)
-    return found
-
-
-def solid_figures(
-    rows: Sequence[StudyRow], settings: SolidSettings, paths: Sequence[Path], *, seat: float, force: bool = False
-) -> None:
-    """Draw the four figures for balls as PNG files; rows and seat are as in `study_figures`."""
-    of_seat = [row for row in rows if row.seat == seat_name(seat)]
-    with _panels(paths[0], _caption("Figure 5", settings, seat), force=force) as panels:
-        _frames_of_balls(*panels, settings, seat)
-    with _panels(paths[1], _caption("Figure 6", settings, seat), force=force) as panels:
-        _map_of_ball(*panels, settings, seat)
-    with _panels(paths[2], _caption("Figure 7", settings, seat), force=force) as panels:
-        curves = _sections_by_stiffness(settings, seat)
-        _figure_7(*panels, of_seat, curves, "(a) across the head, d {:g} mm, h/d {:g}", _SMALL_BALL)
-    figure_8(of_seat, paths[3], force=force)
 
 
 def lookalikes_text(found: Lookalikes | None) -> str:
@@ -198,51 +188,33 @@ def _caption(name: str, settings: StudySettings | SolidSettings, seat: float) ->
     )
 
 
-def _frames_of_lumps(left: Axes, right: Axes, settings: StudySettings, seat: float, found: Lookalikes | None) -> None:
-    """Fig 5: frames far from the lump on fat of six thicknesses with Eq 1, and over lumps, two of which look alike."""
+def _frames_of_lumps(
+    left: Axes, right: Axes, settings: StudySettings | SolidSettings, seat: float, found: Lookalikes | None
+) -> None:
+    """Fig 5: frames far from the lump on fat of six thicknesses, and over lumps; in two dimensions with Eq 1, and two
+    lumps that look alike."""
+    flat = isinstance(settings, StudySettings)
     for colour, fat in zip(COLOURS, _FAT_MM, strict=True):
-        layers = _plain_layers(settings, fat)
+        layers = Layers(fat, THICKNESS_MM, settings.fat_kpa, settings.gland_ratio, settings.poisson)
         frame = settings.far(layers)
-        left.plot(frame.s_mm, frame.pressure_kpa[0], color=colour, label=f"fat {fat:g} mm")
-        if fat == _FITTED_FAT_MM:
+        left.plot(frame.s_mm, frame.at(0.0), color=colour, label=f"fat {fat:g} mm")
+        if fat == _FITTED_FAT_MM and isinstance(settings, StudySettings):
             model = settings.empirical(1.0, layers, frame)
             text = f"Eq 1 fitted to taxels, fat {fat:g} mm"
             left.plot(frame.s_mm, model.homogeneous(frame.s_mm), "k:", label=text)
-    cases, title = [_OTHER], "no two visible lumps"
+    where, far, title = "position across the head (mm)", "middle of the head", "over the ball, middle of the head"
+    cases = zip(COLOURS, ("-", "-", "-"), _BALLS, strict=False)
+    if flat:
+        where, far, title = _ON_HEAD, "fat over gland, 70 mm in all", "over the lump: no two visible lumps"
+        alike = [] if found is None else [(one.d_mm, one.depth_ratio) for one in (found.small, found.large)]
+        cases = zip(COLOURS[1:], ("-", "--", "-"), [*alike, _OTHER], strict=False)
     if found is not None:
-        cases = [*((one.d_mm, one.depth_ratio) for one in (found.small, found.large)), _OTHER]
-        title = f"two differ by {100 * found.difference:.1f} % of their rise"
-    for colour, line, (d, h) in zip(COLOURS[1:], ("-", "--", "-"), cases, strict=False):
-        elastic = settings.over(settings.surface(settings.body(d, h, seat=seat)))
-        right.plot(elastic.s_mm, elastic.at(0.0), line, color=colour, label=f"d {d:g} mm, h/d {h:.3g}")
-    finish(left, "(a) far from the lump, fat over gland, 70 mm in all", _ON_HEAD, "pressure (kPa)")
-    finish(right, f"(b) over the lump: {title}", _ON_HEAD, "pressure (kPa)", headroom=0.15)
-
-
-def _plain_layers(settings: CaseSettings, fat_mm: float) -> Layers:
-    return Layers(fat_mm, THICKNESS_MM, settings.fat_kpa, settings.gland_ratio, settings.poisson)
-
-
-def _frames_of_balls(left: Axes, right: Axes, settings: SolidSettings, seat: float) -> None:
-    """Fig 5: frames through the middle of the head, far from the lump on fat of several thicknesses, and over balls."""
-    s = settings.head.surface_mm()[:, 0, 0]
-    for colour, fat in zip(COLOURS, _FAT_MM, strict=False):
-        plain = solid_head(head_face(settings.head), _plain_layers(settings, fat))
-        left.plot(s, _middle_frame(plain, [], settings), color=colour, label=f"fat {fat:g} mm")
-    for colour, (d, h) in zip(COLOURS, _BALLS, strict=False):
-        body = settings.body(d, h, seat=seat)
-        lump = settings.placed(settings.condensed(body), HARD_RATIO)
-        right.plot(s, _middle_frame(settings.on(body), [lump], settings), color=colour, label=f"d {d:g} mm, h/d {h:g}")
-    where = "position across the head (mm)"
-    finish(left, "(a) far from the lump, middle of the head", where, "pressure (kPa)")
-    finish(right, "(b) over the ball, middle of the head", where, "pressure (kPa)", headroom=0.15)
-
-
-def _middle_frame(head: SolidHead, lumps: Sequence[SkinPerturbation], settings: SolidSettings) -> FloatArray:
-    """(rows,) the mean of the two middle columns of a level head over the lump."""
-    frame = head.frame(lumps, rotation=np.eye(3), x_mm=0.0, y_mm=0.0, mean_kpa=settings.mean_kpa)[0]
-    middle = frame.shape[1] // 2
-    return np.asarray(frame[:, middle - 1 : middle + 1].mean(axis=1))
+        title = f"over the lump: two differ by {100 * found.difference:.1f} % of their rise"
+    for colour, style, (d, h) in cases:
+        frame = settings.over_lump(settings.body(d, h, seat=seat))
+        right.plot(frame.s_mm, frame.at(0.0), style, color=colour, label=f"d {d:g} mm, h/d {h:.3g}")
+    finish(left, f"(a) far from the lump, {far}", where, "pressure (kPa)")
+    finish(right, f"(b) {title}", where, "pressure (kPa)", headroom=0.15)
 
 
 def _frames_and_maps(
@@ -279,9 +251,7 @@ def _draw_frames(axes: Axes, elastic: LineFrames, empirical: LineFrames) -> None
 def _map_of_ball(left: Axes, right: Axes, settings: SolidSettings, seat: float) -> None:
     """Fig 6: the map of the first phantom, and its sections along both axes of the head."""
     d, h = PHANTOMS[PHANTOM]
-    body = settings.body(d, h, seat=seat)
-    lump = settings.placed(settings.condensed(body), HARD_RATIO)
-    made = raster_map(raster_frames(settings.on(body), lump, settings))
+    made = settings.maps(settings.body(d, h, seat=seat))(HARD_RATIO)
     read_x, read_y = made.covered.any(axis=0), made.covered.any(axis=1)
     x, y, mean = made.x_mm[read_x], made.y_mm[read_y], made.mean[np.ix_(read_y, read_x)]
     picture = left.pcolormesh(x, y, mean, cmap="viridis", shading="nearest")
@@ -305,32 +275,19 @@ def _section(made: TactileMap, axis: str) -> tuple[FloatArray, FloatArray]:
     return across[read], np.asarray(mean[np.ix_(chosen, read)].mean(axis=0))
 
 
-def _lines_by_stiffness(settings: StudySettings, seat: float) -> Iterator[Curve]:
-    """Maps of a lump of several stiffnesses, with Eq 5 fitted to them."""
-    surface = settings.surface(settings.body(*_SMALL, seat=seat))
-    for ratio in _RATIOS:
-        line = build_line(settings.frames(surface, ratio))
-        found = fit_line(line, settings.fit_radius_mm)
-        yield line.x_mm, line.mean, f"E2/E1 {ratio:g}: a {found.amplitude:.3f}, sigma {found.sigma_mm:.2f} mm"
-
-
-def _sections_by_stiffness(settings: SolidSettings, seat: float) -> Iterator[Curve]:
-    """Sections across the head of maps of a ball of several stiffnesses, with Eq 7 fitted to the maps."""
-    body = settings.body(*_SMALL_BALL, seat=seat)
-    head, condensed = settings.on(body), settings.condensed(body)
-    for ratio in _RATIOS:
-        frames = raster_frames(head, settings.placed(condensed, ratio), settings)
-        found = fit_raster(frames, settings)
-        sigma = f"{found.sigma_x_mm:.1f} x {found.sigma_y_mm:.1f} mm"
-        yield *_section(raster_map(frames), "x"), f"E2/E1 {ratio:g}: a {found.amplitude:.3f}, sigma {sigma}"
-
-
-def _figure_7(
-    left: Axes, right: Axes, rows: Sequence[StudyRow], curves: Iterable[Curve], title: str, lump: tuple[float, float]
-) -> None:
-    """Maps of a small lump of several stiffnesses, and how little the widths depend on stiffness."""
-    for colour, (x, value, text) in zip(COLOURS, curves, strict=False):
+def _figure_7(left: Axes, right: Axes, rows: Sequence[StudyRow], settings: CaseSettings, seat: float) -> None:
+    """Maps of a small lump of several stiffnesses with Eq 5 or 7 fitted to them, of a ball across the head, and how
+    little the widths depend on stiffness."""
+    flat = isinstance(settings, StudySettings)
+    d, h = _SMALL if flat else _SMALL_BALL
+    maps = settings.maps(settings.body(d, h, seat=seat))
+    for colour, ratio in zip(COLOURS, _RATIOS, strict=False):
+        made = maps(ratio)
+        found = settings.fitted(made)
+        x, value = (made.x_mm, made.mean) if flat else _section(made, "x")
+        both = " x ".join(f"{width:.{2 if flat else 1}f}" for width in found.widths_mm if width is not None)
         near = np.abs(x) <= 20.0
+        text = f"E2/E1 {ratio:g}: a {found.amplitude:.3f}, sigma {both} mm"
         left.plot(x[near], value[near], color=colour, label=text)
     level = [row for row in rows if abs(row.depth_ratio - 1.0) < 1e-9 and row.detectable]
     for i, diameter in enumerate(dict.fromkeys(row.d_mm for row in hard_cases(level))):
@@ -344,7 +301,8 @@ def _figure_7(
             right.plot(*zip(*points, strict=True), line, label=label, **looks)
     right.axhspan(0.95, 1.05, color="0.9", zorder=0)
     right.set_xscale("log")
-    finish(left, title.format(*lump), _ON_SKIN, _SHARE, headroom=0.4)
+    what = "maps" if flat else "across the head"
+    finish(left, f"(a) {what}, d {d:g} mm, h/d {h:g}", _ON_SKIN, _SHARE, headroom=0.4)
     which = "; full across, dashed along" if len(_axes_of(rows)) > 1 else ""
     title = f"(b) width, h/d 1{which}; grey: 5 %"
     finish(right, title, "stiffness ratio E2/E1", f"sigma / sigma at {HARD_RATIO:g}")

@@ -225,7 +225,7 @@ class FrameAgreement(Record, eq=False):
 
 
 def compare_frames(
-    frames: Sequence[MeasuredFrame], *, d_mm: float, depth_ratio: float, seat: float, settings: StudySettings
+    frames: Sequence[MeasuredFrame], d_mm: float, depth_ratio: float, *, seat: float, settings: StudySettings
 ) -> list[FrameAgreement]:
     """Both models of a hard lump at the places and mean pressures of measured frames.
 

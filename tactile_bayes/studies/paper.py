@@ -43,8 +43,12 @@ class CaseSettings(CaseOptions, kw_only=True):
         """The body of a case."""
         return Body(d_mm, depth_ratio, seat, self.thickness_mm, self.fat_kpa, self.gland_ratio, self.poisson)
 
-    def fitter(self, body: Body) -> Callable[[float], Any]:
-        """From a stiffness ratio of the body's lump to the fit of its map; what all ratios share is computed here."""
+    def maps(self, body: Body) -> Callable[[float], Any]:
+        """From a stiffness ratio of the body's lump to its map; what all ratios share is computed here."""
+        raise NotImplementedError
+
+    def fitted(self, made: Any) -> Any:
+        """The Gaussian of a map."""
         raise NotImplementedError
 
     def recipe(self) -> dict[str, Any]:
@@ -54,10 +58,10 @@ class CaseSettings(CaseOptions, kw_only=True):
     def rows(self, geometry: Geometry) -> list[StudyRow]:
         """The rows of one geometry: the body is condensed once for all stiffnesses of its lump."""
         body = self.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
-        fitted, rows = self.fitter(body), []
+        maps, rows = self.maps(body), []
         setting = body.layers.thickness_mm, self.head.radius_mm, self.head.shoulders
         for ratio in geometry.stiffness_ratios:
-            found = fitted(ratio)
+            found = self.fitted(maps(ratio))
             case = seat_name(geometry.seat), geometry.d_mm, geometry.depth_ratio, ratio
             sigma_x, sigma_y = found.widths_mm
             detectable = bool(found.amplitude >= DETECTABLE and found.resolved)
@@ -82,9 +86,12 @@ class StudySettings(CaseSettings, kw_only=True):
     def recipe(self) -> dict[str, Any]:
         return {"background": "fixed", "fit_radius_mm": self.fit_radius_mm}
 
-    def fitter(self, body: Body) -> Callable[[float], LineFit]:
+    def maps(self, body: Body) -> Callable[[float], plane.TactileLine]:
         surface = self.surface(body)
-        return lambda ratio: fit_line(plane.build_line(self.frames(surface, ratio)), self.fit_radius_mm)
+        return lambda ratio: plane.build_line(self.frames(surface, ratio))
+
+    def fitted(self, made: plane.TactileLine) -> LineFit:
+        return fit_line(made, self.fit_radius_mm)
 
     def surface(self, body: Body) -> plane.SurfaceCompliance:
         """The body condensed onto the surface that the head travels over."""
@@ -101,6 +108,10 @@ class StudySettings(CaseSettings, kw_only=True):
     def over(self, surface: plane.SurfaceCompliance, stiffness_ratio: float = HARD_RATIO) -> plane.LineFrames:
         """The frame with the head's centre over the lump."""
         return plane.press(surface, stiffness_ratio, np.zeros(1), head=self.head, mean_kpa=self.mean_kpa)
+
+    def over_lump(self, body: Body) -> plane.LineFrames:
+        """The frame with the head's centre over a hard lump."""
+        return self.over(self.surface(body))
 
     def far(self, layers: Layers) -> plane.LineFrames:
         """The frame far from any lump."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from tactile_bayes.declarations import Record, as_dict, field, replace
 from tactile_bayes.forward.axisymmetric import CondensedLump, condense_lump
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize
-from tactile_bayes.forward.plane import FINENESS
+from tactile_bayes.forward.plane import FINENESS, LineFrames, fit_height
 from tactile_bayes.forward.scene import Head
 from tactile_bayes.forward.simulate import (
     RANK_TOLERANCE,
@@ -22,7 +22,7 @@ from tactile_bayes.forward.simulate import (
     skin_perturbation,
     solid_head,
 )
-from tactile_bayes.forward.tissue import Body
+from tactile_bayes.forward.tissue import Body, Layers
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.accumulate import FlatField
 from tactile_bayes.mapping.build import build_map
@@ -31,7 +31,8 @@ from tactile_bayes.posterior.bump import Bump, FitCells, window_cells
 from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, WIDEST_IN_RADII
 from tactile_bayes.presets import FIT_RADIUS_MM, Background
 from tactile_bayes.scans import CountArray, ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
-from tactile_bayes.studies.paper import CaseSettings
+from tactile_bayes.studies.model_comparison import centre_line
+from tactile_bayes.studies.paper import HARD_RATIO, CaseSettings
 
 # --- Maps of a study's raster of frames, built and fitted like a patient's.
 
@@ -75,7 +76,7 @@ def _readings(pressure_kpa: FloatArray) -> CountArray:
     return counts
 
 
-def fit_raster(frames: RasterFrames, settings: SolidSettings) -> RasterFit:
+def fit_raster(made: TactileMap, settings: SolidSettings) -> RasterFit:
     """Fit Eq 7 about the lump's axis with equal weights; the level is fitted or 1, by the settings.
 
     All readings of a cell come from its middle, so the Gaussian is not averaged over it. A patient's readings are
@@ -86,8 +87,8 @@ def fit_raster(frames: RasterFrames, settings: SolidSettings) -> RasterFit:
     trough.
     """
     radius_mm, free = settings.fit_radius_mm, settings.background == "free"
-    cells = replace(window_cells(raster_map(frames), (0.0, 0.0), radius_mm=radius_mm), cell_mm=0.0)
-    pitch = frames.head.pitch_mm
+    cells = replace(window_cells(made, (0.0, 0.0), radius_mm=radius_mm), cell_mm=0.0)
+    pitch = settings.head.pitch_mm
     ends = np.log([LEAST_WIDTH_IN_CELLS * pitch, WIDEST_IN_RADII * radius_mm])
     log_widths = _lowest(cells, ends, free=free)
     amplitude, sse = _height(log_widths, cells, free=free)
@@ -97,8 +98,8 @@ def fit_raster(frames: RasterFrames, settings: SolidSettings) -> RasterFit:
         and log_widths.max() < ends[1] - 1e-6
         and wide <= MOST_AXIS_RATIO * narrow
     )
-    sigma_x, sigma_y = (float(width) for width in np.exp(log_widths))
-    return RasterFit(amplitude, sigma_x, sigma_y, float(np.sqrt(sse / len(cells))), bool(resolved))
+    sigma_x, sigma_y = np.exp(log_widths).tolist()
+    return RasterFit(amplitude, (sigma_x, sigma_y), float(np.sqrt(sse / len(cells))), bool(resolved))
 
 
 def _height(log_widths: FloatArray, cells: FitCells, *, free: bool) -> tuple[float, float]:
@@ -109,8 +110,7 @@ def _height(log_widths: FloatArray, cells: FitCells, *, free: bool) -> tuple[flo
     if free:
         # what is left of both once a level is taken off
         shape, excess = shape - shape.mean(), excess - excess.mean()
-    height = float(shape @ excess / (shape @ shape))
-    return height, float(np.sum((excess - height * shape) ** 2))
+    return fit_height(shape, excess)
 
 
 def _lowest(cells: FitCells, ends: FloatArray, *, free: bool) -> FloatArray:
@@ -169,9 +169,12 @@ class SolidSettings(CaseSettings, kw_only=True):
     def recipe(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in ("background", "fit_radius_mm", "flat_field")}
 
-    def fitter(self, body: Body) -> Callable[[float], RasterFit]:
+    def maps(self, body: Body) -> Callable[[float], TactileMap]:
         head, condensed = self.on(body), self.condensed(body)
-        return lambda ratio: fit_raster(raster_frames(head, self.placed(condensed, ratio), self), self)
+        return lambda ratio: raster_map(raster_frames(head, [self.placed(condensed, ratio)], self))
+
+    def fitted(self, made: TactileMap) -> RasterFit:
+        return fit_raster(made, self)
 
     def geometry(self, body: Body) -> LumpGeometry:
         """The ball in the body."""
@@ -196,6 +199,18 @@ class SolidSettings(CaseSettings, kw_only=True):
     def on(self, body: Body) -> SolidHead:
         """The head on the body without a lump."""
         return solid_head(head_face(self.head), body.layers)
+
+    def far(self, layers: Layers) -> LineFrames:
+        """The frame far from any lump, across the middle of the head."""
+        return self._middle(solid_head(head_face(self.head), layers), [])
+
+    def over_lump(self, body: Body) -> LineFrames:
+        """The frame with the head's centre over a hard lump, across the middle of the head."""
+        return self._middle(self.on(body), [self.placed(self.condensed(body), HARD_RATIO)])
+
+    def _middle(self, head: SolidHead, lumps: Sequence[SkinPerturbation]) -> LineFrames:
+        frame, _ = head.frame(lumps, rotation=_LEVEL, x_mm=0.0, y_mm=0.0, mean_kpa=self.mean_kpa)
+        return LineFrames(np.zeros(1), self.head.surface_mm()[:, 0, 0], centre_line(frame[None]))
 
     def placed(self, condensed: CondensedLump, stiffness_ratio: float) -> SkinPerturbation:
         """The lump under the middle of the raster."""
@@ -222,22 +237,14 @@ class RasterFrames(Record, eq=False):
 class RasterFit(Record):
     """The fit of Eq 7 to a raster's map."""
 
-    amplitude: float
-    sigma_x_mm: float
-    sigma_y_mm: float
-    """`amplitude`, `sigma_x_mm`, `sigma_y_mm`: a (height above the level, in units of the map) and the widths of Eq 7,
-    across and along the head."""
+    amplitude: float  #: a of Eq 7: height above the level, in units of the map.
+    widths_mm: tuple[float, float]  #: Across and along the head.
     rms: float  #: Root mean square of what the Gaussian leaves, in units of the background.
     resolved: bool  #: True when both widths are ones that array and window can tell.
 
-    @property
-    def widths_mm(self) -> tuple[float, float]:
-        """Across and along the head."""
-        return self.sigma_x_mm, self.sigma_y_mm
 
-
-def raster_frames(head: SolidHead, lump: SkinPerturbation | None, settings: SolidSettings) -> RasterFrames:
-    """Frames of the raster over a lump, or over the plain body.
+def raster_frames(head: SolidHead, lumps: Sequence[SkinPerturbation], settings: SolidSettings) -> RasterFrames:
+    """Frames of the raster over lumps on its middle, or over the plain body.
 
     The lump is symmetric about both axes of the level head, so the frame at (-x, y) is the one at (x, y) with its rows
     turned about, and that at (x, -y) with its columns. The layers are alike everywhere, so one frame tells all that the
@@ -251,7 +258,7 @@ def raster_frames(head: SolidHead, lump: SkinPerturbation | None, settings: Soli
         y = pitch * round(line / pitch)
         for x in pitch * np.arange(count + 1.0):
             pressure, contact = head.frame(
-                [] if lump is None else [lump],
+                lumps,
                 rotation=_LEVEL,
                 x_mm=float(x),
                 y_mm=y,

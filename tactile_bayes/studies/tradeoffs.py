@@ -10,7 +10,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.mesh import lump_mesh
-from tactile_bayes.forward.plane import build_line, head_positions, rim_nodes
+from tactile_bayes.forward.plane import TactileLine, build_line, head_positions, rim_nodes
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import Body, SceneBody, fat_thickness
 from tactile_bayes.geometry import FloatArray
@@ -158,15 +158,15 @@ def measure_forward(case: LumpCase, setting: Setting, *, clock: estimate_tradeof
 
     `clock` is called before and after each part.
     """
-    times = []
+    times: list[tuple[float, float]] = []
+    settings: paper.CaseSettings = setting.settings
     for _ in range(runs):
         begun = clock()
-        fitted = _empirical(case) if setting.model == EMPIRICAL else setting.settings.fitter(case.body)
+        maps = _empirical(case) if setting.model == EMPIRICAL else settings.maps(case.body)
         middle = clock()
-        found = fitted(case.stiffness_ratio)
+        found = settings.fitted(maps(case.stiffness_ratio))
         times.append((middle - begun, clock() - middle))
     lump, one_map = np.min(times, axis=0)
-    settings = setting.settings
     if isinstance(settings, SolidSettings):
         nodes = len(lump_mesh(settings.geometry(case.body), settings.mesh_size).arc)
     else:
@@ -175,18 +175,12 @@ def measure_forward(case: LumpCase, setting: Setting, *, clock: estimate_tradeof
     return Measured(setting, element, float(lump), float(one_map), found.amplitude, *found.widths_mm)
 
 
-def _empirical(case: LumpCase) -> Callable[[float], paper.LineFit]:
-    """The fit of the map of Eqs 1 to 4, which are fitted to plane-strain frames."""
+def _empirical(case: LumpCase) -> Callable[[float], TactileLine]:
+    """The map of Eqs 1 to 4, which are fitted to plane-strain frames."""
     settings = case.plane
     over = settings.over(settings.surface(case.body), case.stiffness_ratio)
     model = settings.empirical(case.d_mm, case.body.layers, over)
-
-    def fitted(_: float) -> paper.LineFit:
-        return paper.fit_line(
-            build_line(model.frames(head_positions(settings.positions_mm), over.s_mm)), settings.fit_radius_mm
-        )
-
-    return fitted
+    return lambda _: build_line(model.frames(head_positions(settings.positions_mm), over.s_mm))
 
 
 def teach(case: LumpCase, model: str, *, progress: Callable[[int, int], None]) -> list[paper.StudyRow]:
