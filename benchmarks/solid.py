@@ -51,7 +51,7 @@ def least_cpu(work: Callable[[], Any], runs: int) -> float:
 
 def head_on(geometry: LumpGeometry) -> SolidHead:
     """The default head on the body of a lump."""
-    return solid_head(head_face(Head()), geometry.layers)
+    return solid_head(Head(), geometry.layers)
 
 
 def sweep(head: SolidHead, lumps: Sequence[SkinPerturbation], count: int = 60) -> list[Any]:

@@ -36,7 +36,6 @@ from tactile_bayes.forward.simulate import (
     SkinPerturbation,
     SolidHead,
     condensed_lump,
-    head_face,
     skin_perturbation,
     solid_head,
 )
@@ -255,7 +254,7 @@ class _Model:
 
 @lru_cache(maxsize=8)
 def _kept_head(head: Any, body: SceneBody, fat_mm: float) -> SolidHead:
-    return solid_head(head_face(head), body.layers(fat_mm))
+    return solid_head(head, body.layers(fat_mm))
 
 
 def _plain_head(scene: Scene, body: SceneBody, fat_mm: float) -> SolidHead:

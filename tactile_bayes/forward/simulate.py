@@ -498,12 +498,13 @@ class SolidHead(Record, eq=False):
         return values[:, kept], signs[kept]
 
 
-def solid_head(face: HeadFace, layers: Layers) -> SolidHead:
+def solid_head(head: Head, layers: Layers) -> SolidHead:
     """Prepare a head on a body without lumps.
 
     The compliance is that of the squares on the flat skin: the head's curvature and tilt enter as heights, as the
     linear theory has it (Johnson 1985, ch. 4).
     """
+    face = head_face(head)
     rows, columns = face.sensing.shape
     compliance = taxel_compliance(layers, rows=rows, columns=columns, pitch_mm=face.pitch_mm)
     return SolidHead(face, ContactStiffness.of(compliance))
@@ -521,9 +522,13 @@ def frames_at_poses(
 ) -> tuple[FloatArray, FloatArray]:
     """Pressures in kPa, (n, rows, columns), on the head at poses from `scanhead` to the scene's `plane`, without noise,
     and z in mm of its apex there, which the mean pressures decide."""
-    body = scene.body or SceneBody()
-    head, lumps = _head(scene.head, body, fat_thickness(body, scene.solid_lumps)), _placed(scene)
-    count = len(mean_kpa)
+    body, lumps = scene.body or SceneBody(), []
+    fat = fat_thickness(body, scene.solid_lumps)
+    head, count = _head(scene.head, body.layers(fat)), len(mean_kpa)
+    for lump in scene.stiff_balls:
+        around = condensed_lump(lump, body, fat)
+        change = skin_perturbation(around, lump.stiffness_ratio * body.fat_kpa, square_mm=scene.head.pitch_mm)
+        lumps.append(replace(change, x_mm=lump.x_mm, y_mm=lump.y_mm))
     pressure = np.empty((count, scene.head.rows, scene.head.columns))
     depth, touching = np.empty(count), None
     for i in range(count):
@@ -548,20 +553,4 @@ def condensed_lump(lump: SolidLump, body: SceneBody, fat_mm: float) -> Condensed
 # Exams of one body, and lumps of one size and depth in it, share these; a scene has few.
 _BODIES_KEPT = 8
 _condensed = lru_cache(maxsize=_BODIES_KEPT)(condense_lump)
-
-
-@lru_cache(maxsize=_BODIES_KEPT)
-def _head(head: Head, body: SceneBody, fat_mm: float) -> SolidHead:
-    return solid_head(head_face(head), body.layers(fat_mm))
-
-
-def _placed(scene: Scene) -> list[SkinPerturbation]:
-    """The scene's lumps with their places."""
-    body = scene.body or SceneBody()
-    fat = fat_thickness(body, scene.solid_lumps)
-    placed = []
-    for lump in scene.stiff_balls:
-        around = condensed_lump(lump, body, fat)
-        change = skin_perturbation(around, lump.stiffness_ratio * body.fat_kpa, square_mm=scene.head.pitch_mm)
-        placed.append(replace(change, x_mm=lump.x_mm, y_mm=lump.y_mm))
-    return placed
+_head = lru_cache(maxsize=_BODIES_KEPT)(solid_head)

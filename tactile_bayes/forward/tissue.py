@@ -261,12 +261,8 @@ def check_solid(body: SceneBody, lumps: Sequence[SolidLump], ribs: Sequence[Rib]
 
 def _check_rib(index: int, rib: Rib, body: SceneBody) -> None:
     half = (1.0 + _LEAST_COVER) * rib.d_mm / 2
-    if not half <= rib.depth_mm <= body.thickness_mm - half:
-        where = "stands out of the skin" if rib.depth_mm < half else "reaches into the chest wall"
-        raise BadDataError(
-            f"rib[{index}].depth_mm is {rib.depth_mm:g}: the rib {where}",
-            way_out=f"it must lie in {half:.4g} to {body.thickness_mm - half:.4g} mm for this diameter and body",
-        )
+    ends = half, body.thickness_mm - half
+    _check_room(f"rib[{index}].depth_mm", rib.depth_mm, ends, "the rib", " mm for this diameter and body")
     count = 2 * int(rib.half_length_mm / rib.spacing_mm + 1e-9) + 1
     if count > MOST_BALLS:
         raise BadDataError(
@@ -278,14 +274,18 @@ def _check_rib(index: int, rib: Rib, body: SceneBody) -> None:
 def _check_depth(index: int, lump: SolidLump, body: SceneBody) -> None:
     half = (1.0 + _LEAST_COVER) * lump.vertical_mm / 2
     least, most = half / lump.d_mm, (body.thickness_mm - half) / lump.d_mm
-    if least <= lump.depth_ratio <= most:
-        return
-    where = "stands out of the skin" if lump.depth_ratio < least else "reaches into the chest wall"
     if least > most:
         raise BadDataError(
             f"lump[{index}] is {lump.vertical_mm:g} mm high", way_out=f"the body has {body.thickness_mm:g} mm of room"
         )
-    raise BadDataError(
-        f"lump[{index}].depth_ratio is {lump.depth_ratio:g}: the lump {where}",
-        way_out=f"it must lie in {least:.4g} to {most:.4g} for this size and body",
-    )
+    key = f"lump[{index}].depth_ratio"
+    _check_room(key, lump.depth_ratio, (least, most), "the lump", " for this size and body")
+
+
+def _check_room(key: str, depth: float, ends: tuple[float, float], what: str, where: str) -> None:
+    """Refuse a depth at which something stands out of the body."""
+    least, most = ends
+    if not least <= depth <= most:
+        out = "stands out of the skin" if depth < least else "reaches into the chest wall"
+        way_out = f"it must lie in {least:.4g} to {most:.4g}{where}"
+        raise BadDataError(f"{key} is {depth:g}: {what} {out}", way_out=way_out)

@@ -19,13 +19,12 @@ from tactile_bayes.studies.model_comparison import (
     NEAR_MM,
     MeasuredScan,
     ModelComparison,
-    centre_line,
     centre_row,
     line_bump,
     residual_map,
     residual_slope,
 )
-from tactile_bayes.studies.paper import HomogeneousTissue, Uniformity, most_even, narrowest
+from tactile_bayes.studies.paper import HomogeneousTissue, Uniformity, centre_line, most_even, narrowest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

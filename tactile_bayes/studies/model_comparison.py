@@ -21,7 +21,7 @@ from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import BumpFit, fit_bump, fitted_candidates
 from tactile_bayes.progress import Progress, untold
 from tactile_bayes.scans import ElementCalibration, PressureFrames, Scan
-from tactile_bayes.studies.paper import HARD_RATIO, PAPER_DIAMETERS_MM, LineFit, StudySettings, fit_line
+from tactile_bayes.studies.paper import HARD_RATIO, PAPER_DIAMETERS_MM, LineFit, StudySettings, centre_line, fit_line
 
 # --- Tables 1 and 2 of the paper and the phantoms of its section 2.3: the empirical model against the elastic one.
 #
@@ -80,8 +80,7 @@ class TableScene(Record):
     name: str  #: For people.
     d_mm: float
     depth_ratio: float
-    seat: float
-    """`d_mm`, `depth_ratio`, `seat`: As in `body.Body`."""
+    seat: float  #: These as in `tissue.Body`.
     stiffness_ratio: float = HARD_RATIO  #: E2/E1.
 
 
@@ -89,11 +88,9 @@ class Curves(Record, eq=False):
     """Frames and maps of both models for one scene."""
 
     elastic: plane.LineFrames
-    empirical: plane.LineFrames
-    """`elastic`, `empirical`: Frames at the same positions."""
+    empirical: plane.LineFrames  #: At the same positions.
     elastic_map: plane.TactileLine
     empirical_map: plane.TactileLine
-    """`elastic_map`, `empirical_map`: What they average to."""
 
 
 class Agreement(Record):
@@ -364,12 +361,6 @@ def compare_model(
         float(np.sum((ours - theirs) ** 2) / np.sum((theirs - 1.0) ** 2)),
         _bump(made, measured.place_mm),
     )
-
-
-def centre_line(pressure_kpa: FloatArray) -> FloatArray:
-    """(n, rows) pressure across the head along its centre line: the mean of the two middle columns."""
-    middle = pressure_kpa.shape[2] // 2
-    return np.asarray(pressure_kpa[:, :, middle - 1 : middle + 1].mean(axis=2))
 
 
 def centre_row(measured: MeasuredScan, tactile_map: TactileMap) -> tuple[FloatArray, FloatArray]:

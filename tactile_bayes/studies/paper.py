@@ -304,13 +304,17 @@ ALIKE = 0.05  #: Frames that differ by less than this share of what the lump add
 _STEP = 0.01  #: Of the depths in diameters that are tried by interpolation between those solved.
 
 
+def centre_line(values: FloatArray) -> FloatArray:
+    """Mean over the two middle ones of (..., n) taxels: of frames (m, rows, columns) what is along the centre line."""
+    half = values.shape[-1] // 2
+    return np.asarray(values[..., half - 1 : half + 1].mean(axis=-1))
+
+
 class CentredFrame(Record, eq=False):
     """The frame with the head's centre over a lump, as taxels see it."""
 
     d_mm: float
     depth_ratio: float
-    """`d_mm`, `depth_ratio`: Size and depth of the lump."""
-    s_mm: FloatArray  #: (n,) array: Taxel positions across the head.
     share: FloatArray  #: (n,) array: Pressure over the frame's mean.
     added: FloatArray  #: (n,) array: `share` less that of the same layers without the lump.
 
@@ -320,7 +324,6 @@ class Lookalikes(Record, eq=False):
 
     small: CentredFrame
     large: CentredFrame
-    """`small`, `large`: Their frames."""
     difference: float
     """Root mean square difference of the frames over the root mean square of what the smaller lump adds."""
 
@@ -337,7 +340,7 @@ def centred_frame(d_mm: float, depth_ratio: float, *, settings: StudySettings, s
     surface = plane.condense(body, reach_mm=reach, cell_mm=settings.cell_mm, fineness=settings.fineness)
     over, far = (one.as_taxels(HEAD_PITCH_MM) for one in (settings.over(surface), settings.far(body.layers)))
     share, plain = (np.asarray(one.at(0.0) / one.at(0.0).mean()) for one in (over, far))
-    return CentredFrame(d_mm, depth_ratio, over.s_mm, share, share - plain)
+    return CentredFrame(d_mm, depth_ratio, share, share - plain)
 
 
 def find_lookalikes(
@@ -367,7 +370,7 @@ def find_lookalikes(
             continue
         gaps = np.sqrt(np.mean((shares[d][:, None] - shares[e]) ** 2, axis=2))
         gaps /= np.sqrt(np.mean(added[d] ** 2, axis=1))[:, None]
-        gaps[(_middle(added[d]) < LEAST_RISE)[:, None] | (_middle(added[e]) < LEAST_RISE)] = np.inf
+        gaps[(centre_line(added[d]) < LEAST_RISE)[:, None] | (centre_line(added[e]) < LEAST_RISE)] = np.inf
         i, j = np.unravel_index(np.argmin(gaps), gaps.shape)
         if np.isfinite(gaps[i, j]):
             pairs.append((float(gaps[i, j]), d, float(tried[i]), e, float(tried[j])))
@@ -387,12 +390,6 @@ def find_lookalikes(
 
 def _difference(small: CentredFrame, large: CentredFrame) -> float:
     return _rms(large.share - small.share) / _rms(small.added)
-
-
-def _middle(across: FloatArray) -> FloatArray:
-    """Mean over the two middle taxels of (..., n) values."""
-    half = across.shape[-1] // 2
-    return np.asarray(across[..., half - 1 : half + 1].mean(axis=-1))
 
 
 def _rms(values: FloatArray) -> float:

@@ -18,7 +18,6 @@ from tactile_bayes.forward.simulate import (
     RANK_TOLERANCE,
     SkinPerturbation,
     SolidHead,
-    head_face,
     skin_perturbation,
     solid_head,
 )
@@ -31,8 +30,7 @@ from tactile_bayes.posterior.bump import Bump, FitCells, window_cells
 from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, WIDEST_IN_RADII
 from tactile_bayes.presets import FIT_RADIUS_MM, Background
 from tactile_bayes.scans import CountArray, ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
-from tactile_bayes.studies.model_comparison import centre_line
-from tactile_bayes.studies.paper import HARD_RATIO, CaseSettings
+from tactile_bayes.studies.paper import HARD_RATIO, CaseSettings, centre_line
 
 # --- Maps of a study's raster of frames, built and fitted like a patient's.
 
@@ -198,11 +196,11 @@ class SolidSettings(CaseSettings, kw_only=True):
 
     def on(self, body: Body) -> SolidHead:
         """The head on the body without a lump."""
-        return solid_head(head_face(self.head), body.layers)
+        return solid_head(self.head, body.layers)
 
     def far(self, layers: Layers) -> LineFrames:
         """The frame far from any lump, across the middle of the head."""
-        return self._middle(solid_head(head_face(self.head), layers), [])
+        return self._middle(solid_head(self.head, layers), [])
 
     def over_lump(self, body: Body) -> LineFrames:
         """The frame with the head's centre over a hard lump, across the middle of the head."""

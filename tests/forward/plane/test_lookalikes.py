@@ -35,9 +35,8 @@ def test_without_two_visible_sizes_there_is_no_pair() -> None:
     ("difference", "words"), [(0.04, "indistinguishable are d 10 mm at h/d 1"), (0.06, "no pair within 5 %")]
 )
 def test_the_line_says_whether_they_are(difference: float, words: str) -> None:
-    s = np.arange(4.0)
-    small = CentredFrame(10.0, 1.0, s, np.ones(4), 0.2 * np.ones(4))
-    large = CentredFrame(15.0, 0.9, s, np.ones(4) + 0.2 * difference, 0.2 * np.ones(4))
+    small = CentredFrame(10.0, 1.0, np.ones(4), 0.2 * np.ones(4))
+    large = CentredFrame(15.0, 0.9, np.ones(4) + 0.2 * difference, 0.2 * np.ones(4))
     text = lookalikes_text(Lookalikes(small, large, difference))
     assert words in text
     assert f"{20 * difference:.2f} % of the mean" in text

@@ -28,16 +28,17 @@ from tactile_bayes.forward.tissue import Layers
 
 LEVEL = np.eye(3)
 PITCH = 1.5
+HEAD = Head(pitch_mm=PITCH, radius_mm=35.0, rim_mm=3.0)
 
 
 @cache
 def face() -> HeadFace:
-    return head_face(Head(pitch_mm=PITCH, radius_mm=35.0, rim_mm=3.0))
+    return head_face(HEAD)
 
 
 @cache
 def on_fat(fat_mm: float, thickness_mm: float = 70.0) -> SolidHead:
-    return solid_head(face(), Layers(fat_mm, thickness_mm))
+    return solid_head(HEAD, Layers(fat_mm, thickness_mm))
 
 
 @cache

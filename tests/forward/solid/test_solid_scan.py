@@ -313,7 +313,7 @@ def one_ball(lump: SolidLump) -> tuple[SolidHead, SkinPerturbation]:
     body = SceneBody()
     fat = fat_thickness(body, [lump])
     change = skin_perturbation(condensed_lump(lump, body, fat), lump.stiffness_ratio * body.fat_kpa)
-    return solid_head(head_face(Head()), body.layers(fat)), change
+    return solid_head(Head(), body.layers(fat)), change
 
 
 def poses_and_frames(path: Path, skin: np.ndarray, latency_ms: float) -> list[tuple[np.ndarray, np.ndarray]]:
