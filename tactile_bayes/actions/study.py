@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from functools import cache, partial
 from operator import attrgetter
@@ -34,26 +34,8 @@ from tactile_bayes.forward.tissue import parse_seat
 from tactile_bayes.mapping.select import scan_findings
 from tactile_bayes.options import CaseOptions, FieldCosines, SbcOptions, SectionOptions, StudyOptions
 from tactile_bayes.presets import HEADS, RESEARCH_USE, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE, Method
-from tactile_bayes.report.laboratory import heads_text, sbc_document, sbc_figure, sbc_text, tables_document, tables_text
-from tactile_bayes.report.laboratory import table_text as ranks_table
-from tactile_bayes.report.paper_head import (
-    comparison_document,
-    comparison_figure,
-    comparison_text,
-    design_document,
-    design_figure,
-    design_text,
-    named,
-    uniformity_document,
-    uniformity_text,
-)
-from tactile_bayes.report.study import (
-    frames_text,
-    lookalikes_text,
-    study_figures,
-    study_table,
-    study_text,
-)
+from tactile_bayes.report import laboratory, paper_head
+from tactile_bayes.report.study import frames_text, lookalikes_text, study_figures, study_table, study_text
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.studies import paper, sbc
@@ -61,7 +43,6 @@ from tactile_bayes.studies.model_comparison import (
     NEAREST_HEADS,
     PHANTOMS,
     TRIED_HEADS,
-    Agreement,
     MeasuredFrame,
     compare_frames,
     compare_heads,
@@ -220,9 +201,6 @@ def table_text(rows: list[paper.StudyRow]) -> str:
     return csv_text(names, ([getattr(row, name) for name in names] for row in rows), digits=6)
 
 
-ByHead = Mapping[Head, Sequence[Agreement]]
-
-
 def tables_action(*, seat: str, head: str | None, search: bool, workers: int, as_json: bool, **section: float) -> None:
     """Recompute Tables 1 and 2 of the paper beside the printed figures."""
     at = parse_seat(seat)
@@ -231,16 +209,16 @@ def tables_action(*, seat: str, head: str | None, search: bool, workers: int, as
     heads = list(dict.fromkeys([asked, *([nearest] if nearest else []), *(TRIED_HEADS if search else ())]))
     found, phantoms = run_tables(at, heads=heads, workers=workers)
     if as_json:
-        click.echo(json.dumps(tables_document(found, phantoms, seat=at), indent=2))
+        click.echo(json.dumps(laboratory.tables_document(found, phantoms, seat=at), indent=2))
         return
     beside = found[nearest] if nearest and nearest != asked else None
-    click.echo(tables_text(found[asked], phantoms[asked], head=asked, nearest=nearest, beside=beside))
+    click.echo(laboratory.tables_text(found[asked], phantoms[asked], head=asked, nearest=nearest, beside=beside))
     if search:
-        click.echo(heads_text(found))
+        click.echo(laboratory.heads_text(found))
     click.echo(RESEARCH_USE)
 
 
-def run_tables(seat: float, *, heads: Sequence[Head], workers: int) -> tuple[ByHead, ByHead]:
+def run_tables(seat: float, *, heads: Sequence[Head], workers: int) -> tuple[laboratory.ByHead, laboratory.ByHead]:
     """Agreement of both models over the cases of the tables, and over the phantoms, under each head."""
     scenes = table_scenes(seat) + phantom_scenes(seat)
     work = partial(compare_heads, settings=paper.StudySettings(), heads=heads)
@@ -262,9 +240,9 @@ def head_uniformity_action(
     section = SectionOptions(head_radius_mm=head_radius_mm, shoulder_mm=shoulder_mm)
     found, limit = paper.uniformity(_section(section, head), body), body.limit_percent / 100
     if as_json:
-        click.echo(json.dumps(uniformity_document(found, body, limit=limit), indent=2))
+        click.echo(json.dumps(paper_head.uniformity_document(found, body, limit=limit), indent=2))
     else:
-        click.echo(f"{uniformity_text(found, body, limit=limit)}\n{RESEARCH_USE}")
+        click.echo(f"{paper_head.uniformity_text(found, body, limit=limit)}\n{RESEARCH_USE}")
 
 
 def head_design_action(*, head: str | None, figure: Path | None, as_json: bool, force: bool, **tissue: Any) -> None:
@@ -273,17 +251,17 @@ def head_design_action(*, head: str | None, figure: Path | None, as_json: bool, 
     limit = body.limit_percent / 100
     found = paper.search_heads(body, kinds=HEADS if head is None else (head,))
     if figure is not None:
-        design_figure(found, body, limit=limit, path=figure, force=force)
+        paper_head.design_figure(found, body, limit=limit, path=figure, force=force)
     if as_json:
-        click.echo(json.dumps(design_document(found, body, limit=limit), indent=2))
+        click.echo(json.dumps(paper_head.design_document(found, body, limit=limit), indent=2))
     else:
-        click.echo(f"{design_text(found, body, limit=limit)}\n{RESEARCH_USE}")
+        click.echo(f"{paper_head.design_text(found, body, limit=limit)}\n{RESEARCH_USE}")
     if paper.narrowest(found, limit=limit) is None:
         best = paper.most_even(found)
         raise UsageError(
             f"no head keeps the pressure within {body.limit_percent:g} % of its mean: the most even one, "
-            f"{named(best.head)}, reaches {100 * best.worst:.1f} %; give a larger --limit-percent, narrower ranges or "
-            "another --thickness-mm"
+            f"{paper_head.named(best.head)}, reaches {100 * best.worst:.1f} %; give a larger --limit-percent, narrower "
+            "ranges or another --thickness-mm"
         )
 
 
@@ -313,14 +291,14 @@ def compare_model_action(
         with progress_bar(f"frames, {fidelity}") as progress:
             found.append(compare_model(measured, body, fidelity=fidelity, head=head, progress=progress))
     if figure is not None:
-        comparison_figure(measured, found, figure, title=f"{scan.stem} against {scene.stem}", force=force)
+        paper_head.comparison_figure(measured, found, figure, title=f"{scan.stem} against {scene.stem}", force=force)
     if as_json:
-        document = comparison_document(measured, found, inputs=hash_inputs(scan=scan, scene=scene))
+        document = paper_head.comparison_document(measured, found, inputs=hash_inputs(scan=scan, scene=scene))
         click.echo(dump_json(document), nl=False)
         return
     for line in finding_lines(scan_findings(loaded)):
         click.echo(line, err=True)
-    click.echo(f"{comparison_text(measured, found)}\n{RESEARCH_USE}")
+    click.echo(f"{paper_head.comparison_text(measured, found)}\n{RESEARCH_USE}")
 
 
 def sbc_action(
@@ -337,8 +315,8 @@ def sbc_action(
     how: dict[str, Any] = {"method": asked.method, "seed": asked.seed, "cosines": asked.field_cosines}
 
     def report(found: list[sbc.MapRanks], speed: float | None) -> None:
-        document = sbc_document(found, maps_per_s=speed, **how)
-        click.echo(dump_json(document) if as_json else sbc_text(document), nl=False)
+        document = laboratory.sbc_document(found, maps_per_s=speed, **how)
+        click.echo(dump_json(document) if as_json else laboratory.sbc_text(document), nl=False)
 
     try:
         with (
@@ -356,7 +334,7 @@ def sbc_action(
     speed = made / (monotonic() - begun) if made else None
     found = [outcome.value for outcome in outcomes if outcome.value is not None]
     if output is not None:
-        write_text(output, ranks_table(found), force=force)
+        write_text(output, laboratory.table_text(found), force=force)
     failed = [outcome for outcome in outcomes if not outcome.ok]
     for line in fault_lines(failed):
         click.echo(f"could not be estimated: map {line}", err=True)
@@ -364,7 +342,7 @@ def sbc_action(
         unfinished(output).unlink(missing_ok=True)
     try:
         if figure is not None:
-            sbc_figure(found, figure, force=force)
+            laboratory.sbc_figure(found, figure, force=force)
     finally:  # what was computed is not lost with the figure
         report(found, speed)
     if failed:

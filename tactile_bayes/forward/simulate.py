@@ -26,14 +26,7 @@ from tactile_bayes.forward.scene import (
     record,
     tissue_truth,
 )
-from tactile_bayes.forward.tissue import (
-    MOST_SEAT,
-    Body,
-    Layers,
-    SceneBody,
-    SolidLump,
-    fat_thickness,
-)
+from tactile_bayes.forward.tissue import MOST_SEAT, Body, Layers, SceneBody, SolidLump, fat_thickness
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HEAD_PITCH_MM, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
 from tactile_bayes.progress import Progress, untold

@@ -15,6 +15,7 @@ from tactile_bayes.posterior.white import BumpFit
 from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE
 from tactile_bayes.report.figure_file import figure_file, finish
 from tactile_bayes.report.study import COLOURS
+from tactile_bayes.report.tradeoff import finite
 from tactile_bayes.studies.model_comparison import (
     NEAR_MM,
     MeasuredScan,
@@ -315,7 +316,7 @@ def comparison_document(
         "models": [
             {
                 "fidelity": one.fidelity,
-                **{name: _number(getattr(one, name)) for name in (*_ROWS, "rms_kpa")},
+                **{name: finite(getattr(one, name)) for name in (*_ROWS, "rms_kpa")},
                 **_bumps(measured, one.lump, one.tactile_map),
                 **dict(zip(_SLOPE, residual_slope(measured, one), strict=True)),
             }
@@ -334,13 +335,9 @@ def _shape(lump: BumpFit | None) -> tuple[float, float, float]:
 
 def _bumps(measured: MeasuredScan, lump: BumpFit | None, tactile_map: TactileMap) -> dict[str, float | None]:
     """Eq 7 of a map, null without, and Eq 5 of its centre line."""
-    amplitude, sigma_x, sigma_y = map(_number, _shape(lump))
+    amplitude, sigma_x, sigma_y = map(finite, _shape(lump))
     line = dict(zip(("line_amplitude", "line_sigma_mm"), line_bump(measured, tactile_map), strict=True))
     return {"amplitude": amplitude, "sigma_x_mm": sigma_x, "sigma_y_mm": sigma_y, **line}
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 # --- A scan against forward models, as Fig 6 of the paper: frames, the map's centre line, both maps and the residual.

@@ -170,8 +170,8 @@ def ladder_file(ladder: Ladder, *, varied: Literal["estimate", "map"], provenanc
         tolerance_mm=ladder.tolerance_mm,
         reference=ReferenceFile(
             reference.words,
-            _finite(reference.error_mm),
-            None if answer is None else _finite(answer.half_width_mm),
+            finite(reference.error_mm),
+            None if answer is None else finite(answer.half_width_mm),
             reference.cpu_s,
             None if answer is None else _answer(answer),
         ),
@@ -183,9 +183,9 @@ def ladder_file(ladder: Ladder, *, varied: Literal["estimate", "map"], provenanc
                 usable=one.usable,
                 runs=len(one.answers),
                 cpu_s=one.cpu_s,
-                median_off_mm=_finite(one.off.median),
-                ends_off_mm=_finite(one.off.ends),
-                width_ends_off_mm=_finite(one.off.width_ends),
+                median_off_mm=finite(one.off.median),
+                ends_off_mm=finite(one.off.ends),
+                width_ends_off_mm=finite(one.off.width_ends),
                 answer=_answer(one.answer),
                 frontier=id(one) in frontier,
             )
@@ -193,7 +193,7 @@ def ladder_file(ladder: Ladder, *, varied: Literal["estimate", "map"], provenanc
         ),
         enough=None if enough is None else enough.label,
         pooled=tuple(
-            PooledFile(one.maps, one.cpu_s, _answer(one.answer), _finite(one.another_half_mm)) for one in ladder.pooled
+            PooledFile(one.maps, one.cpu_s, _answer(one.answer), finite(one.another_half_mm)) for one in ladder.pooled
         ),
         shared_cpu_s=ladder.shared_cpu_s,
         advice=tuple(advice(ladder)),
@@ -204,13 +204,14 @@ def ladder_file(ladder: Ladder, *, varied: Literal["estimate", "map"], provenanc
 
 def _answer(answer: SizeAnswer) -> AnswerFile:
     quantities = {
-        name: QuantityFile(*map(_finite, (one.median, one.low, one.high, one.mc_error)))
+        name: QuantityFile(*map(finite, (one.median, one.low, one.high, one.mc_error)))
         for name, one in answer.quantities.items()
     }
     return AnswerFile(answer.reason, answer.probability, answer.method, quantities, answer.shares)
 
 
-def _finite(value: float) -> float | None:
+def finite(value: float) -> float | None:
+    """The number; null in a file for what is none."""
     return value if math.isfinite(value) else None
 
 

@@ -129,8 +129,7 @@ class Geometry(Record):
 
     seat: float
     d_mm: float
-    depth_ratio: float
-    """`seat`, `d_mm`, `depth_ratio`: As in `tissue.Body`."""
+    depth_ratio: float  #: These as in `tissue.Body`.
     stiffness_ratios: tuple[float, ...]  #: E2/E1, the lump's modulus over that of fat.
 
     @property

@@ -14,13 +14,7 @@ from tactile_bayes.forward.axisymmetric import CondensedLump, condense_lump
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize
 from tactile_bayes.forward.plane import FINENESS, LineFrames, fit_height
 from tactile_bayes.forward.scene import Head
-from tactile_bayes.forward.simulate import (
-    RANK_TOLERANCE,
-    SkinPerturbation,
-    SolidHead,
-    skin_perturbation,
-    solid_head,
-)
+from tactile_bayes.forward.simulate import RANK_TOLERANCE, SkinPerturbation, SolidHead, skin_perturbation, solid_head
 from tactile_bayes.forward.tissue import Body, Layers
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.accumulate import FlatField

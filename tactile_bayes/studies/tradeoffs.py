@@ -23,7 +23,19 @@ from tactile_bayes.scans import Scan
 from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
 from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import outside_domain
-from tactile_bayes.studies import estimate_tradeoff, paper
+from tactile_bayes.studies import paper
+from tactile_bayes.studies.estimate_tradeoff import (
+    Choice,
+    Clock,
+    Estimator,
+    Ladder,
+    Reference,
+    Run,
+    SizeAnswer,
+    Work,
+    climbed,
+    default_run,
+)
 from tactile_bayes.studies.paper_solid import SolidSettings
 
 # --- Cost and error of each forward model and setting for one lump, measured on this machine.
@@ -48,8 +60,7 @@ class LumpCase(Record):
     d_mm: float
     depth_ratio: float
     stiffness_ratio: float
-    seat: float
-    """`d_mm`, `depth_ratio`, `stiffness_ratio`, `seat`: As in `study.Geometry`."""
+    seat: float  #: These as in `paper.Geometry`.
     plane: paper.StudySettings
     solid: SolidSettings
     """`plane`, `solid`: The default settings of both models for its body and head. All maps are as they are and fitted
@@ -153,7 +164,7 @@ def forward_settings(case: LumpCase) -> list[Setting]:
     ]
 
 
-def measure_forward(case: LumpCase, setting: Setting, *, clock: estimate_tradeoff.Clock, runs: int = 1) -> Measured:
+def measure_forward(case: LumpCase, setting: Setting, *, clock: Clock, runs: int = 1) -> Measured:
     """Compute the map by one setting and measure the time, of so many `runs` the least.
 
     `clock` is called before and after each part.
@@ -223,7 +234,7 @@ class SizeRule(Record, eq=False):
     sizes: Sizes  #: Diameters; the largest is the size.
     scatter: float  #: Standard deviation of ln d that it leaves: of what Eq 6 was learned from, or of bodies left out.
     source: str  #: In words.
-    outside_of: Outside | None = None  #: What of a map is none of the calibration's.
+    outside_of: Outside = lambda *_: []  #: What of a map is none of the calibration's.
 
     def size_mm(self, one: Measured) -> float:
         """Size of a measured map; NaN where its amplitude allows none."""
@@ -233,8 +244,6 @@ class SizeRule(Record, eq=False):
 
     def outside(self, one: Measured) -> list[str]:
         """Quantities of a measured map that lie outside the calibration's table, in words."""
-        if self.outside_of is None:
-            return []
         return self.outside_of(one.amplitude, one.sigma_x_mm, one.sigma_y_mm)
 
 
@@ -306,31 +315,20 @@ class Built(Record):
     duration_s: float | None = None  #: Use the first so many seconds only; None uses all.
 
 
-def map_settings(scan: Scan) -> list[estimate_tradeoff.Choice[Built]]:
+def map_settings(scan: Scan) -> list[Choice[Built]]:
     """Everything that is tried, the default first."""
     time_s = scan.frames.time_s
     whole_s = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
-    return [
-        estimate_tradeoff.Choice(CELL, f"--cell-mm {CELL_MM:g}", Built(), default=True),
-        *(
-            estimate_tradeoff.Choice(CELL, f"--cell-mm {h:g}", Built({"cell_mm": h}), 0.5 + 0.5 / h**2)
-            for h in CELLS_MM
-        ),
-        *(estimate_tradeoff.Choice(FRAMES, f"--every {n}", Built({"every": n}), 0.5 + 0.5 / n) for n in EVERY),
-        *(
-            estimate_tradeoff.Choice(TIME, f"the first {s:.3g} s of {whole_s:.3g} s", Built(duration_s=s), usable=False)
-            for s in (share * whole_s for share in SHARES_OF_TIME)
-            if whole_s > 0
-        ),
-        *(
-            estimate_tradeoff.Choice(LEVEL, f"--normalise {way}", Built({"normalise": way}), usable=False)
-            for way in NORMALISE
-            if way != DEFAULT_NORMALISE
-        ),
-    ]
+    found = [Choice(CELL, f"--cell-mm {CELL_MM:g}", Built(), default=True)]
+    found += [Choice(CELL, f"--cell-mm {h:g}", Built({"cell_mm": h}), 0.5 + 0.5 / h**2) for h in CELLS_MM]
+    found += [Choice(FRAMES, f"--every {n}", Built({"every": n}), 0.5 + 0.5 / n) for n in EVERY]
+    for s in (share * whole_s for share in SHARES_OF_TIME if whole_s > 0):
+        found.append(Choice(TIME, f"the first {s:.3g} s of {whole_s:.3g} s", Built(duration_s=s), usable=False))
+    others = [way for way in NORMALISE if way != DEFAULT_NORMALISE]
+    return [*found, *(Choice(LEVEL, f"--normalise {way}", Built({"normalise": way}), usable=False) for way in others)]
 
 
-def measure_map(scan: Scan, *, inputs: Inputs, work: estimate_tradeoff.Work) -> estimate_tradeoff.Ladder:
+def measure_map(scan: Scan, *, inputs: Inputs, work: Work) -> Ladder:
     """Build and estimate the map of a scan at every setting.
 
     `inputs` leads from a map to the calibration and the options with which `estimate` takes it by itself. Where no map
@@ -338,31 +336,31 @@ def measure_map(scan: Scan, *, inputs: Inputs, work: estimate_tradeoff.Work) -> 
     """
     clock, settings = work.clock, map_settings(scan)
 
-    def run_of(one: Built) -> estimate_tradeoff.Run:
-        def once(number: int) -> tuple[dict[str, float], estimate_tradeoff.SizeAnswer]:
+    def run_of(one: Built) -> Run:
+        def once(number: int) -> tuple[dict[str, float], SizeAnswer]:
             begun = clock()
             try:
                 used = scan if one.duration_s is None else first_seconds(scan, one.duration_s)
                 tactile_map = build_map(used, **one.options)
                 built_s = clock() - begun
                 calibration, options = inputs(tactile_map)
-                seconds, answer = estimate_tradeoff.Estimator(tactile_map, calibration, work).run(options)(number)
+                seconds, answer = Estimator(tactile_map, calibration, work).run(options)(number)
             except BadDataError as error:
                 if one == settings[0].how:
                     raise
-                return {"map": clock() - begun, "estimate": 0.0}, estimate_tradeoff.SizeAnswer(str(error))
+                return {"map": clock() - begun, "estimate": 0.0}, SizeAnswer(str(error))
             return {"map": built_s, **seconds}, answer
 
         return once
 
-    def reference() -> estimate_tradeoff.Reference:
+    def reference() -> Reference:
         """A long run on the map with the finest cells, of all frames."""
         begun, finest = clock(), build_map(scan, cell_mm=FINEST_CELL_MM)
         calibration, options = inputs(finest)
-        found = estimate_tradeoff.Estimator(finest, calibration, work).reference(options)
+        found = Estimator(finest, calibration, work).reference(options)
         ours = f"the map of all frames in cells of {FINEST_CELL_MM:g} mm"
         words = found.words.replace("the default's posterior", ours)
         return replace(found, words=words, cpu_s=clock() - begun)
 
-    seconds, _ = estimate_tradeoff.default_run(run_of(settings[0].how))
-    return estimate_tradeoff.climbed(settings, run_of, reference, default_s=seconds, work=work)
+    seconds, _ = default_run(run_of(settings[0].how))
+    return climbed(settings, run_of, reference, default_s=seconds, work=work)
