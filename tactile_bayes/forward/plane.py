@@ -424,24 +424,6 @@ def outside_range(d_mm: float, depth_ratio: float) -> str | None:
     return None
 
 
-def homogeneous_pressure(
-    s_mm: FloatArray, *, peak_kpa: float, curvature_per_mm2: float, half_width_mm: float
-) -> FloatArray:
-    r"""Pressure across the head far from the lump, P1 (Eq 1); 0 outside the head and where the root would be imaginary.
-
-    .. math:: P_1(s) = P_o \sqrt{1 - s^2 / a^2}
-
-    `peak_kpa` is :math:`P_o(t)`, `curvature_per_mm2` :math:`1/a(t)^2`: positive for a profile that falls off to the
-    sides, negative for one that rises.
-
-    Wellman & Howe (1999) eq. 1, after Hertz (Johnson 1985, section 4.2). On thick tissue the pressure under this head
-    rises to its sides, which no real a describes: the square may have either sign.
-    """
-    s = np.asarray(s_mm, dtype=np.float64)
-    inside = np.maximum(1.0 - curvature_per_mm2 * s**2, 0.0)
-    return np.where(np.abs(s) <= half_width_mm, peak_kpa * np.sqrt(inside), 0.0)
-
-
 def lump_pressure(x_mm: FloatArray, *, height_kpa: float, width_mm: float) -> FloatArray:
     r"""Pressure that the lump adds at a point of the skin, P2 (Eq 2).
 
@@ -467,7 +449,8 @@ class EmpiricalModel(Record):
 
     peak_kpa: float
     curvature_per_mm2: float
-    """`peak_kpa`, `curvature_per_mm2`: Of the homogeneous profile (Eq 1)."""
+    """`peak_kpa`, `curvature_per_mm2`: :math:`P_o(t)` and :math:`1/a(t)^2` of the homogeneous profile (Eq 1): positive
+    for a profile that falls off to the sides, negative for one that rises."""
     height_kpa: float
     width_mm: float
     """`height_kpa`, `width_mm`: g and sigma of Eq 2."""
@@ -475,10 +458,17 @@ class EmpiricalModel(Record):
     half_width_mm: float  #: Of the head.
 
     def homogeneous(self, s_mm: FloatArray) -> FloatArray:
-        """P1 of this case."""
-        return homogeneous_pressure(
-            s_mm, peak_kpa=self.peak_kpa, curvature_per_mm2=self.curvature_per_mm2, half_width_mm=self.half_width_mm
-        )
+        r"""Pressure across the head far from the lump, P1 (Eq 1); 0 outside the head and where the root would be
+        imaginary.
+
+        .. math:: P_1(s) = P_o \sqrt{1 - s^2 / a^2}
+
+        Wellman & Howe (1999) eq. 1, after Hertz (Johnson 1985, section 4.2). On thick tissue the pressure under this
+        head rises to its sides, which no real a describes: the square may have either sign.
+        """
+        s = np.asarray(s_mm, dtype=np.float64)
+        inside = np.maximum(1.0 - self.curvature_per_mm2 * s**2, 0.0)
+        return np.where(np.abs(s) <= self.half_width_mm, self.peak_kpa * np.sqrt(inside), 0.0)
 
     def surface_pressure(self, s_mm: FloatArray, x_c_mm: FloatArray) -> FloatArray:
         r"""Pressure at position s on the head whose centre is at x_c; the arguments broadcast.
@@ -511,7 +501,7 @@ def fit_empirical(
 
     def profile(scaled: float) -> FloatArray:
         curvature = scaled / half_width_mm**2
-        return homogeneous_pressure(s_mm, peak_kpa=1.0, curvature_per_mm2=curvature, half_width_mm=half_width_mm)
+        return EmpiricalModel(1.0, curvature, 0.0, 1.0, d_mm, half_width_mm).homogeneous(s_mm)
 
     def bump(log_width: float) -> FloatArray:
         return lump_pressure(s_mm, height_kpa=1.0, width_mm=float(np.exp(log_width)))

@@ -14,7 +14,6 @@ from tactile_bayes.declarations import Record, as_dict, names_of
 from tactile_bayes.files.tables import csv_text
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.forward.plane import RANGE, outside_range
-from tactile_bayes.geometry import FloatArray
 from tactile_bayes.options import FieldCosines
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file, finish
@@ -22,7 +21,7 @@ from tactile_bayes.report.paper_head import named
 from tactile_bayes.report.study import COLOURS, MARKS
 from tactile_bayes.studies import model_comparison, sbc
 from tactile_bayes.studies.paper import seat_name
-from tactile_bayes.studies.tradeoffs import EMPIRICAL, PLANE, SOLID, LumpCase, Measured, SizeRule, change, cheapest
+from tactile_bayes.studies.tradeoffs import EMPIRICAL, PLANE, SOLID, LumpCase, Measured, SizeRule, change
 
 # --- Reports of simulation-based calibration: text, data, table and figure.
 
@@ -396,9 +395,9 @@ def advice(report: TradeoffReport) -> list[str]:
 
 def _enough(report: TradeoffReport, model: str) -> str:
     """The cheapest sufficient setting of a model, compared with its default and its reference."""
-    found = [one for one in report.of(model) if one.setting.kind in _MESHES]
-    errors: FloatArray = np.array([report.size_error(one) for one in found])
-    least = cheapest(found, errors, tolerance=report.tolerance)
+    meshes = [one for one in report.of(model) if one.setting.kind in _MESHES]
+    within = [one for one in meshes if abs(report.size_error(one)) <= report.tolerance]
+    least = min(within, key=lambda one: one.seconds, default=None)
     limit = f"{100 * report.tolerance:g} %"
     if least is None or least.setting.kind == "reference":
         return f"{model}: only the finest setting keeps the size within {limit}"

@@ -429,17 +429,6 @@ class HomogeneousTissue(TissueOptions):
         """(3,) both ends and the middle."""
         return np.linspace(*self.pressure_kpa, 3)
 
-    def frames(self, head: Head, *, cell_mm: float = _CELL_MM) -> tuple[FloatArray, FloatArray]:
-        """Taxel positions (n,) in mm, and pressure over its mean (3, 3, n) for each modulus and each mean pressure."""
-        # Halving the thickness into two equal layers is the homogeneous body.
-        layers = Layers(0.5 * self.thickness_mm, self.thickness_mm, 1.0, 1.0, self.poisson)
-        strain = self.pressures_kpa[None, :] / self.moduli_kpa[:, None]
-        frames = plane.press_layers(layers, head=head, mean_kpa=strain.ravel(), cell_mm=cell_mm).as_taxels(
-            HEAD_PITCH_MM
-        )
-        share = frames.pressure_kpa / frames.pressure_kpa.mean(axis=1, keepdims=True)
-        return frames.s_mm, share.reshape(3, 3, -1)
-
 
 class Uniformity(Record, eq=False):
     """How evenly one head presses."""
@@ -474,9 +463,14 @@ class Uniformity(Record, eq=False):
         return 2 * self.head.half_face_mm
 
 
-def uniformity(head: Head, tissue: HomogeneousTissue) -> Uniformity:
+def uniformity(head: Head, tissue: HomogeneousTissue, *, cell_mm: float = _CELL_MM) -> Uniformity:
     """How evenly a head presses on homogeneous tissue."""
-    return Uniformity(head, *tissue.frames(head))
+    # halving the thickness into two equal layers is the homogeneous body
+    layers = Layers(0.5 * tissue.thickness_mm, tissue.thickness_mm, 1.0, 1.0, tissue.poisson)
+    strain = tissue.pressures_kpa[None, :] / tissue.moduli_kpa[:, None]
+    frames = plane.press_layers(layers, head=head, mean_kpa=strain.ravel(), cell_mm=cell_mm).as_taxels(HEAD_PITCH_MM)
+    share = frames.pressure_kpa / frames.pressure_kpa.mean(axis=1, keepdims=True)
+    return Uniformity(head, frames.s_mm, share.reshape(3, 3, -1))
 
 
 def search_heads(

@@ -13,7 +13,6 @@ from tactile_bayes.forward.mesh import lump_mesh
 from tactile_bayes.forward.plane import TactileLine, build_line, head_positions, rim_nodes
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import Body, SceneBody, fat_thickness
-from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.select import first_seconds
@@ -212,12 +211,6 @@ def change(value: float | None, reference: float | None) -> float:
     if value is None or reference is None:
         return float("nan")
     return value / reference - 1.0
-
-
-def cheapest(found: Sequence[Measured], errors: FloatArray, *, tolerance: float) -> Measured | None:
-    """The cheapest of the settings whose error is at most `tolerance`."""
-    good = [one for one, error in zip(found, errors, strict=True) if abs(error) <= tolerance]
-    return min(good, key=lambda one: one.seconds, default=None)
 
 
 # --- Point estimates of size from one map's Gaussian, by either form of the size calibration.

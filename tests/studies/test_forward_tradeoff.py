@@ -36,7 +36,6 @@ from tactile_bayes.studies.tradeoffs import (
     SizeRule,
     calibrated_rule,
     case_of,
-    cheapest,
     learned_rule,
 )
 from tactile_bayes.studies.tradeoffs import forward_settings as settings_of
@@ -206,8 +205,8 @@ def test_the_advice_names_the_cheapest_that_is_enough() -> None:
     assert "a rule, which itself leaves 12 % (SD of ln d)" in text
     strict = replace(made, tolerance=1e-9)
     assert "solid: only the finest setting keeps the size within" in tradeoff_text(strict)
-    errors = np.array([made.size_error(one) for one in made.found])
-    assert cheapest(made.found, errors, tolerance=-1.0) is None
+    none = SizeRule(lambda *_: [float("nan")], 0.12, "a rule")
+    assert "solid: only the finest setting" in tradeoff_text(replace(made, rules={PLANE: none, SOLID: none}))
 
 
 def test_the_document_is_plain_data() -> None:

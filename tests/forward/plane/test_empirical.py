@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.plane import (
     SHARE,
@@ -15,7 +16,6 @@ from tactile_bayes.forward.plane import (
     fit_empirical,
     fit_shape,
     head_positions,
-    homogeneous_pressure,
     kappa,
     lump_pressure,
     outside_range,
@@ -41,11 +41,11 @@ MODEL = EmpiricalModel(
 
 def test_equation_1_is_hertz_and_its_mirror() -> None:
     s = np.array([0.0, 5.0, 12.0, 12.1])
-    falling = homogeneous_pressure(s, peak_kpa=10.0, curvature_per_mm2=1 / 20**2, half_width_mm=12.0)
+    falling = replace(MODEL, peak_kpa=10.0, curvature_per_mm2=1 / 20**2).homogeneous(s)
     np.testing.assert_allclose(falling, [10.0, 10 * np.sqrt(1 - 1 / 16), 8.0, 0.0])
-    rising = homogeneous_pressure(s, peak_kpa=10.0, curvature_per_mm2=-1 / 20**2, half_width_mm=12.0)
+    rising = replace(MODEL, peak_kpa=10.0, curvature_per_mm2=-1 / 20**2).homogeneous(s)
     np.testing.assert_allclose(rising[2], 10 * np.sqrt(1.36))
-    narrow = homogeneous_pressure(s, peak_kpa=10.0, curvature_per_mm2=1 / 6**2, half_width_mm=12.0)
+    narrow = replace(MODEL, peak_kpa=10.0, curvature_per_mm2=1 / 6**2).homogeneous(s)
     assert narrow[2] == 0.0  # beyond the contact, not an imaginary number
 
 
@@ -75,7 +75,7 @@ def test_equation_3_over_the_lump_and_far_from_it() -> None:
     peak=st.floats(1.0, 30.0), curvature=st.floats(-0.02, 0.006), height=st.floats(0.5, 20.0), width=st.floats(1.0, 8.0)
 )
 def test_the_fit_finds_what_it_was_made_of(peak: float, curvature: float, height: float, width: float) -> None:
-    p1 = homogeneous_pressure(S, peak_kpa=peak, curvature_per_mm2=curvature, half_width_mm=12.0)
+    p1 = replace(MODEL, peak_kpa=peak, curvature_per_mm2=curvature).homogeneous(S)
     p0 = lump_pressure(S, height_kpa=height, width_mm=width) + SHARE * p1
     found = fit_empirical(S, p1, p0, d_mm=10.0, half_width_mm=12.0)
     assert found.peak_kpa == pytest.approx(peak, rel=1e-4)

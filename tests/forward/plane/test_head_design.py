@@ -53,10 +53,10 @@ def test_a_round_head_that_touches_in_part_is_hertz() -> None:
     assert 8.0 < a < 10.0
     inside = np.clip(EDGES, -a, a)
     expected = taxel_means(lambda _: 0.5 * (inside * np.sqrt(a**2 - inside**2) + a**2 * np.arcsin(inside / a)))
-    _, share = tissue.frames(Head(radius_mm=radius, shoulder_mm=0.0), cell_mm=0.125)
-    np.testing.assert_allclose(share[0, 0], expected, atol=0.01)
-    _, other = tissue.frames(Head(radius_mm=0.9 * radius, shoulder_mm=0.0), cell_mm=0.125)
-    assert np.abs(other[0, 0] - expected).max() > 0.05  # the negative control: another radius is seen
+    found = uniformity(Head(radius_mm=radius, shoulder_mm=0.0), tissue, cell_mm=0.125)
+    np.testing.assert_allclose(found.share[0, 0], expected, atol=0.01)
+    other = uniformity(Head(radius_mm=0.9 * radius, shoulder_mm=0.0), tissue, cell_mm=0.125)
+    assert np.abs(other.share[0, 0] - expected).max() > 0.05  # the negative control: another radius is seen
 
 
 def test_only_the_ratio_of_pressure_to_modulus_matters() -> None:
@@ -71,7 +71,7 @@ def test_only_the_ratio_of_pressure_to_modulus_matters() -> None:
 def test_three_cells_a_taxel_are_enough() -> None:
     head = Head(radius_mm=70.0, shoulder_mm=15.0, shoulders=SHOULDERS_OUTSIDE)
     tissue = HomogeneousTissue()
-    coarse, fine = (np.abs(tissue.frames(head, cell_mm=cell)[1] - 1).max() for cell in (0.5, 0.25))
+    coarse, fine = (uniformity(head, tissue, cell_mm=cell).worst for cell in (0.5, 0.25))
     assert coarse == pytest.approx(fine, abs=0.001)
 
 
