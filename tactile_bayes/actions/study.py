@@ -53,12 +53,10 @@ from tactile_bayes.studies.model_comparison import (
 )
 from tactile_bayes.studies.paper_solid import SolidSettings
 
-_FRAMES_SCHEMA = "measured_frames.table.json"
-
 
 def read_frames(path: Path) -> list[MeasuredFrame]:
     """The frames of a table, one for each place of the head, in the order in which they first appear."""
-    columns = read_table(path, _FRAMES_SCHEMA).columns
+    columns = read_table(path, "measured_frames.table.json").columns
     place = np.array([0.0 if x is None else x for x in columns["x_c_mm"]])
     s, pressure = np.array(columns["s_mm"]), np.array(columns["pressure_kpa"])
     with in_file(path):
@@ -77,7 +75,6 @@ def prepare_figures(folder: Path, *, model: str, force: bool) -> list[Path]:
     return paths
 
 
-_GRID_SCHEMA = "study_grid.table.json"
 RECIPE = ("normalise", "background", "fit_radius_mm", "noise", "flat_field")
 """Columns that say how the maps of a table were made and fitted; `calibrate size` refuses what contradicts them."""
 
@@ -147,7 +144,7 @@ def _section(at: SectionOptions, shoulders: str | None) -> Head:
 
 def read_grid(path: Path, *, seat: float) -> list[paper.Geometry]:
     """Read the cases of a table; `seat` is the default of rows without one."""
-    table = read_table(path, _GRID_SCHEMA)
+    table = read_table(path, "study_grid.table.json")
     seats = [seat if text is None else parse_seat(text) for text in table.columns["seat"]]
     names = ("d_mm", "depth_ratio", "stiffness_ratio")
     with in_file(path):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.forward.plane import LineFrames
+from tactile_bayes.forward.plane import LineFrames, build_line
 from tactile_bayes.forward.tissue import Layers
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
@@ -22,7 +22,7 @@ from tactile_bayes.studies.model_comparison import (
     FrameAgreement,
     TableScene,
     mean_squared_difference,
-    scene_curves,
+    scene_frames,
 )
 from tactile_bayes.studies.paper import (
     ALIKE,
@@ -141,8 +141,8 @@ def _four_lumps(settings: StudySettings, path: Path, *, seat: float, force: bool
     """Both models frame by frame for the phantoms of section 2.3: its curves "for four lumps"."""
     with figure_file(path, size_in=(10.0, 7.6), foot=_caption("Dotted: Eq 3", settings, seat), force=force) as four:
         for axes, (d, h) in zip(four.subplots(2, 2).ravel(), PHANTOMS.values(), strict=True):
-            curves = scene_curves(TableScene("", d, h, seat), settings)
-            ours, theirs = curves.empirical.as_taxels(HEAD_PITCH_MM), curves.elastic.as_taxels(HEAD_PITCH_MM)
+            frames = scene_frames(TableScene("", d, h, seat), settings)
+            theirs, ours = (one.as_taxels(HEAD_PITCH_MM) for one in frames)
             share = 100 * mean_squared_difference(ours.pressure_kpa, theirs.pressure_kpa)
             _draw_frames(axes, theirs, ours)
             title = f"d {d:g} mm, h/d {h:g}; MSD of all frames {share:.1f} %"
@@ -163,8 +163,8 @@ def lookalikes_text(found: Lookalikes | None) -> str:
 def frames_text(measured: Sequence[FrameAgreement]) -> list[str]:
     """How far measured frames are from both models, a line for each."""
     return [
-        f"figure 6: frame at {one.measured.x_c_mm:g} mm, MSD {100 * one.elastic_difference:.2f} % of the elastic "
-        f"model, {100 * one.empirical_difference:.2f} % of the empirical one"
+        f"figure 6: frame at {one.measured.x_c_mm:g} mm, MSD {100 * one.differences[0]:.2f} % of the elastic "
+        f"model, {100 * one.differences[1]:.2f} % of the empirical one"
         for one in measured
     ]
 
@@ -221,7 +221,7 @@ def _frames_and_maps(
     left: Axes, right: Axes, settings: StudySettings, scene: TableScene, measured: Sequence[FrameAgreement]
 ) -> None:
     """Fig 6: frames and map of a phantom, elastic and empirical; measured frames, thick, where there are any."""
-    curves = scene_curves(scene, settings)
+    both = scene_frames(scene, settings)
     for colour, one in zip(COLOURS, measured, strict=False):
         s = one.measured.s_mm
         text = f"measured, head at {one.measured.x_c_mm:g} mm"
@@ -229,10 +229,11 @@ def _frames_and_maps(
         left.plot(s, one.elastic_kpa, color=colour)
         left.plot(s, one.empirical_kpa, ":", color=colour)
     if not measured:
-        _draw_frames(left, curves.elastic, curves.empirical)
-    x = curves.elastic_map.x_mm
+        _draw_frames(left, *both)
+    elastic_map, empirical_map = map(build_line, both)
+    x = elastic_map.x_mm
     near = np.abs(x) <= 40.0
-    elastic, empirical = curves.elastic_map.mean[near], curves.empirical_map.mean[near]
+    elastic, empirical = elastic_map.mean[near], empirical_map.mean[near]
     share = 100 * mean_squared_difference(empirical, elastic)
     right.plot(x[near], elastic, color=COLOURS[0], label="elastic model")
     right.plot(x[near], empirical, ":", color=COLOURS[1], label=f"empirical model (MSD {share:.1f} %)")

@@ -84,15 +84,6 @@ class TableScene(Record):
     stiffness_ratio: float = HARD_RATIO  #: E2/E1.
 
 
-class Curves(Record, eq=False):
-    """Frames and maps of both models for one scene."""
-
-    elastic: plane.LineFrames
-    empirical: plane.LineFrames  #: At the same positions.
-    elastic_map: plane.TactileLine
-    empirical_map: plane.TactileLine
-
-
 class Agreement(Record):
     """How far the empirical model is from the elastic one; differences as shares, not percent."""
 
@@ -122,10 +113,11 @@ def phantom_scenes(seat: float) -> list[TableScene]:
     return [TableScene(name, d, h, seat) for name, (d, h) in PHANTOMS.items()]
 
 
-def scene_curves(
+def scene_frames(
     scene: TableScene, settings: StudySettings, *, surface: plane.SurfaceCompliance | None = None
-) -> Curves:
-    """Frames and maps of both models; the empirical one is fitted to what the taxels see far from and over the lump.
+) -> tuple[plane.LineFrames, plane.LineFrames]:
+    """Frames of the elastic and the empirical model at the same positions; the latter is fitted to what the taxels see
+    far from and over the lump.
 
     `surface` is the scene's body condensed onto its skin, where it is at hand.
     """
@@ -133,16 +125,16 @@ def scene_curves(
         surface = settings.surface(settings.body(scene.d_mm, scene.depth_ratio, seat=scene.seat))
     elastic = settings.frames(surface, scene.stiffness_ratio)
     model = settings.empirical(scene.d_mm, surface.body.layers, elastic)
-    empirical = model.frames(elastic.x_c_mm, elastic.s_mm)
-    return Curves(elastic, empirical, plane.build_line(elastic), plane.build_line(empirical))
+    return elastic, model.frames(elastic.x_c_mm, elastic.s_mm)
 
 
 def compare(scene: TableScene, *, settings: StudySettings, surface: plane.SurfaceCompliance | None = None) -> Agreement:
-    """One scene's figures; `surface` as in `scene_curves`."""
-    curves = scene_curves(scene, settings, surface=surface)
-    inside = np.abs(curves.elastic_map.x_mm) <= settings.fit_radius_mm
-    ours, theirs = curves.empirical_map.mean[inside], curves.elastic_map.mean[inside]
-    fitted, seen = curves.empirical.as_taxels(presets.HEAD_PITCH_MM), curves.elastic.as_taxels(presets.HEAD_PITCH_MM)
+    """One scene's figures; `surface` as in `scene_frames`."""
+    elastic, empirical = scene_frames(scene, settings, surface=surface)
+    elastic_map, empirical_map = plane.build_line(elastic), plane.build_line(empirical)
+    inside = np.abs(elastic_map.x_mm) <= settings.fit_radius_mm
+    ours, theirs = empirical_map.mean[inside], elastic_map.mean[inside]
+    fitted, seen = empirical.as_taxels(presets.HEAD_PITCH_MM), elastic.as_taxels(presets.HEAD_PITCH_MM)
     frames = fitted.at(0.0), seen.at(0.0)
     shares = frames[0] / frames[0].mean(), frames[1] / frames[1].mean()
     return Agreement(
@@ -151,8 +143,8 @@ def compare(scene: TableScene, *, settings: StudySettings, surface: plane.Surfac
         mean_squared_difference(fitted.pressure_kpa, seen.pressure_kpa),
         mean_squared_difference(ours, theirs),
         float(np.sum((ours - theirs) ** 2) / np.sum((theirs - 1.0) ** 2)),
-        fit_line(curves.elastic_map, settings.fit_radius_mm),
-        fit_line(curves.empirical_map, settings.fit_radius_mm),
+        fit_line(elastic_map, settings.fit_radius_mm),
+        fit_line(empirical_map, settings.fit_radius_mm),
         mean_squared_difference(*shares),
         tuple((by(*frames), by(*shares), by(ours, theirs)) for by in OTHER_DEFINITIONS.values()),
     )
@@ -211,14 +203,10 @@ class FrameAgreement(Record, eq=False):
     """`elastic_kpa`, `empirical_kpa` (n,) arrays: The models at the same taxels."""
 
     @property
-    def elastic_difference(self) -> float:
-        """Mean squared difference from the elastic model, as a share of the model's sum of squares."""
-        return mean_squared_difference(self.measured.pressure_kpa, self.elastic_kpa)
-
-    @property
-    def empirical_difference(self) -> float:
-        """The same from the empirical model."""
-        return mean_squared_difference(self.measured.pressure_kpa, self.empirical_kpa)
+    def differences(self) -> tuple[float, float]:
+        """Mean squared differences from the elastic and the empirical model, as shares of their sums of squares."""
+        seen = self.measured.pressure_kpa
+        return mean_squared_difference(seen, self.elastic_kpa), mean_squared_difference(seen, self.empirical_kpa)
 
 
 def compare_frames(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.stats import binom, chi2, poisson
+from scipy.stats import binom, chisquare, poisson
 
 from tactile_bayes.declarations import Record, as_dict
 from tactile_bayes.errors import NotConvergedError
@@ -86,9 +86,7 @@ def chi2_p(ranks: IntArray, draws: int) -> float:
     bins = [b for b in range(2, 21) if (draws + 1) % b == 0 and len(ranks) >= LEAST_IN_BIN * b]
     if not bins:
         return 1.0
-    number = np.bincount(ranks * bins[-1] // (draws + 1), minlength=bins[-1])
-    expected = len(ranks) / bins[-1]
-    return float(chi2.sf(np.sum((number - expected) ** 2) / expected, bins[-1] - 1))
+    return float(chisquare(np.bincount(ranks * bins[-1] // (draws + 1), minlength=bins[-1])).pvalue)
 
 
 def coverage(ranks: IntArray, draws: int, probability: float) -> Coverage:

@@ -28,7 +28,7 @@ from tactile_bayes.studies.model_comparison import (
     compare,
     mean_squared_difference,
     phantom_scenes,
-    scene_curves,
+    scene_frames,
     table_scenes,
 )
 from tactile_bayes.studies.paper import StudySettings
@@ -140,9 +140,9 @@ def quick() -> StudySettings:
 
 def test_where_the_paper_shows_agreement_there_is_some(quick: StudySettings) -> None:
     """Its first phantom, the lump resting: curves of figure 6."""
-    curves = scene_curves(TableScene("first", 12.5, 0.825, 1.0), quick)
-    inner = np.abs(curves.elastic_map.x_mm) < 25
-    ours, theirs = curves.empirical_map.mean[inner], curves.elastic_map.mean[inner]
+    elastic, empirical = map(build_line, scene_frames(TableScene("first", 12.5, 0.825, 1.0), quick))
+    inner = np.abs(elastic.x_mm) < 25
+    ours, theirs = empirical.mean[inner], elastic.mean[inner]
     assert mean_squared_difference(ours, theirs) < 0.026
     assert ours.max() == pytest.approx(theirs.max(), rel=0.1)
 
