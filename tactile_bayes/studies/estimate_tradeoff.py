@@ -214,16 +214,16 @@ class Ladder(Record):
         return found
 
 
-Run = Callable[[int], tuple[dict[str, float], SizeAnswer]]
-"""From the number of the run, which seeds its random numbers, to CPU seconds by part, and the answer."""
+Run = Callable[[How, int], tuple[dict[str, float], SizeAnswer]]
+"""From a setting and the number of the run, which seeds its random numbers, to CPU seconds by part, and the answer."""
 
 
-def priced(one: Choice[Any], run: Run, reference: Reference, *, runs: int) -> Priced:
+def priced(one: Choice[How], run: Run[How], reference: Reference, *, runs: int) -> Priced:
     """Run a setting so often, or twice where that took `MOST_S`, and compare its answers with the reference."""
     spent: list[dict[str, float]] = []
     answers: list[SizeAnswer] = []
     for number in range(runs):
-        seconds, answer = run(number)
+        seconds, answer = run(one.how, number)
         spent.append(seconds)
         answers.append(answer)
         # the first run also imports: a second one is worth its wait
@@ -233,16 +233,16 @@ def priced(one: Choice[Any], run: Run, reference: Reference, *, runs: int) -> Pr
     return Priced(one.axis, one.label, least, tuple(answers), off, one.default, one.usable)
 
 
-def default_run(run: Run) -> tuple[float, SizeAnswer]:
+def default_run(how: How, run: Run[How]) -> tuple[float, SizeAnswer]:
     """CPU seconds and answer of the default, which is run twice: imports and first calls cost nothing afterwards."""
-    run(0)
-    seconds, answer = run(0)
+    run(how, 0)
+    seconds, answer = run(how, 0)
     return sum(seconds.values()), answer
 
 
 def climbed(
     choices: Sequence[Choice[How]],
-    run_of: Callable[[How], Run],
+    run: Run[How],
     reference: Callable[[], Reference],
     *,
     default_s: float,
@@ -252,7 +252,7 @@ def climbed(
     work.announce(default_s * (4.0 + work.runs * sum(one.weight for one in choices)))
     made, rows = reference(), []
     for number, one in enumerate(choices, start=1):
-        rows.append(priced(one, run_of(one.how), made, runs=work.runs))
+        rows.append(priced(one, run, made, runs=work.runs))
         work.progress(number, len(choices))
     return Ladder(tuple(rows), made, work.tolerance_mm)
 
@@ -343,8 +343,8 @@ class Estimator(Record):
     calibration: Calibration | None  #: From widths to sizes; None stops at widths.
     work: Work
 
-    def run(self, options: SamplerSettings) -> Run:
-        """A whole estimate, from the map to the size, as a function of the number of the run.
+    def run(self, options: SamplerSettings, number: int) -> tuple[dict[str, float], SizeAnswer]:
+        """A whole estimate, from the map to the size.
 
         The calibration counts as learned from maps fitted as the options say: `estimate` refuses a size from a map
         fitted in another way, and here it is wanted, to see how far off it would be.
@@ -353,24 +353,20 @@ class Estimator(Record):
         if calibration is not None:
             used = {"background": options.background, "radius_mm": options.fit_radius_mm, "noise": options.noise}
             calibration = replace(calibration, recipe=replace(calibration.recipe, **used))
-
-        def once(number: int) -> tuple[dict[str, float], SizeAnswer]:
-            rng = np.random.default_rng([self.work.seed, number, self.tactile_map.fingerprint])
-            begun = self.work.clock()
-            try:
-                found = estimate_map(self.tactile_map, calibration=calibration, options=options, rng=rng)
-                answer = answer_of(found, probability=self.work.probability)
-            except NotConvergedError as error:
-                answer = SizeAnswer(str(error), code="method")
-            return {"estimate": self.work.clock() - begun}, answer
-
-        return once
+        rng = np.random.default_rng([self.work.seed, number, self.tactile_map.fingerprint])
+        begun = self.work.clock()
+        try:
+            found = estimate_map(self.tactile_map, calibration=calibration, options=options, rng=rng)
+            answer = answer_of(found, probability=self.work.probability)
+        except NotConvergedError as error:
+            answer = SizeAnswer(str(error), code="method")
+        return {"estimate": self.work.clock() - begun}, answer
 
     def reference(self, options: SamplerSettings) -> Reference:
         """The same posterior by the first long run that converges; without one, or without a lump, no answer."""
         spent, answer = 0.0, SizeAnswer("")
         for method, accuracy in LONG_RUNS:
-            seconds, answer = self.run(_by(options, method, accuracy))(-1 % 2**32)
+            seconds, answer = self.run(_by(options, method, accuracy), -1 % 2**32)
             spent += seconds["estimate"]
             if answer.reported is not None:
                 name = "importance sampling" if method == "importance" else "MCMC (four ensembles)"
@@ -385,6 +381,6 @@ def measure(
 ) -> Ladder:
     """Run every setting on one map, from the calibration and options that `estimate` takes by itself for it."""
     estimator = Estimator(tactile_map, calibration, work)
-    seconds, answer = default_run(estimator.run(options))
+    seconds, answer = default_run(options, estimator.run)
     settings = worth_trying(settings_of(options, level_known=tactile_map.background is not None), answer)
     return climbed(settings, estimator.run, lambda: estimator.reference(options), default_s=seconds, work=work)

@@ -29,7 +29,6 @@ from tactile_bayes.studies.estimate_tradeoff import (
     Estimator,
     Ladder,
     Reference,
-    Run,
     SizeAnswer,
     Work,
     climbed,
@@ -329,22 +328,19 @@ def measure_map(scan: Scan, *, inputs: Inputs, work: Work) -> Ladder:
     """
     clock, settings = work.clock, map_settings(scan)
 
-    def run_of(one: Built) -> Run:
-        def once(number: int) -> tuple[dict[str, float], SizeAnswer]:
-            begun = clock()
-            try:
-                used = scan if one.duration_s is None else first_seconds(scan, one.duration_s)
-                tactile_map = build_map(used, **one.options)
-                built_s = clock() - begun
-                calibration, options = inputs(tactile_map)
-                seconds, answer = Estimator(tactile_map, calibration, work).run(options)(number)
-            except BadDataError as error:
-                if one == settings[0].how:
-                    raise
-                return {"map": clock() - begun, "estimate": 0.0}, SizeAnswer(str(error))
-            return {"map": built_s, **seconds}, answer
-
-        return once
+    def run(one: Built, number: int) -> tuple[dict[str, float], SizeAnswer]:
+        begun = clock()
+        try:
+            used = scan if one.duration_s is None else first_seconds(scan, one.duration_s)
+            tactile_map = build_map(used, **one.options)
+            built_s = clock() - begun
+            calibration, options = inputs(tactile_map)
+            seconds, answer = Estimator(tactile_map, calibration, work).run(options, number)
+        except BadDataError as error:
+            if one == settings[0].how:
+                raise
+            return {"map": clock() - begun, "estimate": 0.0}, SizeAnswer(str(error))
+        return {"map": built_s, **seconds}, answer
 
     def reference() -> Reference:
         """A long run on the map with the finest cells, of all frames."""
@@ -355,5 +351,5 @@ def measure_map(scan: Scan, *, inputs: Inputs, work: Work) -> Ladder:
         words = found.words.replace("the default's posterior", ours)
         return replace(found, words=words, cpu_s=clock() - begun)
 
-    seconds, _ = default_run(run_of(settings[0].how))
-    return climbed(settings, run_of, reference, default_s=seconds, work=work)
+    seconds, _ = default_run(settings[0].how, run)
+    return climbed(settings, run, reference, default_s=seconds, work=work)

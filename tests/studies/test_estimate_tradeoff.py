@@ -196,7 +196,7 @@ def test_least_time_counts_and_a_slow_setting_is_run_twice():
     spent = iter([5.0, 4.0, 1.0])
     some = row("--method laplace").answer
     found = priced(
-        Choice("a", "b", None), lambda _: ({"estimate": next(spent)}, some), Reference("", some, 0.0), runs=3
+        Choice("a", "b", None), lambda *_: ({"estimate": next(spent)}, some), Reference("", some, 0.0), runs=3
     )
     assert (found.seconds, len(found.answers)) == (4.0, 2)
 
@@ -281,7 +281,7 @@ def test_a_large_map_costs_what_its_window_costs():
     """200 x 200 cells: the fit has no more cells than the window, and the size is that of the bump alone."""
     small, large = field_map(half_mm=25.0), field_map(half_mm=100.0)
     assert large.mean.shape == (201, 201)
-    answers = [estimator_of(one).run(inputs_of(one)[1])(0)[1] for one in (small, large)]
+    answers = [estimator_of(one).run(inputs_of(one)[1], 0)[1] for one in (small, large)]
     sizes = [one.quantities[SIZE] for one in answers]
     assert sizes[1].median == pytest.approx(sizes[0].median, rel=0.1)
 
