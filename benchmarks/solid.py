@@ -59,7 +59,7 @@ def sweep(head: SolidHead, lumps: Sequence[SkinPerturbation], count: int = 60) -
     frames: list[Any] = []
     touching = None
     for x in np.linspace(-30.0, 30.0, count):
-        frame, contact = head.frame(lumps, rotation=np.eye(3), x_mm=float(x), y_mm=2.0, mean_kpa=9.5, touching=touching)
+        frame, contact = head.frame(lumps, np.eye(3), (float(x), 2.0), mean_kpa=9.5, touching=touching)
         frames.append(frame)
         touching = contact.touching
     return frames
@@ -84,7 +84,7 @@ def mesh_rows(name: str, geometry: LumpGeometry, runs: int) -> list[dict[str, An
 
 def over(head: SolidHead, lumps: Sequence[SkinPerturbation]) -> Any:
     """The frame centred on the lump."""
-    return head.frame(lumps, rotation=np.eye(3), x_mm=0.0, y_mm=0.0, mean_kpa=9.5)[0]
+    return head.frame(lumps, np.eye(3), (0.0, 0.0), mean_kpa=9.5)[0]
 
 
 def frame_rows(runs: int) -> list[dict[str, Any]]:

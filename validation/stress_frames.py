@@ -201,7 +201,7 @@ class _Model:
 
         def solved(head: SolidHead, lumps: Sequence[Any]) -> tuple[FloatArray, Contact]:
             touching = None if before is None else before.touching
-            return head.frame(lumps, rotation=rotation, x_mm=origin[0], y_mm=origin[1], mean_kpa=kpa, touching=touching)
+            return head.frame(lumps, rotation, origin, mean_kpa=kpa, touching=touching)
 
         k = self.physics.local_stiffening
         if not k or kpa <= 0:

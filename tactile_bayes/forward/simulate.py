@@ -456,22 +456,21 @@ class SolidHead(Record, eq=False):
     def frame(
         self,
         lumps: Sequence[SkinPerturbation],
-        *,
         rotation: FloatArray,
-        x_mm: float,
-        y_mm: float,
+        at_mm: Sequence[float] | FloatArray,
+        *,
         mean_kpa: float,
         touching: NDArray[np.bool_] | None = None,
     ) -> tuple[FloatArray, Contact]:
         """(rows, columns) mean pressure on each taxel, and the contact of the whole face, at a pose and a mean over the
         taxels: what the examiner's tone holds, and the gate of a map looks at.
 
-        ``p_plane = rotation @ p_scanhead + (x, y, contact.depth_mm)``: z = 0 is the undisturbed skin. The head keeps
-        its rotation; only the depth adapts. `touching` is where to start: `contact.touching` of a neighbouring frame.
+        ``p_plane = rotation @ p_scanhead + (*at_mm[:2], contact.depth_mm)``: z = 0 is the undisturbed skin. The head
+        keeps its rotation; only the depth adapts. `touching` is where to start: that of a neighbouring frame's contact.
         """
         place = self.face.surface_mm.reshape(-1, 3) @ rotation.T
         stiffness = self.plain
-        parts = [self._vectors(lump, place[:, 0] + x_mm, place[:, 1] + y_mm) for lump in lumps]
+        parts = [self._vectors(lump, place[:, 0] + at_mm[0], place[:, 1] + at_mm[1]) for lump in lumps]
         vectors = np.concatenate([np.zeros((len(place), 0)), *[vector for vector, _ in parts]], axis=1)
         if vectors.shape[1]:
             stiffness = stiffness.changed(vectors, np.concatenate([sign for _, sign in parts]))
@@ -525,14 +524,8 @@ def frames_at_poses(
     pressure = np.empty((count, scene.head.rows, scene.head.columns))
     depth, touching = np.empty(count), None
     for i in range(count):
-        pressure[i], contact = head.frame(
-            lumps,
-            rotation=rotation[i],
-            x_mm=float(origin_mm[i, 0]),
-            y_mm=float(origin_mm[i, 1]),
-            mean_kpa=float(mean_kpa[i]),
-            touching=touching,
-        )
+        kpa = float(mean_kpa[i])
+        pressure[i], contact = head.frame(lumps, rotation[i], origin_mm[i], mean_kpa=kpa, touching=touching)
         depth[i], touching = contact.depth_mm, contact.touching
         progress(i + 1, count)
     return pressure, depth

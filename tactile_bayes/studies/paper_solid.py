@@ -201,7 +201,7 @@ class SolidSettings(CaseSettings, kw_only=True):
         return self._middle(self.on(body), [self.placed(self.condensed(body), HARD_RATIO)])
 
     def _middle(self, head: SolidHead, lumps: Sequence[SkinPerturbation]) -> LineFrames:
-        frame, _ = head.frame(lumps, rotation=_LEVEL, x_mm=0.0, y_mm=0.0, mean_kpa=self.mean_kpa)
+        frame, _ = head.frame(lumps, _LEVEL, (0.0, 0.0), mean_kpa=self.mean_kpa)
         return LineFrames(np.zeros(1), self.head.surface_mm()[:, 0, 0], centre_line(frame[None]))
 
     def placed(self, condensed: CondensedLump, stiffness_ratio: float) -> SkinPerturbation:
@@ -249,14 +249,7 @@ def raster_frames(head: SolidHead, lumps: Sequence[SkinPerturbation], settings: 
     for line in settings.lines_mm:
         y = pitch * round(line / pitch)
         for x in pitch * np.arange(count + 1.0):
-            pressure, contact = head.frame(
-                lumps,
-                rotation=_LEVEL,
-                x_mm=float(x),
-                y_mm=y,
-                mean_kpa=settings.mean_kpa,
-                touching=touching,
-            )
+            pressure, contact = head.frame(lumps, _LEVEL, (x, y), mean_kpa=settings.mean_kpa, touching=touching)
             touching = contact.touching
             for side in (1, -1) if x > 0 else (1,):
                 for end in (1, -1) if y > 0 else (1,):
@@ -265,6 +258,6 @@ def raster_frames(head: SolidHead, lumps: Sequence[SkinPerturbation], settings: 
                     frames.append(pressure[::side, ::end])
     plain = None
     if settings.flat_field:
-        plain = head.frame([], rotation=_LEVEL, x_mm=0.0, y_mm=0.0, mean_kpa=settings.mean_kpa)[0]
+        plain = head.frame([], _LEVEL, (0.0, 0.0), mean_kpa=settings.mean_kpa)[0]
     place = np.array(places)
     return RasterFrames(place[:, 0], place[:, 1], np.array(depths), np.stack(frames), settings.head, plain)

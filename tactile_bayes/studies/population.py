@@ -137,17 +137,13 @@ def draw_exam(prior: ExamPrior, rng: np.random.Generator) -> Scene:
         return {name: rng.uniform(*getattr(prior, name)) for name in names}
 
     lines = int(rng.integers(prior.lines[0], prior.lines[1] + 1))
-    background = Background(**drawn("mean_kpa", "drift_kpa"), drift_period_s=rng.uniform(1.5, 5.0))
-    strokes = Strokes(lines=lines, **drawn("spacing_mm", "half_length_mm", "wander_mm", "tilt_deg", "yaw_deg"))
-    noise = Noise(**drawn("element_kpa", "tracker_mm", "tracker_deg", "gain_share"))
-    tracker = Tracker(**drawn("latency_ms"))
-    return Scene(
+    return Scene(  # drawn in this order
+        background=Background(**drawn("mean_kpa", "drift_kpa"), drift_period_s=rng.uniform(1.5, 5.0)),
+        strokes=Strokes(lines=lines, **drawn("spacing_mm", "half_length_mm", "wander_mm", "tilt_deg", "yaw_deg")),
+        noise=Noise(**drawn("element_kpa", "tracker_mm", "tracker_deg", "gain_share")),
+        tracker=Tracker(**drawn("latency_ms")),
         duration_s=lines * rng.uniform(*prior.line_s),
         frame_rate_hz=FRAME_RATE_HZ,
-        background=background,
-        strokes=strokes,
-        noise=noise,
-        tracker=tracker,
     )
 
 

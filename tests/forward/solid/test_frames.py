@@ -50,7 +50,7 @@ def sphere(d: float, h: float, fat_mm: float, ratio: float = 100.0, thickness_mm
 def frame(
     *lumps: SkinPerturbation, x: float = 0.0, y: float = 0.0, turn: np.ndarray = LEVEL, mean: float = 9.5
 ) -> np.ndarray:
-    return on_fat(15.0).frame(lumps, rotation=turn, x_mm=x, y_mm=y, mean_kpa=mean)[0]
+    return on_fat(15.0).frame(lumps, turn, (x, y), mean_kpa=mean)[0]
 
 
 BALL = (15.0, 15.0, 15.0)
@@ -69,7 +69,7 @@ def test_without_a_lump_a_frame_is_the_plain_contact() -> None:
 
 def test_the_frame_bears_its_mean_and_meets_the_contact_conditions() -> None:
     lump = replace(sphere(*BALL), x_mm=3.0, y_mm=-2.0)
-    pressure, contact = on_fat(15.0).frame([lump], rotation=LEVEL, x_mm=0.0, y_mm=0.0, mean_kpa=9.5)
+    pressure, contact = on_fat(15.0).frame([lump], LEVEL, (0.0, 0.0), mean_kpa=9.5)
     assert pressure.mean() == pytest.approx(9.5, rel=1e-10)
     assert contact.pressure_kpa.min() >= 0.0
     assert np.abs(contact.pressure_kpa * contact.gap_mm).max() <= 1e-8 * 9.5 * contact.depth_mm
@@ -161,8 +161,8 @@ def test_half_the_mesh_size_hardly_changes_a_frame(place: tuple[float, float, fl
     for size in (MeshSize(), MeshSize(arc=30, rings=10, core=5, grade=1.25)):
         lump = condense_lump(LumpGeometry(radius, radius, depth, Layers(fat)), size=size)
         placed = skin_perturbation(lump, 500.0)
-        frames.append(on_fat(fat).frame([placed], rotation=LEVEL, x_mm=0.0, y_mm=0.0, mean_kpa=9.5)[0])
-    plain = on_fat(fat).frame([], rotation=LEVEL, x_mm=0.0, y_mm=0.0, mean_kpa=9.5)[0]
+        frames.append(on_fat(fat).frame([placed], LEVEL, (0.0, 0.0), mean_kpa=9.5)[0])
+    plain = on_fat(fat).frame([], LEVEL, (0.0, 0.0), mean_kpa=9.5)[0]
     change = np.abs(frames[0] - frames[1]) / np.abs(frames[1] - plain).max()
     assert change.max() <= 0.025  # a taxel or two over the axis
     assert np.sqrt(np.mean(change**2)) <= 0.005
@@ -177,8 +177,8 @@ def raster_map(d: float, h: float, fat_mm: float, ratio: float) -> tuple[np.ndar
     touching = None
     for y in (0, 4, 8):
         for x in range(23):
-            place = {"x_mm": x * PITCH, "y_mm": y * PITCH}
-            pressure, contact = head.frame([lump], rotation=LEVEL, **place, mean_kpa=9.5, touching=touching)
+            place = (x * PITCH, y * PITCH)
+            pressure, contact = head.frame([lump], LEVEL, place, mean_kpa=9.5, touching=touching)
             touching = contact.touching
             for side in {1, -1 if x else 1}:
                 for end in {1, -1 if y else 1}:

@@ -281,7 +281,7 @@ def test_another_programs_frames_are_met_one_by_one(
         shared_data / "scans" / f"{name}.npz", skin, float(row["tracker_latency_ms"])
     ):
         mean = float(pressure.mean())
-        frame, contact = head.frame([placed], rotation=pose[:3, :3], x_mm=pose[0, 3], y_mm=pose[1, 3], mean_kpa=mean)
+        frame, contact = head.frame([placed], pose[:3, :3], pose[:2, 3], mean_kpa=mean)
         residual.append((frame - pressure) / mean)
         ratio.append(contact.depth_mm / pose[2, 3])
     assert len(residual) > 25
@@ -302,7 +302,7 @@ def test_another_programs_rib_is_met_frame_by_frame(shared_data: Path) -> None:
     found = poses_and_frames(shared_data / "scans" / "s07_rib_edge.npz", skin, float(row["tracker_latency_ms"]))
     residual, alone = [], []
     for pose, pressure in found[::3]:
-        pressed = {"rotation": pose[:3, :3], "x_mm": pose[0, 3], "y_mm": pose[1, 3], "mean_kpa": float(pressure.mean())}
+        pressed = {"rotation": pose[:3, :3], "at_mm": pose[:2, 3], "mean_kpa": float(pressure.mean())}
         residual.append((head.frame(balls, **pressed)[0] - pressure) / pressure.mean())
         alone.append((head.frame([placed], **pressed)[0] - pressure) / pressure.mean())
     assert np.sqrt(np.mean(np.square(residual))) <= 0.04

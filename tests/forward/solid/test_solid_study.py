@@ -49,7 +49,7 @@ def test_mirrored_frames_are_the_frames_there() -> None:
     assert len(ball().x_mm) == 45 * 5
     for x, y in ((-9.0, 6.0), (3.0, -12.0), (-1.5, -6.0)):
         (i,) = np.flatnonzero((ball().x_mm == x) & (ball().y_mm == y))
-        direct, contact = head.frame([lump], rotation=np.eye(3), x_mm=x, y_mm=y, mean_kpa=9.5)
+        direct, contact = head.frame([lump], np.eye(3), (x, y), mean_kpa=9.5)
         np.testing.assert_allclose(ball().pressure_kpa[i], direct, rtol=1e-6)
         assert ball().depth_mm[i] == pytest.approx(contact.depth_mm, rel=1e-9)
 
