@@ -28,6 +28,8 @@ from tactile_bayes.studies.paper import (
     ALIKE,
     DETECTABLE,
     HARD_RATIO,
+    PAPER_DIAMETERS_MM,
+    PAPER_STIFFNESS_RATIOS,
     CaseSettings,
     Lookalikes,
     StudyRow,
@@ -98,7 +100,6 @@ _BALLS = ((10.0, 0.8), (15.0, 1.0), (20.0, 1.2))
 PHANTOM = "phantom 12.5 mm"
 _FRAME_PLACES_MM = (0.0, 6.0, 12.0, 20.0)
 _SMALL, _SMALL_BALL = (5.0, 1.0), (10.0, 1.0)
-_RATIOS = (2.0, 5.0, 8.0, 10.0, 100.0)
 _AXES = {"x": "across the head", "y": "along it"}
 _ON_HEAD, _ON_SKIN, _SHARE = "position on the head (mm)", "place on the skin (mm)", "pressure / mean of its frame"
 
@@ -109,9 +110,9 @@ def study_figures(
     paths: Sequence[Path],
     *,
     seat: float,
-    phantom: tuple[float, float] = PHANTOMS[PHANTOM],
-    measured: Sequence[FrameAgreement] = (),
-    force: bool = False,
+    phantom: tuple[float, float],
+    measured: Sequence[FrameAgreement],
+    force: bool,
 ) -> Lookalikes | None:
     """Draw figures 5 to 8, and in two dimensions the frames of four lumps, as PNG files; returns the pair of lumps that
     figure 5b shows there.
@@ -282,7 +283,7 @@ def _figure_7(left: Axes, right: Axes, rows: Sequence[StudyRow], settings: CaseS
     flat = isinstance(settings, StudySettings)
     d, h = _SMALL if flat else _SMALL_BALL
     maps = settings.maps(settings.body(d, h, seat=seat))
-    for colour, ratio in zip(COLOURS, _RATIOS, strict=False):
+    for colour, ratio in zip(COLOURS, PAPER_STIFFNESS_RATIOS, strict=False):
         made = maps(ratio)
         found = settings.fitted(made)
         x, value = (made.x_mm, made.mean) if flat else _section(made, "x")
@@ -351,8 +352,6 @@ def _draw_printed_eq6(left: Axes, right: Axes, hard: Sequence[StudyRow], axis: s
 
 # --- Fig 8 of the paper for any table of lumps: Eq 6 with the points that it was learned from.
 
-_DIAMETERS_MM = (5.0, 10.0, 15.0, 20.0, 25.0)
-
 
 def eq6_figure(
     calibration: SizeCalibration, lumps: SizeTable, path: Path, *, title: str = "", force: bool = False
@@ -402,12 +401,12 @@ def _draw_banded(axes: Axes, i: int, x: FloatArray, mean: FloatArray, draws: Flo
 
 def _draw_plane(axes: Axes, axis: AxisCalibration, d_mm: FloatArray, amplitude: FloatArray, sigma: FloatArray) -> None:
     """Where Eq 6 puts each diameter in the plane of amplitude and width; points in the colour of their true d."""
-    low, high = min(_DIAMETERS_MM), max(_DIAMETERS_MM)
+    low, high = min(PAPER_DIAMETERS_MM), max(PAPER_DIAMETERS_MM)
     looks: dict[str, Any] = {"vmin": low, "vmax": high, "cmap": "viridis", "edgecolors": "black", "linewidths": 0.4}
     points = axes.scatter(amplitude, sigma, c=d_mm, s=22, **looks)
     m, b, e, f = axis.draws.mean(axis=0)[:4]
     a = np.geomspace(amplitude.min(), amplitude.max(), 100)
-    for d, colour in zip(_DIAMETERS_MM, points.to_rgba(np.array(_DIAMETERS_MM)), strict=True):
+    for d, colour in zip(PAPER_DIAMETERS_MM, points.to_rgba(np.array(PAPER_DIAMETERS_MM)), strict=True):
         width = (d - b) / m * e * a**f
         if (width > 0).any():
             axes.plot(a, np.where(width > 0, width, np.nan), color=colour, label=f"d {d:g} mm")
