@@ -18,7 +18,7 @@ from tactile_bayes.inference.modes import LogDensity
 from tactile_bayes.options import FitSettings
 from tactile_bayes.presets import FIT_RADIUS_MM, Background, Method, Noise, Rotation, SceneAsked
 from tactile_bayes.progress import Progress
-from tactile_bayes.size.draws import BumpDraws
+from tactile_bayes.size.draws import BUMP, BumpDraws
 from tactile_bayes.size.pooling import SizePriors
 
 # --- Settings as the sampler takes them, and whether they go together.
@@ -84,8 +84,8 @@ class MapPosterior(BumpDraws, eq=False, kw_only=True):
     @property
     def medians(self) -> tuple[float, float, float]:
         """Posterior medians of amplitude, sigma_x_mm and sigma_y_mm."""
-        middle = self.middle
-        return middle.amplitude, middle.sigma_x_mm, middle.sigma_y_mm
+        amplitude, sigma_x, sigma_y = (float(np.median(getattr(self, name))) for name in BUMP[:3])
+        return amplitude, sigma_x, sigma_y
 
     @property
     def middle(self) -> ModalBump:
@@ -164,6 +164,7 @@ class Diagnostics(Record):
 
 # --- Posterior draws of a bump, under either noise model: by the chosen method, or by the next one where it fails.
 
+LADDER: tuple[Method, ...] = ("laplace", "importance", "ensemble")
 DISAGREEMENT = 5.0
 """Ends of intervals by two methods differ by more than this many of their joint Monte-Carlo errors: one is wrong."""
 START_ACCURACY_SD = 0.05
@@ -213,9 +214,6 @@ class Drawable(Protocol):
     def width_sd_mm(self) -> float | None:
         """Posterior SD of the less certain width; None where accuracies in mm are not offered."""
 
-    def methods(self, options: SamplerSettings) -> Sequence[Method]:
-        """The requested method, and those that are tried where it fails."""
-
     def at_mode(self, method: Method, number: int, rng: np.random.Generator) -> ParameterDraws:
         """Draw from the mode and its curvature; under a noise field `number` draws."""
 
@@ -239,7 +237,7 @@ def draw_parameters(
     passed_over: list[str] = []
     figures: Mapping[str, float] = {}
     accuracy = accuracy_in_sd(options, fitted.width_sd_mm)
-    for method in fitted.methods(options):
+    for method in methods(options):
         try:
             if method in ("optimise", "laplace"):
                 draws = fitted.at_mode(method, options.draws, rng)
@@ -260,6 +258,16 @@ def draw_parameters(
             return _with_end_error(draws, fitted.width_sd_mm), tuple(passed_over)
         passed_over.append(f"{method}: Pareto shape {shape:.2f} (trusted up to {TRUSTED_SHAPE:g})")
     raise NotConvergedError("; ".join(passed_over), diagnostics=dict(figures))
+
+
+def methods(options: SamplerSettings) -> Sequence[Method]:
+    """The requested method, and the next one where a step up is allowed: who wants a quick one does not wait minutes
+    for chains. Under independent errors only weights that cannot be trusted have a next one: chains need none."""
+    ladder = LADDER if options.correlated else LADDER[1:]
+    if options.method not in ladder:
+        return (options.method,)
+    first = ladder.index(options.method)
+    return ladder[first : first + 1 + (options.step_up or not options.correlated)]
 
 
 def accuracy_in_sd(options: SamplerSettings, width_sd_mm: float | None) -> float | None:
@@ -300,17 +308,17 @@ def ensemble_draws(
     settings = EnsembleOptions()
     if options.max_steps is not None:
         settings = replace(settings, max_steps=options.max_steps)
-    about = density.log_density, density.mean, density.covariance
-    if density.checkpoint_key is None:
-        return ensemble(*about, rng=rng, options=settings, progress=progress)
-    if accuracy_sd is not None:
-        settings = replace(settings, least_ess=(END_ERROR / accuracy_sd) ** 2)
-    key = density.checkpoint_key(settings.identity(), rng)
-    start = None
-    with suppress(NotConvergedError):
-        start = importance_draws(density, rng=rng, accuracy_sd=START_ACCURACY_SD)
+    start, key = None, ""
+    if density.checkpoint_key is not None:
+        if accuracy_sd is not None:
+            settings = replace(settings, least_ess=(END_ERROR / accuracy_sd) ** 2)
+        key = density.checkpoint_key(settings.identity(), rng)
+        with suppress(NotConvergedError):
+            start = importance_draws(density, rng=rng, accuracy_sd=START_ACCURACY_SD)
     draws = ensemble(
-        *about,
+        density.log_density,
+        density.mean,
+        density.covariance,
         rng=rng,
         options=settings,
         progress=progress,
@@ -321,13 +329,14 @@ def ensemble_draws(
     if start is None:
         return draws
     gap = disagreement(draws, start)
+    figures = dict(draws.diagnostics) | {"disagreement": gap}
     if gap > DISAGREEMENT:
         raise NotConvergedError(
             f"ensemble and importance sampling disagree: an interval's end by {gap:.1f} of its Monte-Carlo errors "
             f"(at most {DISAGREEMENT:g} is chance)",
-            diagnostics=dict(draws.diagnostics) | {"disagreement": gap},
+            diagnostics=figures,
         )
-    return replace(draws, diagnostics=dict(draws.diagnostics) | {"disagreement": gap})
+    return replace(draws, diagnostics=figures)
 
 
 def disagreement(chains: ParameterDraws, weighted: ParameterDraws) -> float:

@@ -21,7 +21,6 @@ from tactile_bayes.posterior.draw import (
     ROTATION_ODDS,
     Diagnostics,
     ModalBump,
-    NoiseFigures,
     SamplerSettings,
     check_options,
 )
@@ -31,7 +30,7 @@ from tactile_bayes.presets import CELL_PER_SIGMA, INTERVAL
 from tactile_bayes.progress import Progress
 from tactile_bayes.scans import DEFAULT_HEAD, HeadShape
 from tactile_bayes.size import terms
-from tactile_bayes.size.draws import BUMP, EXTREMES, SIZES, SizePosterior
+from tactile_bayes.size.draws import BUMP, EXTREMES, SIZES
 from tactile_bayes.size.pooling import Calibration, draw_sizes
 
 # --- Search for the lump: candidate places, highest first, each fitted and assessed.
@@ -43,7 +42,9 @@ Assessment = White | Correlated
 
 def assess(tactile_map: TactileMap, fit: BumpFit, options: SamplerSettings) -> Assessment:
     """Assess whether there is a lump at a fitted place, under the noise model of the options."""
-    return (Correlated if options.correlated else White).of(tactile_map, fit, options)
+    if options.correlated:
+        return Correlated.of(tactile_map, fit, options)
+    return White(tactile_map, fit, white.detect(tactile_map, fit))
 
 
 MOST_LOOKS = 3  #: Places that are no lump by the evidence before the search ends: each look is a chance to be wrong.
@@ -87,24 +88,16 @@ def search(tactile_map: TactileMap, options: SamplerSettings) -> tuple[tuple[Can
 def _places(tactile_map: TactileMap, options: SamplerSettings) -> Iterator[Candidate]:
     """Candidate places, highest first, fitted on demand."""
     settings = _search_options(tactile_map, options)
-    if not options.correlated:
-        yield from white.fitted_candidates(tactile_map, settings)
-        return
-    found_on = levelled(tactile_map)
+    found_on = levelled(tactile_map) if options.correlated else tactile_map
     for one in white.fitted_candidates(found_on, settings):
-        if found_on is tactile_map or one.fit is None:
-            yield one
-        else:
-            yield replace(one, fit=_with_cells_of(tactile_map, one.fit, settings))
+        if found_on is not tactile_map and one.fit is not None:
+            one = replace(one, fit=_with_cells_of(tactile_map, one.fit, settings))
+        yield one
 
 
 def _with_cells_of(tactile_map: TactileMap, fit: BumpFit, settings: SamplerSettings) -> BumpFit:
-    """Replace a fit's cells by the map's cells in the whole window.
-
-    Under a noise field least squares is only a start.
-    """
-    centre = (float(fit.theta[1]), float(fit.theta[2]))
-    return replace(fit, cells=window_cells(tactile_map, centre, radius_mm=settings.fit_radius_mm))
+    """The fit with the map's own cells in the whole window: under a noise field least squares is only a start."""
+    return replace(fit, cells=window_cells(tactile_map, fit.centre_mm, radius_mm=settings.fit_radius_mm))
 
 
 def _close_search(
@@ -194,16 +187,7 @@ class Work(Record, eq=False):
     progress: Progress | None = None  #: Called with effective draws done and wanted.
 
 
-class SizedDraws(Record, eq=False):
-    """Draws of one map with its size by `calibration`; `fault` says why there is none."""
-
-    made: MapDraws
-    size: SizePosterior | None
-    fault: Abstention | None
-    calibration: Calibration | None
-
-
-def draw_until_accurate(work: Work, seen: Assessment) -> SizedDraws:
+def draw_until_accurate(work: Work, seen: Assessment) -> MapDraws:
     """Draw until the size interval is as accurate as requested.
 
     The method stops when the widths are exact enough, which mostly makes the size so too. Where a method cannot draw
@@ -222,9 +206,9 @@ def draw_until_accurate(work: Work, seen: Assessment) -> SizedDraws:
     return sized
 
 
-def _finer(sized: SizedDraws, options: SamplerSettings) -> float | None:
+def _finer(sized: MapDraws, options: SamplerSettings) -> float | None:
     """Accuracy in SDs for the next draws; None where the size is accurate enough, or no accuracy is requested."""
-    wanted = options.accuracy_sd or DEFAULT_ACCURACY_SD.get(sized.made.draws.method)
+    wanted = options.accuracy_sd or DEFAULT_ACCURACY_SD.get(sized.draws.method)
     if sized.size is None or wanted is None:
         return None
     ends = [sized.size.summarise(name, probability=INTERVAL) for name in EXTREMES]
@@ -234,21 +218,21 @@ def _finer(sized: SizedDraws, options: SamplerSettings) -> float | None:
     return None if short >= 1.0 else max(SAFETY * short * wanted, LEAST_ACCURACY_SD)
 
 
-def draw_with_size(work: Work, seen: Assessment) -> SizedDraws:
+def draw_with_size(work: Work, seen: Assessment) -> MapDraws:
     """Draw once, and size the draws where the calibration reaches so far."""
     options, cell_mm = work.options, work.tactile_map.recipe.cell_mm
     made = seen.draw(options, rng=work.rng, progress=work.progress)
-    posterior = made.posterior
+    posterior, calibration = made.posterior, work.calibration
     fault = verdict.shape_fault(posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=cell_mm, prior=options.prior)
-    if work.calibration is None:
-        return SizedDraws(made, None, fault, None)
-    calibration = work.calibration.at_depth_or_fallback(*posterior.medians)
+    if calibration is None:
+        return replace(made, fault=fault)
+    calibration = calibration.at_depth_or_fallback(*posterior.medians)
     if fault is None and (far := calibration.extrapolation_faults(*posterior.medians)):
         fault = terms.extrapolated(far)
-    if fault:
-        return SizedDraws(made, None, fault, calibration)
-    size = draw_sizes(posterior, calibration=calibration, priors=options.size_priors, rng=work.rng)
-    return SizedDraws(made, size, None, calibration)
+    size = (
+        draw_sizes(posterior, calibration=calibration, priors=options.size_priors, rng=work.rng) if not fault else None
+    )
+    return replace(made, calibration=calibration, size=size, fault=fault)
 
 
 # --- The answer for one map: a size, widths, or the reason for neither.
@@ -340,7 +324,7 @@ def _measured(work: Work, seen: Assessment, candidates: tuple[Candidate, ...]) -
     if hopeless is not None:
         return _none(hopeless, candidates, detection, bump)
     try:
-        sized = draw_until_accurate(work, seen)
+        made = draw_until_accurate(work, seen)
     except NotConvergedError as error:
         why = Abstention("method", f"no method converged: {error}", LONGER, OTHER_METHOD_ON_PAPER)
         if error.advice:
@@ -348,8 +332,13 @@ def _measured(work: Work, seen: Assessment, candidates: tuple[Candidate, ...]) -
         elif options.method == "ensemble" or not options.correlated:
             raise
         return _none(why, candidates, detection, bump)
-    made, size, calibration, fault = sized.made, sized.size, sized.calibration, sized.fault
-    detection, posterior, diagnostics = made.detection, made.posterior, _diagnostics(sized)
+    detection, posterior, size, fault, diagnostics = (
+        made.detection,
+        made.posterior,
+        made.size,
+        made.fault,
+        _diagnostics(made),
+    )
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
         reason = f"no positive size in {size.invalid} of {size.d_x_mm.size} draws: outside the calibration"
         advice = "learn a calibration whose table holds such lumps"
@@ -361,7 +350,7 @@ def _measured(work: Work, seen: Assessment, candidates: tuple[Candidate, ...]) -
     drawn |= {} if size is None else {"max_size_mm": size.max_size_mm}
     return Estimate(
         "estimate",
-        "" if calibration is not None else "no size calibration was given: widths only",
+        "" if made.calibration is not None else "no size calibration was given: widths only",
         detection=detection,
         fit=made.fit,
         draws=made.draws,
@@ -369,11 +358,11 @@ def _measured(work: Work, seen: Assessment, candidates: tuple[Candidate, ...]) -
         size=size,
         candidates=candidates,
         diagnostics=diagnostics,
-        left_out=_left_out(work.tactile_map, options, calibration, made.figures),
+        left_out=_left_out(work.tactile_map, options, made),
         scene=seen.scene,
         sensitivity=prior_sensitivity(posterior.sigma_x_mm, posterior.sigma_y_mm, drawn, options.prior),
         bump=bump,
-        findings=tuple(_findings(sized, cell_mm=cell_mm)),
+        findings=tuple(_findings(made, cell_mm=cell_mm)),
     )
 
 
@@ -438,29 +427,29 @@ def _way_to(recipe: terms.Recipe, tactile_map: TactileMap) -> str:
     return "leave the fit's options to the calibration, or learn a calibration for these"
 
 
-def _diagnostics(sized: SizedDraws) -> Diagnostics:
-    made, calibration = sized.made, sized.calibration
+def _diagnostics(made: MapDraws) -> Diagnostics:
+    """Figures and flags of the draws, for the report."""
     return Diagnostics(
         cells=len(made.fit.cells),
         covered_share=made.fit.covered_share,
-        fat_mm=None if calibration is None else calibration.fat_mm,
+        fat_mm=None if made.calibration is None else made.calibration.fat_mm,
         method=made.draws.method,
         sampler=made.draws.diagnostics,
         noise=made.figures,
         convergence={
             name: convergence(getattr(source, name))
-            for source, names in ((sized.size, SIZES), (made.posterior, BUMP[:3]))
+            for source, names in ((made.size, SIZES), (made.posterior, BUMP[:3]))
             if source is not None and made.draws.method == "ensemble"
             for name in names
         },
     )
 
 
-def _findings(sized: SizedDraws, *, cell_mm: float) -> Iterator[Finding]:
+def _findings(made: MapDraws, *, cell_mm: float) -> Iterator[Finding]:
     """Findings against the size of a lump, besides those against its map."""
-    posterior, calibration = sized.made.posterior, sized.calibration
+    posterior, calibration = made.posterior, made.calibration
     if calibration is not None:
-        beyond = [] if sized.size is None else calibration.beyond_lumps(sized.size.median_mm)
+        beyond = [] if made.size is None else calibration.beyond_lumps(made.size.median_mm)
         for text in (*calibration.outside(*posterior.medians), *beyond):
             yield Finding("outside_calibration", f"{terms.UNLIKE_LEARNED}: {text}")
     if posterior.irregular:
@@ -469,7 +458,7 @@ def _findings(sized: SizedDraws, *, cell_mm: float) -> Iterator[Finding]:
         text = f"the map's cells of {cell_mm:g} mm are coarse for so small a lump"
         remedy, on_paper = "map again with a smaller --cell-mm", "have the scan mapped again with smaller cells"
         yield Finding("coarse_cells", text, remedy, on_paper)
-    offset = sized.made.figures.level_offset
+    offset = made.figures.level_offset
     if offset is not None and abs(offset) >= _NEAR_LEVEL:
         text = (
             f"the pressure round the lump is {100 * offset:+.1f} % off that of the rest of the map: something else "
@@ -479,10 +468,8 @@ def _findings(sized: SizedDraws, *, cell_mm: float) -> Iterator[Finding]:
         yield Finding("uneven_level", text)
 
 
-def _left_out(
-    tactile_map: TactileMap, options: SamplerSettings, calibration: Calibration | None, noise: NoiseFigures
-) -> tuple[str, ...]:
-    notes = []
+def _left_out(tactile_map: TactileMap, options: SamplerSettings, made: MapDraws) -> tuple[str, ...]:
+    notes, noise, calibration = [], made.figures, made.calibration
     if tactile_map.recipe.source == "scan" and noise.places_share is None:
         notes.append("tracker position error and its blur")
     odds = noise.rotation_odds

@@ -16,7 +16,7 @@ from tactile_bayes.inference.draws import ParameterDraws, Solved, student_draws
 from tactile_bayes.inference.importance import Gaussians, smooth_weights
 from tactile_bayes.inference.modes import find_mode, finite_differences, mode_and_covariance, stencil
 from tactile_bayes.posterior.bump import covariance_from_log_widths, drawn_widths
-from tactile_bayes.posterior.draw import ROTATION_ODDS, Sampled, SamplerSettings, with_beside
+from tactile_bayes.posterior.draw import ROTATION_ODDS, Sampled, with_beside
 from tactile_bayes.posterior.marginal import STEP, CollapsedTarget, Scene, Shape
 from tactile_bayes.posterior.window import FLOOR, NEGLIGIBLE, Problem, linear_columns
 from tactile_bayes.presets import Method, SceneAsked
@@ -28,8 +28,6 @@ ROUGH, FINE = 0.3, 1e-3
 """Last Newton step, in `Scene.steps`: under the start's fields, which are not the mode's; then under those."""
 LEAST_SHARE = 1e-2
 """Fields with a smaller share of the density at the mode have no Gaussian of their own in what `laplace` draws."""
-LADDER: tuple[Method, ...] = ("laplace", "importance", "ensemble")
-STEPS_UP = 1  #: Methods tried after the requested one: a user who wants a quick one does not wait minutes for chains.
 CHECKED = 512  #: Draws of the Gaussians that are weighed to judge them.
 
 
@@ -81,11 +79,6 @@ class FieldFit(Record, eq=False, dict=True):
         """Posterior SD of the less certain width, from the Gaussian approximation."""
         sd = dict(zip(self.scene.names, np.sqrt(np.diag(self.covariance)), strict=True))
         return max(float(sd[name]) * float(np.exp(self.at[name])) for name in ("u", "v") if name in sd)
-
-    def methods(self, options: SamplerSettings) -> Sequence[Method]:
-        """The requested method, and the next one where a step up is allowed."""
-        first = LADDER.index(options.method)
-        return LADDER[first : first + 1 + STEPS_UP * options.step_up]
 
     def at_mode(self, method: Method, number: int, rng: np.random.Generator) -> ParameterDraws:
         """Draw from the fields' Gaussians, with t tails for the noise scale, and the Pareto shape of their weights.
@@ -417,10 +410,10 @@ def ask_departure(choice: SceneChoice) -> SceneChoice:
     fit = choice.fit
     if fit.scene.extra or fit.scene.shape == "ridge":
         return choice
-    column, exponent, log_odds = _departure(fit)
+    _, exponent, log_odds = _regression(fit)
     answer = Structure("departure", odds(log_odds), bool(log_odds > np.log(LEAST_ODDS)), False)
     if answer.supported:
-        refitted = _fitted(fit, column)
+        refitted = _fitted(fit)
         if refitted is not None:
             x, y = change_in_sd(refitted, fit.mode)
             middle, power = "flatter" if exponent > 0 else "sharper", 2 * (1 + exponent)
@@ -430,15 +423,13 @@ def ask_departure(choice: SceneChoice) -> SceneChoice:
     return replace(choice, fit=fit, structures=(*choice.structures, answer))
 
 
-def _fitted(fit: FieldFit, column: FloatArray) -> FieldFit | None:
+def _fitted(fit: FieldFit) -> FieldFit | None:
     """Refit with the regressor, made orthogonal on average over the new noise fields; None where there is no mode."""
     refitted: FieldFit | None = fit
-    for left in reversed(range(SETTLINGS)):
-        assert refitted is not None
-        refitted = fit_or_none(replace(fit.target.problem, departure=column[None]), fit.scene, refitted.mode)
-        if refitted is None or not left:
-            break
-        column = _departure(refitted)[0]
+    for _ in range(SETTLINGS):
+        if refitted is not None:
+            problem = replace(fit.target.problem, departure=_departure(refitted)[None])
+            refitted = fit_or_none(problem, fit.scene, refitted.mode)
     return refitted
 
 
@@ -458,16 +449,16 @@ def exponent_covariance(fit: FieldFit) -> FloatArray:
     return covariance
 
 
-def _departure(fit: FieldFit) -> tuple[FloatArray, float, float]:
-    """Regressor at a fit's mode, e - 1 by least squares under the likeliest noise, and the log odds against 0."""
-    shared, exponent, log_odds = _regression(fit)
-    mean = fit.target.field_weights(fit.mode) @ shared
+def _departure(fit: FieldFit) -> FloatArray:
+    """(n,) regressor at a fit's mode, of largest value 1."""
+    mean = fit.target.field_weights(fit.mode) @ _regression(fit)[0]
     column = _raw_column(fit) - mean @ tangent_columns(fit)
-    return column / np.abs(column).max(), exponent, log_odds
+    return np.asarray(column / np.abs(column).max())
 
 
 def _regression(fit: FieldFit) -> tuple[FloatArray, float, float]:
-    """(h, v) parts of the raw column in the tangent columns under each field; e - 1 and its log odds as above."""
+    """(h, v) parts of the raw column in the tangent columns under each field; e - 1 by least squares under the
+    likeliest one, and its log odds against 0."""
     cells = fit.target.window.cells
     known, raw = tangent_columns(fit), _raw_column(fit)
     value = cells.value - cells.value.mean()

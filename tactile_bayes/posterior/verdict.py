@@ -209,8 +209,7 @@ def _for_fault(tactile_map: TactileMap, candidate: Candidate, reason: str) -> Ab
         return Abstention("ridge", reason, FEEL_A_RIB, FEEL_A_RIB_ON_PAPER, at)
     if narrow < LEAST_WIDTH_IN_CELLS * fit.cells.cell_mm:
         return _coarse(reason, narrow, at)
-    centre = (float(fit.theta[1]), float(fit.theta[2]))
-    extend = extend_advice(missing_strokes(tactile_map, centre, reach_mm=NEEDED_IN_WIDTHS * wide))
+    extend = extend_advice(missing_strokes(tactile_map, fit.centre_mm, reach_mm=NEEDED_IN_WIDTHS * wide))
     if not extend and candidate.fault.startswith(AT_RIM):
         extend = BEYOND_IT  # under correlated errors the rise is wider than least squares made it
     if extend:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator
+from functools import cached_property, partial
+from math import lgamma, log, pi
 
 import numpy as np
 
 from tactile_bayes.declarations import Record, replace
-from tactile_bayes.errors import UsageError
+from tactile_bayes.errors import Abstention, UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference import modes
 from tactile_bayes.inference.draws import ParameterDraws, Solved
@@ -29,7 +30,7 @@ from tactile_bayes.posterior.detection import (
     Detection,
     ErrorModel,
     count_weights,
-    detect,
+    detection_from_odds,
     error_model,
     independent_errors,
     level_offset,
@@ -45,6 +46,8 @@ from tactile_bayes.posterior.draw import (
 )
 from tactile_bayes.presets import Background, Method, Noise
 from tactile_bayes.progress import Progress
+from tactile_bayes.size.draws import SizePosterior
+from tactile_bayes.size.pooling import Calibration
 
 # --- Log posterior density of a least-squares model, with the noise scale integrated out.
 
@@ -115,7 +118,7 @@ PLACE_TOLERANCE = 1e-2  #: The same where least squares only finds the place: th
 JOINED = 0.05  #: So near to a minimum, in the same units, a fit ends in it.
 
 
-class BumpFit(Record, eq=False):
+class BumpFit(Record, eq=False, dict=True):
     """A least-squares bump, with all that the methods need."""
 
     bump: Bump  #: The model.
@@ -126,11 +129,18 @@ class BumpFit(Record, eq=False):
     covariance: FloatArray
     """(p, p) array: Of the parameters, correlated errors included, but under a noise field: its model has them."""
     covered_share: float  #: Share of the disc of 1.5 widths about the centre that the map covers.
+    prior: BumpPrior  #: Of the parameters.
+    width_sd_mm: None = None  #: Accuracies in mm are not offered, see `Drawable`.
 
     @property
     def theta(self) -> FloatArray:
         """(p,) least-squares parameters."""
         return self.fit.theta
+
+    @property
+    def centre_mm(self) -> tuple[float, float]:
+        """The bump's centre."""
+        return float(self.theta[1]), float(self.theta[2])
 
     def widths(self) -> tuple[float, float, float]:
         """sigma_x_mm, sigma_y_mm, angle_rad of the fit."""
@@ -142,7 +152,8 @@ class BumpFit(Record, eq=False):
         amplitude, x, y = (float(value) for value in self.theta[:3])
         return ModalBump(amplitude, x, y, *self.widths()[:2])
 
-    def target(self, prior: BumpPrior) -> Target:
+    @cached_property
+    def target(self) -> Target:
         """Posterior density of the parameters.
 
         The prior is of the bumps that `lump_fault` accepts: a rise, no wider than the window, its centre within it.
@@ -155,7 +166,7 @@ class BumpFit(Record, eq=False):
             sigma_x, sigma_y, _ = self.bump.widths(theta)
             inside = np.hypot(theta[:, 1] - x, theta[:, 2] - y) <= radius
             inside &= (theta[:, 0] > 0) & (np.maximum(sigma_x, sigma_y) <= WIDEST_IN_RADII * radius)
-            return np.where(inside, self.bump.log_prior(theta, prior), -np.inf)
+            return np.where(inside, self.bump.log_prior(theta, self.prior), -np.inf)
 
         return Target(
             predict=lambda theta: self.bump.predict(theta, self.cells),
@@ -166,6 +177,21 @@ class BumpFit(Record, eq=False):
             sse_min=self.fit.sse,
             dimension=len(self.theta),
         )
+
+    def at_mode(self, method: Method, number: int, rng: np.random.Generator) -> ParameterDraws:
+        """Draw from the least-squares estimate, or from the posterior's mode, and the curvature there."""
+        del number
+        if method == "optimise":
+            return modes.optimise(self.theta, self.covariance, dof=self.errors.dof, rng=rng)
+        scale = np.sqrt(np.diag(self.covariance))
+        return modes.laplace(self.target, self.theta, scale=scale, dof=self.errors.dof, rng=rng)
+
+    def sampled(self, solved: Solved | None = None) -> Sampled:
+        """The density, which keeps its sums of squares in `solved`."""
+        scale = np.sqrt(np.diag(self.covariance))
+        mode, covariance, _ = modes.mode_and_covariance(self.target, self.theta, scale=scale)
+        density = self.target if solved is None else partial(self.target, solved=solved)
+        return Sampled(density, mode, covariance)
 
 
 class Candidate(Record, eq=False):
@@ -228,7 +254,7 @@ def fit_bump(
     covariance = errors.noise_sd**2 * errors.inflation * modes.inverse_information(fit.jacobian, weight)
     sigma_x, sigma_y, _ = bump.widths(fit.theta)
     share = covered_share(tactile_map, centre, radius_mm=1.5 * float(max(sigma_x, sigma_y)))
-    result = BumpFit(bump, cells, weight, fit, errors, covariance, share)
+    result = BumpFit(bump, cells, weight, fit, errors, covariance, share, options.prior)
     return result, lump_fault(result, options)
 
 
@@ -351,8 +377,7 @@ def rotation_odds(
 
     The Savage-Dickey ratio at r = 0 of the larger model: prior over posterior density there.
     """
-    centre = (float(unrotated.theta[1]), float(unrotated.theta[2]))
-    turned, fault = fit_bump(tactile_map, centre, options=replace(options, rotation="on"))
+    turned, fault = fit_bump(tactile_map, unrotated.centre_mm, options=replace(options, rotation="on"))
     if turned is None or fault:
         return 0.0, None
     r, sd = float(turned.theta[5]), float(np.sqrt(turned.covariance[5, 5]))
@@ -360,17 +385,135 @@ def rotation_odds(
     return float(np.exp(np.clip(log_odds, -700, 700))), turned
 
 
+# --- Detection of a lump: evidence for a bump against noise alone, over the whole map.
+
+LENGTHS_IN_WIDTHS = (0.35, 0.7, 1.4, 2.8, 5.6)
+"""Correlation lengths tried for the noise, in widths of the bump under test."""
+FIELD_SHARES = (0.5, 0.9, 0.99)
+"""Share of the error variance that is correlated; none of it is as likely as each of them, at every length."""
+MOST_BLOCKS = 480
+
+
+class _Blocks(Record, eq=False):
+    """The map about a candidate, averaged over square blocks of cells."""
+
+    x_mm: FloatArray
+    y_mm: FloatArray
+    value: FloatArray
+    template: FloatArray
+    reading_variance: FloatArray
+
+
+def detect(tactile_map: TactileMap, fit: BumpFit) -> Detection:
+    """Bayes factor of "a bump of this shape somewhere on the map" against "correlated noise on a level background".
+
+    Both models carry the same noise, an exponentially
+    correlated field plus independent errors, whose length and share are averaged over a grid. The field is either alike
+    all over the map, as the model's misfit is, or larger where readings are few, as errors are that a frame's readings
+    share: few frames reach the map's rim, and with the same errors there as in the middle a rise of the rim would be
+    "detected". Level, amplitude and noise scale are integrated out; position and widths enter by their Laplace volume
+    against the map's area and the prior (the Occam factor, MacKay 2003, Information Theory, Inference, and Learning
+    Algorithms, ch. 28), so that a search over a large map costs what it should. A lump-free map has bumps of its own,
+    and with independent noise each would be "detected".
+    """
+    blocks = _blocks(tactile_map, fit)
+    if len(blocks.value) < 8 or fit.theta[0] <= 0:
+        return Detection(0.0, -np.inf)
+    sigma_x, sigma_y, _ = fit.widths()
+    width = float(np.sqrt(sigma_x * sigma_y))
+    null, lump = _log_evidences(blocks, width, amplitude_sd=fit.prior.amplitude_sd * fit.bump.scale)
+    return detection_from_odds(lump - null + _log_occam_factor(tactile_map, fit))
+
+
+def _blocks(tactile_map: TactileMap, fit: BumpFit) -> _Blocks:
+    cell = tactile_map.recipe.cell_mm
+    side = max(1, int(min(fit.widths()[:2]) / cell))
+    radius = np.sqrt(MOST_BLOCKS / pi) * side * cell
+    cells = window_cells(tactile_map, fit.centre_mm, radius_mm=float(radius))
+    if not len(cells):
+        return _Blocks(*[np.zeros(0)] * 5)
+    key = (cells.row // side) * (int(cells.column.max()) // side + 1) + cells.column // side
+    _, index, number = np.unique(key, return_inverse=True, return_counts=True)
+    keep = number >= 0.5 * side**2
+    averaged = (cells.x_mm, cells.y_mm, cells.value, fit.bump.unit_bump(fit.theta[None], cells)[0], 1.0 / cells.count)
+    x, y, value, template, reading = ((np.bincount(index, one) / number)[keep] for one in averaged)
+    return _Blocks(x, y, value, template, reading / number[keep])
+
+
+def _log_evidences(blocks: _Blocks, width_mm: float, *, amplitude_sd: float) -> tuple[float, float]:
+    """Log evidence without and with the bump, averaged over the noise fields, up to a common constant."""
+    distance = np.hypot(blocks.x_mm[:, None] - blocks.x_mm, blocks.y_mm[:, None] - blocks.y_mm)
+    nugget = blocks.reading_variance / blocks.reading_variance.mean()
+    scales = (np.ones_like(nugget), np.sqrt(nugget))
+    white = _log_evidence_pair(blocks, np.diag(nugget), amplitude_sd=amplitude_sd)
+    pairs = [np.array(white) + log(len(scales) * len(LENGTHS_IN_WIDTHS))]
+    for length in LENGTHS_IN_WIDTHS:
+        alike = np.exp(-distance / (length * width_mm))
+        for scale in scales:
+            field = alike * scale[:, None] * scale
+            for share in FIELD_SHARES:
+                errors = share * field + (1.0 - share) * np.diag(nugget)
+                pairs.append(np.array(_log_evidence_pair(blocks, errors, amplitude_sd=amplitude_sd)))
+    null, lump = np.logaddexp.reduce(pairs, axis=0)
+    return float(null), float(lump)
+
+
+def _log_evidence_pair(blocks: _Blocks, errors: FloatArray, *, amplitude_sd: float) -> tuple[float, float]:
+    """Log evidence without and with the bump for errors of one covariance (n, n), up to a common constant."""
+    n = len(blocks.value)
+    factor = np.linalg.cholesky(errors + 1e-9 * np.eye(n))
+    white = np.linalg.solve(factor, np.stack([np.ones(n), blocks.value, blocks.template], axis=1))
+    one, y, g = white.T
+    half_log_det = float(np.log(np.diag(factor)).sum())
+    level = one @ one
+    y = y - one * (one @ y) / level
+    g = g - one * (one @ g) / level
+    tiny = np.finfo(float).tiny
+    rss = max(float(y @ y), tiny)
+    null = -half_log_det - 0.5 * log(level) + lgamma((n - 1) / 2) - (n - 1) / 2 * log(pi * rss)
+    power = float(g @ g)
+    amplitude = float(g @ y) / power if power > 0 else 0.0
+    if not power > 1e-12 or amplitude <= 0:
+        return null, -np.inf
+    left = max(rss - power * amplitude**2, 1e-12 * rss)
+    prior = -0.5 * (amplitude / amplitude_sd) ** 2 - log(amplitude_sd) - 0.5 * log(2 * pi)
+    lump = -half_log_det - 0.5 * log(level * power) + lgamma((n - 2) / 2) - (n - 2) / 2 * log(pi * left) + prior
+    return null, lump
+
+
+def _log_occam_factor(tactile_map: TactileMap, fit: BumpFit) -> float:
+    """Log of the posterior volume of position and widths over their prior volume."""
+    block, prior = fit.covariance[1:5, 1:5], fit.prior
+    if not np.isfinite(block).all():
+        return -np.inf
+    sign, log_det = np.linalg.slogdet(block)
+    if sign <= 0 or not np.isfinite(log_det):
+        return -np.inf
+    area = float(tactile_map.covered.sum()) * tactile_map.recipe.cell_mm**2
+    p, q, _ = fit.bump.shape_parameters(fit.theta)
+    density = (
+        -0.5 * ((p - log(prior.width_median_mm)) / prior.log_width_sd) ** 2
+        - 0.5 * (q / prior.log_ratio_sd) ** 2
+        - log(2 * pi * prior.log_width_sd * prior.log_ratio_sd)
+        - log(area)
+    )
+    return float(min(2 * log(2 * pi) + 0.5 * log_det + density, 0.0))
+
+
 # --- Estimation under independent errors: assessment, rotation and draws from a least-squares fit.
 
 
 class MapDraws(Record, eq=False):
-    """Posterior draws of one lump under a noise model."""
+    """Posterior draws of one lump under a noise model, and its size."""
 
     detection: Detection  #: The odds of a lump, as the draws left them.
     fit: BumpFit  #: The least-squares fit that the draws started from.
     draws: ParameterDraws  #: Draws of the model's own parameters.
     posterior: MapPosterior  #: The joint draws by name.
     figures: NoiseFigures  #: Figures of the fit and the noise, for the report.
+    calibration: Calibration | None = None  #: The one that gave the size, at the map's depth.
+    size: SizePosterior | None = None
+    fault: Abstention | None = None  #: Why there is no size; None also without a calibration.
 
 
 class White(Record, eq=False):
@@ -382,12 +525,6 @@ class White(Record, eq=False):
     fault: str = ""
     scene: None = None
 
-    @classmethod
-    def of(cls, tactile_map: TactileMap, fit: BumpFit, options: SamplerSettings) -> White:
-        """Compare a fitted bump with no bump."""
-        detection = detect(tactile_map, fit.bump, theta=fit.theta, covariance=fit.covariance, prior=options.prior)
-        return cls(tactile_map, fit, detection)
-
     def bump(self) -> ModalBump:
         """The bump of the least-squares fit."""
         return self.fit.modal()
@@ -398,9 +535,8 @@ class White(Record, eq=False):
         if options.rotation == "auto":
             odds, turned = rotation_odds(self.tactile_map, fit, options=options)
             fit = turned if turned is not None and odds > ROTATION_ODDS else fit
-        target = fit.target(options.prior)
-        solved = Solved(lambda theta: (target.excess(theta),))
-        draws, _ = draw_parameters(_Independent(fit, target), options, rng=rng, progress=progress, solved=solved)
+        solved = Solved(lambda theta: (fit.target.excess(theta),))
+        draws, _ = draw_parameters(fit, options, rng=rng, progress=progress, solved=solved)
         theta = draws.theta
         sigma_x, sigma_y, angle = drawn_widths(*fit.bump.shape_parameters(theta))
         # two of the methods are linear about the mode: for them the exact figure would cost more than all the rest
@@ -418,37 +554,10 @@ class White(Record, eq=False):
             y_mm=theta[..., 2],
             angle_rad=angle,
             background=fit.bump.level(theta),
-            noise_sd=target.draw_noise_sd(excess, rng).reshape(theta.shape[:2]),
+            noise_sd=fit.target.draw_noise_sd(excess, rng).reshape(theta.shape[:2]),
             labels=draws.replicates,
         )
         figures = {"noise_inflation": fit.errors.inflation, "noise_dof": fit.errors.dof}
         offset = level_offset(fit.fit.residual, weight=fit.weight)
         noise = NoiseFigures("independent", fit.bump.rotated, odds, figures, level_offset=offset)
         return MapDraws(self.detection, fit, draws, posterior, noise)
-
-
-class _Independent(Record, eq=False):
-    """A least-squares fit to be drawn, see `Drawable`."""
-
-    fit: BumpFit
-    target: Target
-    width_sd_mm: None = None
-
-    def methods(self, options: SamplerSettings) -> Sequence[Method]:
-        # weights that cannot be trusted are no matter of chains, which need none
-        return ("importance", "ensemble") if options.method == "importance" else (options.method,)
-
-    def at_mode(self, method: Method, number: int, rng: np.random.Generator) -> ParameterDraws:
-        del number
-        fit = self.fit
-        if method == "optimise":
-            return modes.optimise(fit.theta, fit.covariance, dof=fit.errors.dof, rng=rng)
-        return modes.laplace(
-            self.target, fit.theta, scale=np.sqrt(np.diag(fit.covariance)), dof=fit.errors.dof, rng=rng
-        )
-
-    def sampled(self, solved: Solved | None = None) -> Sampled:
-        scale = np.sqrt(np.diag(self.fit.covariance))
-        mode, covariance, _ = modes.mode_and_covariance(self.target, self.fit.theta, scale=scale)
-        density = self.target if solved is None else partial(self.target, solved=solved)
-        return Sampled(density, mode, covariance)

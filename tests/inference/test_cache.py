@@ -8,7 +8,6 @@ from posterior_maps import bump_map, find_bump
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.inference.draws import Solution, Solved
-from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import Bump, cell_mean_gaussian, covariance_from_log_widths, window_cells
 from tactile_bayes.posterior.draw import SamplerSettings, draw_parameters
 from tactile_bayes.posterior.fit import FieldFit
@@ -76,7 +75,7 @@ def test_a_memory_is_of_its_own_points_only() -> None:
 def test_independent_errors_keep_their_sums_of_squares() -> None:
     fit = find_bump(bump_map(noise=noise(3)), SamplerSettings(rotation="off"))[-1].fit
     assert fit is not None
-    target = fit.target(BumpPrior())
+    target = fit.target
     solved = Solved(lambda theta: (np.full(len(theta), np.nan),))
     theta = fit.theta + 0.01 * np.random.default_rng(1).standard_normal((70, len(fit.theta)))
     np.testing.assert_array_equal(target(theta, solved), target(theta))

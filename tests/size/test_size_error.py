@@ -169,7 +169,7 @@ def test_draws_are_made_finer_until_the_size_is_as_exact_as_asked(monkeypatch: p
         size = pooled_size([shape(2.7, noise=0.02, seed=9)], calibration=calibration(), priors=SizePriors(),
                            rng=rng, number=number)  # fmt: skip
         draws = ParameterDraws(np.zeros((1, number, 1)), "importance")
-        return drawn.SizedDraws(MapDraws(None, None, draws, None, {}), size, None, None)
+        return MapDraws(None, None, draws, None, {}, size=size)
 
     monkeypatch.setattr(drawn, "draw_with_size", once)
     for options in (SamplerSettings(), SamplerSettings(accuracy_sd=0.01), SamplerSettings(accuracy_mm=0.005)):

@@ -101,7 +101,7 @@ def test_what_the_column_takes_is_no_longer_noise() -> None:
 
 def test_the_column_leaves_the_widths_alone_on_average_over_the_noise_fields() -> None:
     fit = fit_of(estimated(1.0))
-    column, known = _departure(fit)[0], tangent_columns(fit)
+    column, known = _departure(fit), tangent_columns(fit)
     v = len(known)
     columns = np.concatenate([known, column[None]])
     products = fit.target.products_by_field(columns, columns)

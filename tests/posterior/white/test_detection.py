@@ -15,12 +15,10 @@ from tactile_bayes.files.instrument import read_scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.detection import detect
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.posterior.white import fitted_candidates
+from tactile_bayes.posterior.white import detect, fitted_candidates
 
 SIZE = 51
 NOISE = 0.02
@@ -87,10 +85,7 @@ def test_few_readings_at_the_rim_make_no_lump() -> None:
         places = [
             one.fit for one in list(fitted_candidates(tactile_map, free))[:4] if not one.fault and one.fit is not None
         ]
-        found = [
-            detect(tactile_map, fit.bump, theta=fit.theta, covariance=fit.covariance, prior=BumpPrior())
-            for fit in places
-        ]
+        found = [detect(tactile_map, fit) for fit in places]
         return max((one.probability for one in found), default=0.0)
 
     assert max(map(most, maps)) < 0.95
@@ -127,11 +122,7 @@ def test_the_probability_rises_with_the_amplitude() -> None:
         tactile_map = bump_map(amplitude=amplitude, noise=noise)
         found = find_bump(tactile_map, SamplerSettings(rotation="off", centre_mm=(1.0, -1.0)))[-1].fit
         assert found is not None
-        factors.append(
-            detect(
-                tactile_map, found.bump, theta=found.theta, covariance=found.covariance, prior=BumpPrior()
-            ).log_bayes_factor
-        )
+        factors.append(detect(tactile_map, found).log_bayes_factor)
     assert factors == sorted(factors)
     assert factors[0] < np.log(0.95 / 0.05) < factors[2]
 
@@ -156,7 +147,7 @@ def test_a_larger_map_asks_for_stronger_evidence() -> None:
             -1
         ].fit
         assert found is not None
-        answer = detect(tactile_map, found.bump, theta=found.theta, covariance=found.covariance, prior=BumpPrior())
+        answer = detect(tactile_map, found)
         factor.append(answer.log_bayes_factor)
     assert factor[1] - factor[0] == pytest.approx(np.log(201**2 / 105**2), abs=0.2)
 
@@ -165,7 +156,7 @@ def test_a_depression_is_no_lump() -> None:
     tactile_map = bump_map(amplitude=-0.3)
     found = find_bump(tactile_map, SamplerSettings(rotation="off", centre_mm=(1.0, -1.0)))[-1].fit
     assert found is not None
-    answer = detect(tactile_map, found.bump, theta=found.theta, covariance=found.covariance, prior=BumpPrior())
+    answer = detect(tactile_map, found)
     assert answer.probability == 0.0
 
 
