@@ -45,8 +45,7 @@ def cell_mean_gaussian(x_mm: FloatArray, y_mm: FloatArray, *, covariance_mm2: Fl
 
 
 def covariance_from_log_widths(p: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray:
-    r"""Covariance in mm^2, (..., 2, 2), of a Gaussian from unconstrained coordinates that are smooth through the round
-    case.
+    r"""Covariance in mm^2, (..., 2, 2), of a Gaussian from free coordinates that are smooth through the round case.
 
     :math:`\Sigma^{1/2} = \exp\begin{pmatrix}p+q & r\\ r & p-q\end{pmatrix}` with lengths in mm: p is the log of the
     geometric mean width, ``(q, r)`` the log axis ratio and its direction. For r = 0, sigma_x = exp(p + q) and sigma_y =
@@ -142,28 +141,25 @@ class FitCells(Record, eq=False):
 
 @lru_cache(maxsize=MAPS_AT_HAND)
 def trusted(tactile_map: TactileMap) -> BoolArray:
-    """(ny, nx) True for covered cells with at least a tenth of the median count.
+    """(ny, nx) True for covered cells with at least a tenth of the median count; read-only.
 
     At the rim of a map a handful of readings from one side of the head decide a cell, and they are off together.
-    Worked out once per map, and read-only.
     """
     covered = read_well(tactile_map, FEW_READINGS)
-    covered.setflags(write=False)
+    covered.flags.writeable = False
     return covered
 
 
 def read_well(tactile_map: TactileMap, share: float) -> BoolArray:
     """(ny, nx) True for covered cells with at least a share of the median count."""
     covered = tactile_map.covered
-    if not covered.any():
-        return covered
-    return np.asarray(covered & (tactile_map.count >= share * np.median(tactile_map.count[covered])))
+    typical = np.median(tactile_map.count[covered]) if covered.any() else 0.0
+    return np.asarray(covered & (tactile_map.count >= share * typical))
 
 
 def window_cells(tactile_map: TactileMap, centre_mm: tuple[float, float], *, radius_mm: float) -> FitCells:
     """The trusted cells whose centres lie within `radius_mm` of `centre_mm`."""
-    dx = tactile_map.x_mm[None, :] - centre_mm[0]
-    dy = tactile_map.y_mm[:, None] - centre_mm[1]
+    dx, dy = tactile_map.x_mm - centre_mm[0], tactile_map.y_mm[:, None] - centre_mm[1]
     inside = trusted(tactile_map) & (dx**2 + dy**2 <= radius_mm**2)
     row, column = np.nonzero(inside)
     return FitCells(
@@ -223,17 +219,11 @@ def candidate_centres(tactile_map: TactileMap, *, limit: int = 16, rim_limit: in
     the background.
     """
     excess = smoothed_excess(tactile_map)
-    padded = np.pad(excess, 1, constant_values=-np.inf)
-    ny, nx = excess.shape
-    neighbours = [
-        padded[1 + i : 1 + i + ny, 1 + j : 1 + j + nx] for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)
-    ]
-    peak = np.isfinite(excess) & (excess > 0) & np.logical_and.reduce([excess >= other for other in neighbours])
-    rows, columns = np.nonzero(peak)
-    order = np.argsort(-excess[rows, columns], kind="stable")
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(excess, 1, constant_values=-np.inf), (3, 3))
+    rows, columns = np.nonzero(np.isfinite(excess) & (excess > 0) & (excess >= around.max(axis=(2, 3))))
     centres: list[tuple[float, float]] = []
     left = {False: limit, True: rim_limit}
-    for i in order:
+    for i in np.argsort(-excess[rows, columns], kind="stable"):
         centre = (float(tactile_map.x_mm[columns[i]]), float(tactile_map.y_mm[rows[i]]))
         if any(np.hypot(centre[0] - x, centre[1] - y) <= 2 * SMOOTHING_MM for x, y in centres):
             continue
@@ -248,16 +238,12 @@ def candidate_centres(tactile_map: TactileMap, *, limit: int = 16, rim_limit: in
 
 @lru_cache(maxsize=MAPS_AT_HAND)
 def smoothed_excess(tactile_map: TactileMap) -> FloatArray:
-    """(ny, nx) count-weighted Gaussian smoothing of map minus background; -inf where there is no data.
-
-    Worked out once per map, and read-only.
-    """
+    """(ny, nx) count-weighted Gaussian smoothing of map minus background; -inf where there is no data. Read-only."""
     covered = trusted(tactile_map)
     excess = np.where(covered, tactile_map.mean - typical_level(tactile_map), 0.0)
     weight = np.where(covered, np.sqrt(tactile_map.count.astype(np.float64)), 0.0)
     cell = tactile_map.recipe.cell_mm
-    top = _smooth(excess * weight, SMOOTHING_MM / cell)
-    bottom = _smooth(weight, SMOOTHING_MM / cell)
+    top, bottom = (_smooth(one, SMOOTHING_MM / cell) for one in (excess * weight, weight))
     with np.errstate(invalid="ignore", divide="ignore"):
         smoothed = np.where(covered & (bottom > 0), top / bottom, -np.inf)
     smoothed.setflags(write=False)
@@ -268,8 +254,7 @@ def smoothed_excess(tactile_map: TactileMap) -> FloatArray:
 def levelled(tactile_map: TactileMap) -> TactileMap:
     """The map less its mean over the head's positions that cover a cell, as frame means would remove it.
 
-    A wide rise, as of a stiff layer, is off it, and lumps stand out. Only a map with a gain per frame needs it. Worked
-    out once per map.
+    A wide rise, as of a stiff layer, is off it, and lumps stand out. Only a map with a gain per frame needs it.
     """
     noise = PoseNoise.of(tactile_map)
     if tactile_map.recipe.normalise != "gain" or noise is None:
@@ -288,7 +273,7 @@ def overlap(axis_mm: FloatArray, side_mm: float) -> FloatArray:
 
 
 def _smooth(array: FloatArray, width_cells: float) -> FloatArray:
-    """Separable Gaussian smoothing with zeros beyond the edge, and beyond four widths."""
+    """Gaussian smoothing with zeros beyond the edge, and beyond four widths."""
     kernels = []
     for n in array.shape:
         away = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
@@ -311,11 +296,8 @@ def block_size(cells: int) -> int:
 
 
 class Bump(Record):
-    """The parameters of the model: rotation and a free background are optional.
-
-    The parameter vector is ``(amplitude, x, y, p, q[, r][, background])``: mm for the centre, p and q the log widths
-    of `covariance_from_log_widths`.
-    """
+    """The model's parameters, ``(amplitude, x, y, p, q[, r][, background])``: mm for the centre, p, q and r as of
+    `covariance_from_log_widths`."""
 
     rotated: bool = False  #: The axes of the ellipse may turn (adds r).
     background: float | None = 1.0  #: Fixed level (1 in Eq 7), or None to fit it.
@@ -381,15 +363,12 @@ class Bump(Record):
         ]
         if self.rotated:
             z.append((r / prior.log_ratio_sd, prior.log_ratio_sd))
-        total = sum(-0.5 * value**2 - np.log(sd * np.sqrt(2 * np.pi)) for value, sd in z)
-        return np.asarray(total)
+        return np.asarray(sum(-0.5 * value**2 - np.log(sd * np.sqrt(2 * np.pi)) for value, sd in z))
 
 
 def straight_bump(x_mm: FloatArray, y_mm: FloatArray, *, p: FloatArray, q: FloatArray, cells: FitCells) -> FloatArray:
-    """(m, k) cell means of Gaussians along the grid's axes: products of row and column profiles.
-
-    It is the same formula. Its exponential is a product and its fourth cumulant a sum of what rows and columns have.
-    """
+    """(m, k) cell means of Gaussians along the grid's axes: an exponential that is a product of what rows and columns
+    have, and a fourth cumulant that is their sum."""
     x_axis, y_axis, place = _lattice(cells)
     x, x_fourth = _profile(x_axis, centre_mm=x_mm, sigma_mm=np.exp(p + q), cell_mm=cells.cell_mm)
     y, y_fourth = _profile(y_axis, centre_mm=y_mm, sigma_mm=np.exp(p - q), cell_mm=cells.cell_mm)

@@ -51,11 +51,8 @@ MOST_SDS = 2.5  #: Length of either beyond which a ball is unlikely: of two comp
 
 
 def irregular(fit: FieldFit) -> bool:
-    """True for a bump that is more skewed, or whose axis ratio changes more outwards, than a ball's.
-
-    Judged where the lump stands alone: what is left of a neighbour would answer.
-    """
-    if fit.scene.extra or fit.scene.shape == "ridge":
+    """True for a lone bump that is more skewed, or whose axis ratio changes more outwards, than a ball's."""
+    if fit.scene.extra or fit.scene.shape == "ridge":  # what is left of a neighbour would answer
         return False
     shape, covariance = outline(fit)
     pairs = ((slice(0, 2), BALLS_SD[0]), (slice(2, 4), BALLS_SD[1]))
@@ -109,10 +106,7 @@ LEAST_EIGENVALUE = 3e-3  #: Least eigenvalue of the overlap of two arrays, over 
 
 
 def pose_covariance(fit: FieldFit) -> FloatArray:
-    """(p, p) covariance of the scene's parameters from tracker position error; zeros where it is not known.
-
-    What lies beside the bump is taken as it is.
-    """
+    """(p, p) covariance of the bump's parameters from tracker position error; zeros where it is not known."""
     noise = fit.target.window.cells.pose_noise
     p = fit.scene.own
     covariance = np.zeros((len(fit.mode), len(fit.mode)))
@@ -163,8 +157,7 @@ class Correlated(Record, eq=False):
             scene, detection = fit_and_test(tactile_map, fit, options)
         except NotConvergedError:
             return cls(tactile_map, fit, Detection(0.0, -np.inf))
-        plain = scene.plain
-        fault = rim_fault(tactile_map, plain.centre_mm, plain.widths_mm, radius_mm=options.fit_radius_mm)
+        fault = rim_fault(tactile_map, scene.plain.modal(), radius_mm=options.fit_radius_mm)
         if not fault and detection.probability >= DETECTED:
             scene, detection = with_neighbours(scene, detection, tactile_map, asked=options.scene_asked)
         return cls(tactile_map, fit, detection, scene, fault)
@@ -172,8 +165,7 @@ class Correlated(Record, eq=False):
     def bump(self) -> ModalBump:
         """The bump at the scene's mode, which there is where the detection has any odds."""
         assert self.scene is not None
-        fit = self.scene.fit
-        return ModalBump(fit.target.amplitude_at(fit.mode), *fit.centre_mm, *fit.widths_mm)
+        return self.scene.fit.modal()
 
     def draw(self, options: SamplerSettings, *, rng: np.random.Generator, progress: Progress | None) -> MapDraws:
         """Draw from the posterior; `NotConvergedError` also when the scene's neighbour was not found."""
@@ -222,9 +214,9 @@ def fit_and_test(tactile_map: TactileMap, fit: BumpFit, options: SamplerSettings
     choice, detection = under(FIELD_COSINES if asked == "auto" else asked, start)
     if asked != "auto" or not detection.log_bayes_factor > 0:
         return choice, detection
-    plain = choice.plain
-    window, narrower = plain.target.window, min(plain.widths_mm)
-    wanted = max(cosines_for(narrower, axis) for axis in (window.x_mm, window.y_mm))
+    plain, bump = choice.plain, choice.plain.modal()
+    axes = plain.target.window.x_mm, plain.target.window.y_mm
+    wanted = max(cosines_for(min(bump.sigma_x_mm, bump.sigma_y_mm), axis) for axis in axes)
     if wanted <= FIELD_COSINES:
         return choice, detection
     return under(wanted, plain.scene.carried(plain.mode, Scene("rotated")))

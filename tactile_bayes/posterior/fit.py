@@ -16,8 +16,8 @@ from tactile_bayes.inference.draws import ParameterDraws, Solved, student_draws
 from tactile_bayes.inference.importance import Gaussians, smooth_weights
 from tactile_bayes.inference.modes import find_mode, finite_differences, mode_and_covariance, stencil
 from tactile_bayes.posterior.bump import covariance_from_log_widths, drawn_widths
-from tactile_bayes.posterior.draw import ROTATION_ODDS, Sampled, with_beside
-from tactile_bayes.posterior.marginal import STEP, CollapsedTarget, Scene, Shape
+from tactile_bayes.posterior.draw import ROTATION_ODDS, ModalBump, Sampled, with_beside
+from tactile_bayes.posterior.marginal import STEP, CollapsedTarget, Scene
 from tactile_bayes.posterior.window import FLOOR, NEGLIGIBLE, Problem, linear_columns
 from tactile_bayes.presets import Method, SceneAsked
 
@@ -68,11 +68,10 @@ class FieldFit(Record, eq=False, dict=True):
         """Log evidence of the scene, from the Gaussians' volumes."""
         return self.mixture.log_evidence
 
-    @property
-    def widths_mm(self) -> tuple[float, float]:
-        """sigma_x_mm and sigma_y_mm at the mode."""
-        sigma_x, sigma_y, _ = drawn_widths(*(np.array([self.at[name]]) for name in "pqr"))
-        return float(sigma_x[0]), float(sigma_y[0])
+    def modal(self) -> ModalBump:
+        """The bump at the mode."""
+        sigma_x, sigma_y, _ = (float(one[0]) for one in drawn_widths(*(np.array([self.at[name]]) for name in "pqr")))
+        return ModalBump(self.target.amplitude_at(self.mode), *self.centre_mm, sigma_x, sigma_y)
 
     @property
     def width_sd_mm(self) -> float:
@@ -126,10 +125,8 @@ class FieldFit(Record, eq=False, dict=True):
 
 
 def fit_scene(problem: Problem, scene: Scene, start: FloatArray) -> FieldFit:
-    """Find the mode from (p,) parameters, alternating with the choice of noise fields that matter there.
-
-    `NotConvergedError` when there is no mode.
-    """
+    """Find the mode from (p,) parameters, alternating with the choice of noise fields that matter there, or
+    `NotConvergedError`."""
     target = CollapsedTarget(problem, scene)
     target.settle_fields(start)
     mode, _ = find_mode(target, start, scale=scene.steps, tolerance=ROUGH)
@@ -151,11 +148,8 @@ def fit_scene(problem: Problem, scene: Scene, start: FloatArray) -> FieldFit:
 def newton_mixture(
     target: CollapsedTarget, start: FloatArray, covariance: FloatArray, *, least_share: float = LEAST_SHARE
 ) -> Mixture | None:
-    """One Gaussian per field, each by one Newton step from a common start; None where one of them is no maximum.
-
-    The (p,) start is near the mode of all; the (p, p) covariance, about theirs, scales the finite differences and
-    limits the step. A field has a Gaussian from `least_share` of the density at the start on.
-    """
+    """One Gaussian per field with `least_share` of the density at a start, by one Newton step from there; None where
+    one is no maximum. The (p, p) covariance, about theirs, scales the finite differences and limits the step."""
     scale = np.sqrt(np.diag(covariance))
     points = stencil(start, step=0.3 * scale)
     by_field = target.by_field(points) + target.scene.log_prior(points, target.problem)[:, None]
@@ -175,10 +169,8 @@ def newton_mixture(
         masses.append(by_field[0, h] + gained + 0.5 * float(np.linalg.slogdet(2.0 * np.pi * one)[1]))
     if not masses:
         return None
-    mass = np.array(masses)
-    total = float(np.logaddexp.reduce(mass))
-    left_out = float(np.log(share[share > least_share].sum()))
-    return Mixture(np.exp(mass - total), np.array(means), np.array(covariances), total - left_out)
+    total, kept = float(np.logaddexp.reduce(masses)), float(np.log(share[share > least_share].sum()))
+    return Mixture(np.exp(np.array(masses) - total), np.array(means), np.array(covariances), total - kept)
 
 
 def _newton_gaussian(
@@ -268,15 +260,13 @@ class SceneChoice(Record, eq=False):
 
 
 def choose_shape(problem: Problem, start: FloatArray, *, scene: SceneAsked = "auto") -> SceneChoice:
-    """Fit the bump from (5,) ``(u, v, x, y, r)`` of a rotated ellipse; test whether it is round, rotated and on a
-    slope.
+    """Fit the bump from (5,) ``(u, v, x, y, r)``; test whether it is round, rotated and on a slope.
 
     Level and tilt are always integrated out, and the axis ratio stays free unless `scene` says round: dropping either
     where the evidence does not support it costs coverage and gains little (docs/decisions/0055). Their odds are
     reported all the same.
     """
-    shape: Shape = "round" if scene == "round" else "rotated" if scene == "rotated" else "ellipse"
-    wanted = Scene(shape)
+    wanted = Scene(scene if scene == "round" or scene == "rotated" else "ellipse")
     chosen = fit_scene(problem, wanted, Scene("rotated").carried(start, wanted))
     questions = [_ellipse_question(chosen)] if wanted.shape == "ellipse" else []
     if scene in ASKING:
@@ -286,10 +276,8 @@ def choose_shape(problem: Problem, start: FloatArray, *, scene: SceneAsked = "au
 
 
 def retested(choice: SceneChoice, fit: FieldFit) -> SceneChoice:
-    """Copy the choice with another fit, and repeat the tests for an ellipse and a slope.
-
-    The flank of what lies beside a bump looks like a slope to a model without it.
-    """
+    """The choice with another fit and its tests for an ellipse and a slope: to a model without what lies beside a bump
+    its flank looks like one."""
     answers = {one.name: one for one in choice.structures}
     if fit.scene.shape == "ellipse":
         answers["ellipse"] = _ellipse_question(fit)
@@ -352,9 +340,8 @@ def _rotation_question(problem: Problem, straight: FieldFit, start: FloatArray) 
             log_odds = savage_dickey(mixture, axis, prior_sd=problem.prior.log_ratio_sd)
     if mixture is None:
         return straight, Structure("rotated", 0.0, False, False)
-    used = turned is not None and log_odds > np.log(ROTATION_ODDS)
     x, y = change_in_sd(straight, mixture.moments()[0])
-    if used and turned is not None:
+    if turned is not None and log_odds > np.log(ROTATION_ODDS):
         return turned, Structure("rotated", odds(log_odds), True, True, False, -x, -y)
     return straight, Structure("rotated", odds(log_odds), False, False, False, x, y)
 
@@ -403,12 +390,9 @@ SETTLINGS = 2
 
 
 def ask_departure(choice: SceneChoice) -> SceneChoice:
-    """Test whether the bump is a Gaussian; add the regressor where the evidence supports it.
-
-    A bump with something beside it is not asked: what is left of the neighbour would answer.
-    """
+    """Test whether a bump that stands alone is a Gaussian; add the regressor where the evidence supports it."""
     fit = choice.fit
-    if fit.scene.extra or fit.scene.shape == "ridge":
+    if fit.scene.extra or fit.scene.shape == "ridge":  # what is left of a neighbour would answer
         return choice
     _, exponent, log_odds = _regression(fit)
     answer = Structure("departure", odds(log_odds), bool(log_odds > np.log(LEAST_ODDS)), False)
@@ -434,7 +418,7 @@ def _fitted(fit: FieldFit) -> FieldFit | None:
 
 
 def exponent_covariance(fit: FieldFit) -> FloatArray:
-    """(p, p) covariance of the scene's parameters from the unknown noise field, of a bump with the regressor.
+    """(p, p) covariance of the scene's parameters from the unknown noise field; zeros without the regressor.
 
     A bump that is no Gaussian has other nearest widths under each noise field, by the exponent times what the raw
     column shares with a change of them. Draws have the mean over the fields; this is the spread about it.

@@ -104,23 +104,21 @@ def _rise_at(
     proven = detection.probability >= LEAST_PROBABILITY
     if not proven and not _may_be_lump(seen, rest, estimate):
         return None, False
-    return _rise(seen.bump(), detection.probability, None if estimate.map_posterior is None else estimate), proven
+    return _rise(seen.bump(), detection.probability, estimate.measured), proven
 
 
 def _may_be_lump(seen: Assessment, rest: TactileMap, estimate: Estimate) -> bool:
     """True for a rise without the evidence of a lump that is likely one all the same, beside a measured lump."""
-    if estimate.map_posterior is None or seen.detection.probability < LEAST_BESIDE:
+    lump = estimate.measured
+    if lump is None or seen.detection.probability < LEAST_BESIDE:
         return False
     bump = seen.bump()
-    high = bump.amplitude >= LEAST_SHARE * estimate.map_posterior.middle.amplitude
-    return high and weigh(rest, seen.detection, bump).chance >= LIKELY
+    return bump.amplitude >= LEAST_SHARE * lump.amplitude and weigh(rest, seen.detection, bump).chance >= LIKELY
 
 
 def _rests(tactile_map: TactileMap, estimate: Estimate) -> Iterator[TactileMap]:
-    """The map less the measured lump, and the part of it that was read well.
-
-    Few frames reach the map's rim, and their errors are larger: as part of a rise's window they hide it.
-    """
+    """The map less the measured lump, and its part that was read well: errors of a rim that few frames reach hide
+    rises."""
     if estimate.map_posterior is None:
         yield tactile_map
         return
@@ -145,20 +143,18 @@ def _apart_mm(one: ModalBump | Mass, other: ModalBump | Mass) -> float:
     return float(np.hypot(one.x_mm - other.x_mm, one.y_mm - other.y_mm))
 
 
-def _rise(bump: ModalBump, probability: float, estimate: Estimate | None) -> Rise:
-    """A bump as a rise beside the lump of an estimate, or beside none."""
-    lump = None if estimate is None else estimate.lump
+def _rise(bump: ModalBump, probability: float, lump: ModalBump | Mass | None = None) -> Rise:
+    """A bump as a rise beside a lump, or beside none."""
     away = None if lump is None else _apart_mm(bump, lump)
-    return Rise(**as_dict(bump), distance_mm=away, probability=probability)
+    return Rise(**as_dict(bump) | {"distance_mm": away, "probability": probability})
 
 
 def _places(rest: TactileMap, estimate: Estimate, *, to_rim: bool) -> Iterator[tuple[float, float]]:
     """Local maxima clear of the lump, above a share of its amplitude, highest first: inside the map, or at its rim."""
     found_on, lump = levelled(rest), estimate.lump
     height = smoothed_excess(found_on)
-    centres = candidate_centres(found_on, rim_limit=0)
-    if to_rim:
-        centres = [one for one in candidate_centres(found_on) if one not in centres]
+    inside = candidate_centres(found_on, rim_limit=0)
+    centres = [one for one in candidate_centres(found_on) if one not in inside] if to_rim else inside
     for x, y in centres:
         row, column = (int(np.argmin(np.abs(axis - at))) for axis, at in ((rest.y_mm, y), (rest.x_mm, x)))
         least = 0.0
@@ -177,13 +173,12 @@ def _clear_of_lump(x: float, y: float, rest: TactileMap, estimate: Estimate) -> 
     One whose centre lies off the map stands for what rises at the rim, which is looked at as elsewhere. A rise beside a
     rib is held against a ridge there.
     """
-    lump, second = estimate.lump, _second_lump(estimate)
-    if lump is None:
-        return True
-    lumps = [lump, *([second] if second is not None and on_map(rest, second.x_mm, second.y_mm) else [])]
-    widths = [max(one.sigma_x_mm, one.sigma_y_mm) for one in lumps]
-    away = [float(np.hypot(x - one.x_mm, y - one.y_mm)) for one in lumps]
-    return all(mm > BESIDE_IN_WIDTHS * width for mm, width in zip(away, widths, strict=True))
+    lumps, second = [] if estimate.lump is None else [estimate.lump], _second_lump(estimate)
+    if second is not None and on_map(rest, second.x_mm, second.y_mm):
+        lumps.append(second)
+    return all(
+        np.hypot(x - one.x_mm, y - one.y_mm) > BESIDE_IN_WIDTHS * max(one.sigma_x_mm, one.sigma_y_mm) for one in lumps
+    )
 
 
 def _second_lump(estimate: Estimate) -> ModalBump | None:
@@ -202,10 +197,7 @@ def _at_rim(
     options: SamplerSettings,
     estimate: Estimate,
 ) -> tuple[Rise | None, bool]:
-    """A rise that is a lump by the evidence and that the map covers too poorly to measure; None where there is none.
-
-    At the end of the well-read part the whole map shows how far the rise is covered.
-    """
+    """A rise that is a lump by the evidence and that the map covers too poorly to measure; None where there is none."""
     if not candidates or candidates[0].fit is None or not candidates[0].fault.startswith(AT_RIM):
         return None, False
     bump, lump = candidates[0].fit.modal(), estimate.lump
@@ -215,16 +207,15 @@ def _at_rim(
     if chance is None or chance.detection.probability < LEAST_PROBABILITY:
         return None, False
     proven = chance.probability >= LIKELY
+    # at the end of the well-read part the whole map shows how far the rise is covered
     if not proven and (rest is whole or weigh(whole, chance.detection, bump).probability < LIKELY):
         return None, False
-    return _rise(bump, chance.detection.probability, None), proven
+    return _rise(bump, chance.detection.probability), proven
 
 
 def _stands_out(rise: Rise, rest: TactileMap) -> bool:
-    """True where the map, or the map with wide rises taken off, is higher at a rise's centre than elsewhere.
-
-    A centre beyond the covered cells is not judged.
-    """
+    """True where the map, or the map with wide rises taken off, is higher at a rise's centre than elsewhere, or has no
+    cells there."""
     y, x = np.meshgrid(rest.y_mm, rest.x_mm, indexing="ij")
     near = rest.covered & (np.hypot(x - rise.x_mm, y - rise.y_mm) < STANDING_MM)
     if not near.any():
@@ -259,7 +250,7 @@ def with_masses(tactile_map: TactileMap, first: Estimate, options: SamplerSettin
     are known: they are of that lump. `first` is `estimator`'s result for the map, `estimator` being `estimate_map` with
     its calibration and random numbers.
     """
-    sized = [] if first.bump is None else [Mass(*_place(first), _probability(first), first)]
+    sized = [] if first.lump is None else [_mass_of(first, first.lump)]
     # what is known of a lump is of the first, and so is a checkpoint
     known = {name: value for name, value in options.size_priors.known.items() if name not in OF_A_LUMP}
     others = replace(options, scene="auto", store=None, size_priors=replace(options.size_priors, known=known))
@@ -272,21 +263,18 @@ def with_masses(tactile_map: TactileMap, first: Estimate, options: SamplerSettin
             sized.append(mass)
     why = "the map shows too little of it for a size"
     unsized = [_unsized(rise, "prior", why, MORE_LINES, MORE_LINES_ON_PAPER) for rise in hardly]
-    sized += [mass for mass in unsized if all(_apart(mass, one) for one in sized)]
-    sized = by_evidence(sized)
+    sized = by_evidence([*sized, *(mass for mass in unsized if all(_apart(mass, one) for one in sized))])
     kept = options.centre_mm is not None or bool(set(OF_A_LUMP) & set(options.size_priors.known))
     reported = first if kept or not sized else sized[0].estimate
     masses = tuple(
         replace(one, reported=one.estimate is reported, probability=_calibrated(tactile_map, one)) for one in sized
     )
     here = next((one for one in masses if one.reported and one.estimate.status == "estimate"), None)
-    beside = []
-    for one in masses:
-        if not one.reported:
-            assert one.estimate.bump is not None
-            away = None if here is None else _apart_mm(one, here)
-            shape = as_dict(replace(one.estimate.bump, x_mm=one.x_mm, y_mm=one.y_mm))
-            beside.append(Rise(**shape | {"distance_mm": away, "probability": one.probability}))
+    beside = [
+        _rise(replace(one.bump, x_mm=one.x_mm, y_mm=one.y_mm), one.probability, here)
+        for one in masses
+        if not one.reported
+    ]
     return replace(reported, candidates=first.candidates, masses=masses, other_rises=tuple(beside))
 
 
@@ -298,10 +286,10 @@ def by_evidence(masses: Sequence[Mass]) -> list[Mass]:
     larger than the lump beside it.
     """
     measured = [one for one in masses if one.largest_mm is not None or one.estimate.code == "extrapolated"]
-    highest = max((_amplitude(one.estimate) for one in measured), default=0.0)
+    highest = max((one.bump.amplitude for one in measured), default=0.0)
 
     def rank(mass: Mass) -> tuple[bool, bool, bool, float, float]:
-        estimate, height = mass.estimate, _amplitude(mass.estimate)
+        estimate, height = mass.estimate, mass.bump.amplitude
         held = all(one.kind != "outside_calibration" for one in estimate.findings)
         evidence = -np.inf if estimate.detection is None else estimate.detection.log_bayes_factor
         return height >= DOUBTFUL_SHARE * highest, mass.largest_mm is not None, held, evidence, height
@@ -311,46 +299,29 @@ def by_evidence(masses: Sequence[Mass]) -> list[Mass]:
 
 def _apart(one: Mass, other: Mass) -> bool:
     """True for two masses, not one measured twice: two narrow bumps may stand close to each other."""
-    widths = [max(m.estimate.bump.sigma_x_mm, m.estimate.bump.sigma_y_mm) for m in (one, other) if m.estimate.bump]
-    least = min(2 * SMOOTHING_MM, APART_IN_WIDTHS * max(widths, default=np.inf))
-    return _apart_mm(one, other) > least
+    widest = max(max(mass.bump.sigma_x_mm, mass.bump.sigma_y_mm) for mass in (one, other))
+    return _apart_mm(one, other) > min(2 * SMOOTHING_MM, APART_IN_WIDTHS * widest)
 
 
-def _probability(estimate: Estimate) -> float:
-    return 0.0 if estimate.detection is None else estimate.detection.probability
-
-
-def _place(estimate: Estimate) -> tuple[float, float]:
-    """Centre in `plane`: of the posterior where there is one."""
-    lump = estimate.lump
-    assert lump is not None
-    return lump.x_mm, lump.y_mm
-
-
-def _amplitude(estimate: Estimate) -> float:
-    assert estimate.bump is not None
-    return estimate.bump.amplitude
+def _mass_of(estimate: Estimate, lump: ModalBump, probability: float = 0.0) -> Mass:
+    """The mass of an estimate, where its lump is; no less probable than was known before."""
+    by_odds = 0.0 if estimate.detection is None else estimate.detection.probability
+    return Mass(lump.x_mm, lump.y_mm, max(probability, by_odds), estimate)
 
 
 def _second_lump_of_scene(tactile_map: TactileMap, first: Estimate) -> list[Rise]:
-    """The second lump of the first one's scene, if the evidence put it there and it lies on the map.
-
-    Off the map it stands for what rises at the rim, and `other_rises` judges that.
-    """
+    """The second lump of the first one's scene, if the evidence put it there; off the map `other_rises` judges it."""
     lump, choice = _second_lump(first), first.scene
     if choice is None or lump is None or not on_map(tactile_map, lump.x_mm, lump.y_mm):
         return []
     (asked,) = (one for one in choice.structures if one.name == "second lump")
-    return [_rise(lump, asked.odds / (1.0 + asked.odds), None)] if asked.supported else []
+    return [_rise(lump, asked.odds / (1.0 + asked.odds))] if asked.supported else []
 
 
 def _sized_at(
     tactile_map: TactileMap, rise: Rise, first: Estimate, options: SamplerSettings, estimator: Estimator
 ) -> Mass | None:
-    """The mass at a rise: by the whole map if it shows a lump there, else by the map less the first lump.
-
-    None where neither shows a lump.
-    """
+    """The mass at a rise, by the whole map or by the map less the first lump; None where neither shows a lump there."""
     if not on_map(tactile_map, rise.x_mm, rise.y_mm):
         return _unsized(rise, "window", "its centre lies off the map", BEYOND_IT)
     given = replace(options, centre_mm=(rise.x_mm, rise.y_mm), start_width_mm=None)
@@ -363,15 +334,14 @@ def _sized_at(
                 break
         # a part of the map that hides a lump does not outvote the whole that shows one
         estimate = max(on_rests, key=lambda one: (_same_lump(one, rise, first), one.code not in NO_LUMP))
-        if estimate.size is not None and _amplitude(estimate) < LEAST_SHARE * _amplitude(first):
-            times = f"{1 / LEAST_SHARE:.0f} times as high"
-            estimate = _not_told_apart(
-                estimate, f"it stands in the flank of a lump more than {times}, which hides its shape"
-            )
+        low, high = estimate.bump, first.bump
+        if estimate.size is not None and low and high and low.amplitude < LEAST_SHARE * high.amplitude:
+            lump = f"a lump more than {1 / LEAST_SHARE:.0f} times as high"
+            estimate = _not_told_apart(estimate, f"it stands in the flank of {lump}, which hides its shape")
     if estimate.code in (*NO_LUMP, CANNOT_SHOW):
         return None
-    if _same_lump(estimate, rise, first):
-        return Mass(*_place(estimate), max(rise.probability, _probability(estimate)), estimate)
+    if estimate.measured is not None and _same_lump(estimate, rise, first):
+        return _mass_of(estimate, estimate.measured, rise.probability)
     if estimate.status == "estimate":
         estimate = _not_told_apart(estimate, "its fit moves to the lump beside it: the map does not tell them apart")
     return Mass(rise.x_mm, rise.y_mm, rise.probability, replace(estimate, bump=rise))
@@ -380,11 +350,11 @@ def _sized_at(
 def _unsized(rise: Rise, code: str, why: str, advice: str, on_paper: str = "") -> Mass:
     """The mass at a rise that is likely a lump, and why it has no size."""
     estimate = Estimate("no_estimate", why, code=code, advice=advice, on_paper=on_paper or advice, bump=rise)
-    return Mass(rise.x_mm, rise.y_mm, rise.probability, estimate)
+    return _mass_of(estimate, rise, rise.probability)
 
 
-def _not_told_apart(estimate: Estimate, reason: str) -> Estimate:
-    return Estimate("no_estimate", reason, detection=estimate.detection, code="unresolved", advice=BOTH, on_paper=BOTH)
+def _not_told_apart(estimate: Estimate, why: str) -> Estimate:
+    return Estimate("no_estimate", why, detection=estimate.detection, code="unresolved", advice=BOTH, on_paper=BOTH)
 
 
 def _estimated(tactile_map: TactileMap, options: SamplerSettings, estimator: Estimator) -> Estimate:
@@ -397,17 +367,13 @@ def _estimated(tactile_map: TactileMap, options: SamplerSettings, estimator: Est
 
 def _same_lump(estimate: Estimate, rise: Rise, first: Estimate) -> bool:
     """True where an estimate is of the lump at a rise, and did not move towards the first lump."""
-    if estimate.map_posterior is None or first.bump is None:
-        return estimate.map_posterior is not None
-    moved, apart = ((np.hypot(x - rise.x_mm, y - rise.y_mm)) for x, y in (_place(estimate), _place(first)))
-    return bool(moved < apart / 2.0)
+    lump, other = estimate.measured, first.lump
+    return lump is not None and (other is None or _apart_mm(lump, rise) < _apart_mm(other, rise) / 2.0)
 
 
 def _calibrated(tactile_map: TactileMap, mass: Mass) -> float:
     """Probability that a mass is a lump, by its own estimate, or by the odds and the bump of its rise."""
-    bump = mass.estimate.bump
-    assert bump is not None
     if mass.estimate.probability is not None:
         return mass.estimate.probability
     odds = Detection(mass.probability, float(np.log(mass.probability) - np.log1p(-min(mass.probability, 1.0 - 1e-16))))
-    return weigh(tactile_map, odds, bump).chance
+    return weigh(tactile_map, odds, mass.bump).chance

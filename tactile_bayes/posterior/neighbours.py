@@ -10,6 +10,7 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import SMOOTHING_MM, smoothed_excess
+from tactile_bayes.posterior.draw import ModalBump
 from tactile_bayes.posterior.fit import (
     ASKING,
     LEAST_ODDS,
@@ -46,17 +47,8 @@ class Surroundings(Record, eq=False):
         """Prepare from a map."""
         return cls(tactile_map.x_mm, tactile_map.y_mm, smoothed_excess(tactile_map))
 
-    def rise(
-        self,
-        extra: Neighbour,
-        places: FloatArray,
-        *,
-        bump_mm: tuple[float, float],
-        bump_width_mm: float,
-        amplitude: float,
-        middle: tuple[float, float],
-    ) -> FloatArray:
-        """(g,) excess of the map, without the bump, under second lumps or ribs; -inf where the map has no data.
+    def rise(self, extra: Neighbour, places: FloatArray, bump: ModalBump, *, middle: tuple[float, float]) -> FloatArray:
+        """(g,) excess of the map, without a round bump, under second lumps or ribs; -inf where the map has no data.
 
         The (g, 3) places are as in `Scene`: ``x2, y2, w2`` or ``angle, offset, w2`` about the window's `middle`. Under
         a lump the excess is the mean. Along a rib it is the median over pieces of `PIECE_MM` if that is lower: a rib
@@ -65,11 +57,11 @@ class Surroundings(Record, eq=False):
         A head under constant force presses less beside a lump: the map dips there and comes back to its level. In a
         window that looks like a ridge along its rim. A rib or a lump rises above the level; a dip's far side does not.
         """
-        away = np.hypot(self.x_mm - bump_mm[0], (self.y_mm - bump_mm[1])[:, None])
-        clear = np.isfinite(self.excess) & (away > CLEAR_IN_WIDTHS * bump_width_mm)
-        wide = bump_width_mm**2 + SMOOTHING_MM**2
-        bump = amplitude * bump_width_mm**2 / wide * np.exp(-0.5 * away**2 / wide)
-        excess = np.where(clear, self.excess - bump, 0.0)
+        away, width_mm = np.hypot(self.x_mm - bump.x_mm, (self.y_mm - bump.y_mm)[:, None]), bump.sigma_x_mm
+        clear = np.isfinite(self.excess) & (away > CLEAR_IN_WIDTHS * width_mm)
+        wide = width_mm**2 + SMOOTHING_MM**2
+        height = bump.amplitude * width_mm**2 / wide * np.exp(-0.5 * away**2 / wide)
+        excess = np.where(clear, self.excess - height, 0.0)
         values = np.stack([clear.astype(np.float64), excess])
         if extra == "rib":
             return self._along_ribs(places, values, middle)
@@ -214,16 +206,10 @@ def _split(plain: FieldFit) -> FloatArray | None:
 
 def rises(fit: FieldFit, surroundings: Surroundings, extra: Neighbour, places: FloatArray) -> BoolArray:
     """(g,) whether the map rises by a share of the bump's amplitude at places of second lumps or ribs."""
-    amplitude = fit.target.amplitude_at(fit.mode)
-    rise = surroundings.rise(
-        extra,
-        places,
-        bump_mm=fit.centre_mm,
-        bump_width_mm=float(np.exp(fit.at["p"])),
-        amplitude=amplitude,
-        middle=fit.target.window.middle,
-    )
-    return np.asarray(rise > LEAST_RISE * amplitude)
+    width_mm = float(np.exp(fit.at["p"]))
+    bump = ModalBump(fit.target.amplitude_at(fit.mode), *fit.centre_mm, width_mm, width_mm)
+    rise = surroundings.rise(extra, places, bump, middle=fit.target.window.middle)
+    return np.asarray(rise > LEAST_RISE * bump.amplitude)
 
 
 def second_lumps(plain: FieldFit) -> FloatArray:

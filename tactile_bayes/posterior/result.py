@@ -111,9 +111,14 @@ class Estimate(Record, eq=False):
         return None if self.weighed is None else self.weighed.probability
 
     @property
+    def measured(self) -> ModalBump | None:
+        """The bump at the posterior medians; None where nothing was drawn."""
+        return None if self.map_posterior is None else self.map_posterior.middle
+
+    @property
     def lump(self) -> ModalBump | None:
         """The bump of the lump that the answer is about: at the posterior medians where it was drawn."""
-        return self.bump if self.map_posterior is None else self.map_posterior.middle
+        return self.measured or self.bump
 
 
 class Mass(Record, eq=False):
@@ -124,6 +129,12 @@ class Mass(Record, eq=False):
     probability: float  #: That it is a lump; of a second lump in another's window, by its odds.
     estimate: Estimate  #: Its own: draws and size, or why there is none.
     reported: bool = False  #: The map's `Estimate` is this mass's.
+
+    @property
+    def bump(self) -> ModalBump:
+        """Its bump at the mode."""
+        assert self.estimate.bump is not None
+        return self.estimate.bump
 
     @property
     def largest_mm(self) -> float | None:

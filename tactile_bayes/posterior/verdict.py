@@ -254,17 +254,15 @@ def _reached(along: FloatArray, covered: BoolArray, cell: float, reach: float) -
     return reach
 
 
-def rim_fault(
-    tactile_map: TactileMap, centre_mm: tuple[float, float], widths_mm: tuple[float, float], *, radius_mm: float
-) -> str:
+def rim_fault(tactile_map: TactileMap, bump: ModalBump, *, radius_mm: float) -> str:
     """Fault of a bump mostly beyond the map's rim, within a single cell, or of few readings; empty if none."""
-    wide, narrow, cell = max(widths_mm), min(widths_mm), tactile_map.recipe.cell_mm
+    (narrow, wide), cell = sorted((bump.sigma_x_mm, bump.sigma_y_mm)), tactile_map.recipe.cell_mm
+    centre_mm = bump.x_mm, bump.y_mm
     share = covered_share(tactile_map, centre_mm, radius_mm=1.5 * wide)
     if share < LEAST_COVERED_SHARE:
         return f"{AT_RIM} ({100 * share:.0f} % of the bump is covered, with a sigma of {wide:.3g} mm)"
-    wide_rise = wide > WIDE_IN_RADII * radius_mm
     short = missing_strokes(tactile_map, centre_mm, reach_mm=ENCLOSED_IN_WIDTHS * wide)
-    if wide_rise and short:
+    if wide > WIDE_IN_RADII * radius_mm and short:
         side, millimetres = max(short.items(), key=lambda one: one[1])
         return f"{AT_RIM} (with a sigma of {wide:.3g} mm its flank to {side} is {millimetres:.0f} mm short)"
     if narrow < LEAST_WIDTH_IN_CELLS * cell:

@@ -78,10 +78,8 @@ class Whitening(Record, eq=False):
 
 
 def cosine_profiles(axis_mm: FloatArray, *, cosines: int = FIELD_COSINES) -> tuple[FloatArray, FloatArray]:
-    """(n, cosines) cosines along one axis, and their (cosines,) squared angular frequencies, 1/mm^2.
-
-    Of mean square 1 over the axis and its margins.
-    """
+    """(n, cosines) cosines along one axis, of mean square 1 over it and its margins, and their (cosines,) squared
+    angular frequencies, 1/mm^2."""
     phase, side = _phase(axis_mm)
     order = np.arange(cosines)
     profiles = np.cos(np.pi * order * phase[:, None])
@@ -92,8 +90,7 @@ def cosine_profiles(axis_mm: FloatArray, *, cosines: int = FIELD_COSINES) -> tup
 def cosines_for(width_mm: float, axis_mm: FloatArray) -> int:
     """Number of cosines along an axis for a bump's width, from `FIELD_COSINES` to `FINE_FIELD_COSINES`.
 
-    Errors shorter than the shortest half wave count as independent. For a narrow bump they are not: they have its
-    shape.
+    Errors shorter than the shortest half wave count as independent, which for a narrow bump they are not.
     """
     _, side = _phase(axis_mm)
     wanted = np.ceil(side / (HALF_WAVE_IN_WIDTHS * max(width_mm, 1e-6)))
@@ -107,10 +104,7 @@ def _phase(axis_mm: FloatArray) -> tuple[FloatArray, float]:
 
 
 def gram_of_cosines(along: FloatArray, across: FloatArray, *, weight: FloatArray) -> FloatArray:
-    """Inner products of the plane's cosines under (ny, nx) weights: (cosines^2, cosines^2), y's order counted first.
-
-    `along` and `across` are (ny, cosines) and (nx, cosines) arrays from `cosine_profiles`.
-    """
+    """(cosines^2, cosines^2) inner products of the plane's cosines under (ny, nx) weights, y's order counted first."""
     pairs = [(one[:, :, None] * one[:, None, :]).reshape(len(one), -1) for one in (along, across)]
     cosines = along.shape[1]
     # axes: y, y', x, x'
@@ -220,17 +214,15 @@ class Window:
         cell, noise = self.cells.cell_mm, self.cells.pose_noise
         blur_x, blur_y = (0.0, 0.0) if noise is None else noise.sd_mm
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            away_x, away_y = self.x_mm - x_mm[:, None], self.y_mm - y_mm[:, None]
             if r is None:
-                away_x, away_y = self.x_mm - x_mm[:, None], self.y_mm - y_mm[:, None]
                 columns = cell_mean_profile(away_x, sigma_mm=np.exp(p + q), cell_mm=cell, blur_mm=blur_x)
                 rows = cell_mean_profile(away_y, sigma_mm=np.exp(p - q), cell_mm=cell, blur_mm=blur_y)
                 return Profiles(rows, columns)
             covariance = covariance_from_log_widths(p, q, r)
             blurred = covariance + np.diag([blur_x**2, blur_y**2])
-            lower = np.sqrt(np.linalg.det(covariance) / np.linalg.det(blurred))
-            across, along = self.x_mm - x_mm[:, None], self.y_mm - y_mm[:, None]
-            grid = turned_gaussians(across, along, covariance_mm2=blurred, cell_mm=cell)
-            grid *= lower[:, None, None]
+            grid = turned_gaussians(away_x, away_y, covariance_mm2=blurred, cell_mm=cell)
+            grid *= np.sqrt(np.linalg.det(covariance) / np.linalg.det(blurred))[:, None, None]
             return grid
 
     def ridges(self, angle_rad: FloatArray, offset_mm: FloatArray, *, log_width: FloatArray) -> FloatArray:
@@ -273,9 +265,8 @@ def cell_mean_profile(
 ) -> FloatArray:
     """(m, k) means over cells of one-dimensional Gaussians, of unit height before a blur of this SD.
 
-    They are the factors of `cell_mean_gaussian`.
-    The two corrections of that function's series are multiplied here and added there: a difference of the order of
-    the terms that both leave out.
+    They are the factors of `cell_mean_gaussian`, but for the two corrections of its series, which are multiplied here
+    and added there: a difference of the order of the terms that both leave out.
     """
     blurred = np.hypot(sigma_mm, blur_mm)
     wide = (blurred**2 + cell_mm**2 / 12.0)[:, None]
@@ -471,8 +462,7 @@ class LinearModel:
         return fields, total - float(np.logaddexp.reduce(left))
 
     def without_structure(self) -> tuple[list[FieldColumns], float]:
-        """The lengths with evidence for level and tilt alone, with all their shares, and the whole of the log
-        evidence."""
+        """The lengths with evidence for level and tilt alone, with all their shares, and the log evidence of all."""
         walked, total = self._walk(lambda columns: columns.null_evidence(dof=self.dof(0)))
         return [columns for columns, one in walked if one.max() > total + np.log(NEGLIGIBLE)], total
 
@@ -507,8 +497,7 @@ class LinearModel:
         return self.solve(inner, None if cross is None else inner[0].product(inner[1], cross, columns), columns)
 
     def solve(self, inner: list[Inner], cross: FloatArray | None, columns: FieldColumns) -> LinearSolution:
-        """Solutions under one length: `inner` of each structure's (m,) templates, `cross` (m, h) of two with each
-        other."""
+        """Solutions under one length, from products of each structure's (m,) templates, (m, h) `cross` of both."""
         c, dof = columns.inverse.shape[1], self.dof(len(inner))
         plain = [one.plain for one in inner]
         to_level = [np.matmul(one[:, :, None, :c], columns.inverse)[:, :, 0] for one in plain]

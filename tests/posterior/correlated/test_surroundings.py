@@ -5,11 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.posterior.bump import SMOOTHING_MM
+from tactile_bayes.posterior.draw import ModalBump
 from tactile_bayes.posterior.marginal import Extra
 from tactile_bayes.posterior.neighbours import CLEAR_IN_WIDTHS, LEAST_CELLS, PIECE_MM, Surroundings
 
-BUMP = {"bump_mm": (1.0, -2.0), "bump_width_mm": 4.0, "amplitude": 0.3, "middle": (0.5, 0.5)}
+BUMP, MIDDLE = ModalBump(0.3, 1.0, -2.0, 4.0, 4.0), (0.5, 0.5)
 
 
 def surroundings() -> Surroundings:
@@ -57,7 +59,7 @@ def test_a_rise_is_the_mean_over_the_cells_or_along_a_rib_the_median_piece(
     extra: Extra, places: list[tuple[float, float, float]], exact: float
 ) -> None:
     around = surroundings()
-    found = around.rise(extra, np.array(places), **BUMP)
+    found = around.rise(extra, np.array(places), BUMP, middle=MIDDLE)
     wanted = [cell_by_cell(around, extra, place) for place in places]
     assert wanted[-1] == -np.inf
     assert found == pytest.approx(wanted, abs=exact)
@@ -74,6 +76,6 @@ def test_another_lump_on_a_line_is_no_rib_along_it() -> None:
     distance = np.hypot(around.x_mm + 25.0, around.y_mm[:, None] - 15.0)
     along_y = np.array([(0.0, -25.5, np.log(5.0))])
     lump, ridge = np.exp(-0.5 * (distance / 4.0) ** 2), np.exp(-0.5 * ((around.x_mm + 25.0) / 4.0) ** 2)
-    bare = {**BUMP, "amplitude": 0.0}
-    assert abs(with_excess(lump).rise("rib", along_y, **bare)[0]) < 0.01
-    assert with_excess(np.tile(ridge, (51, 1))).rise("rib", along_y, **bare)[0] > 0.3
+    bare = replace(BUMP, amplitude=0.0)
+    assert abs(with_excess(lump).rise("rib", along_y, bare, middle=MIDDLE)[0]) < 0.01
+    assert with_excess(np.tile(ridge, (51, 1))).rise("rib", along_y, bare, middle=MIDDLE)[0] > 0.3
