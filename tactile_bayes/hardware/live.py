@@ -29,18 +29,11 @@ from tactile_bayes.scans import ElementCalibration, HeadGeometry, TrackerPoses
 
 # --- Feed of a recording to its live view, through a pipe on which the recorder never waits.
 #
-# A message is ``kind u8, length u32, payload``; one that does not fit is left out, and the view misses it while the
-# file does not.
+# A message is the sizes of its parts, JSON, and a frame's counts. It goes in whole or, when it does not fit, not at
+# all: then the view misses it while the file does not.
 
-FRAME: Final = 1
-POSE: Final = 2
-REPORT: Final = 3
-_TOLD: Final = ("frames", "frames_lost", "poses", "first_ns", "last_ns", "unseen")
-LANDMARK: Final = 4
-_HEADER: Final = struct.Struct("<BI")
-_TIMES: Final = struct.Struct("<qq")  # device ns, host ns (monotonic)
-_POSE: Final = struct.Struct("<q7d")
-_POINT: Final = struct.Struct("<3d")
+_SIZES: Final = struct.Struct("<II")
+_TOLD: Final = ("frames", "frames_lost", "poses", "duration_s", "unseen")  #: Of the recorder's account.
 
 
 class SeenFrame(NamedTuple):
@@ -81,24 +74,24 @@ class Feed:
 
     def frame(self, counts: CountArray, device_ns: int) -> None:
         """Send a recorded frame."""
-        times = _TIMES.pack(device_ns, time.monotonic_ns())
-        self._send(FRAME, times + struct.pack("<BB", *counts.shape) + counts.astype("<u2").tobytes())
+        self._send("frame", counts.shape, device_ns, time.monotonic_ns(), counts=counts.astype("<u2").tobytes())
 
     def pose(self, pose: PoseReading, device_ns: int) -> None:
         """Send a recorded pose."""
-        self._send(POSE, _POSE.pack(device_ns, *pose.position_mm, *pose.quaternion_wxyz))
+        self._send("pose", device_ns, pose.position_mm, pose.quaternion_wxyz)
 
     def landmark(self, name: str, position_mm: FloatArray) -> None:
         """Send a landmark, touched or read from a file."""
-        self._send(LANDMARK, _POINT.pack(*position_mm.tolist()) + name.encode())
+        self._send("landmark", name, position_mm.tolist())
 
     def told(self, report: Report) -> None:
         """Send the account so far, with the landmark that was touched last."""
-        told = {name: getattr(report, name) for name in _TOLD} | {"touched": "".join(report.landmarks[-1:])}
-        self._send(REPORT, json.dumps(told).encode())
+        told = {name: getattr(report, name) for name in _TOLD}
+        self._send("report", told | {"touched": "".join(report.landmarks[-1:])})
 
-    def _send(self, kind: int, payload: bytes) -> None:
-        message = _HEADER.pack(kind, len(payload)) + payload
+    def _send(self, *told: Any, counts: bytes = b"") -> None:
+        text = json.dumps(told).encode()
+        message = _SIZES.pack(len(text), len(counts)) + text + counts
         if len(message) > select.PIPE_BUF:  # could go in by halves
             self.missed += 1
             return
@@ -118,7 +111,6 @@ class FeedReader:
     def __init__(self, pipe: int) -> None:
         self.pipe = pipe
         self.ended = False
-        self._rest = b""
         os.set_blocking(pipe, False)
 
     def read(self, wait_s: float) -> list[Seen]:
@@ -132,32 +124,25 @@ class FeedReader:
             while piece := os.read(self.pipe, PIPE_BYTES):
                 data += piece
             self.ended = True
-        return list(self._messages(data))
-
-    def _messages(self, data: bytes) -> Iterator[Seen]:
-        buffer, place = self._rest + data, 0
-        while len(buffer) - place >= _HEADER.size:
-            kind, length = _HEADER.unpack_from(buffer, place)
-            start = place + _HEADER.size
-            if len(buffer) - start < length:
-                break
-            place = start + length
-            yield _decode(kind, buffer[start:place])
-        self._rest = buffer[place:]
+        return list(_messages(data))
 
 
-def _decode(kind: int, payload: bytes) -> Seen:
-    if kind == FRAME:
-        device_ns, host_ns = _TIMES.unpack_from(payload)
-        shape = (payload[_TIMES.size], payload[_TIMES.size + 1])
-        counts = np.frombuffer(payload, dtype="<u2", offset=_TIMES.size + 2).reshape(shape)
-        return SeenFrame(counts, device_ns, host_ns)
-    if kind == POSE:
-        device_ns, *values = _POSE.unpack(payload)
-        return SeenPose(device_ns, tuple(values[:3]), tuple(values[3:]))
-    if kind == LANDMARK:
-        return SeenLandmark(payload[_POINT.size :].decode(), _POINT.unpack_from(payload))
-    return dict(json.loads(payload))
+def _messages(data: bytes) -> Iterator[Seen]:
+    """A whole number of messages, as each went in at once."""
+    place = 0
+    while place < len(data):
+        text, size = _SIZES.unpack_from(data, place)
+        start = place + _SIZES.size + text
+        place = start + size
+        match json.loads(data[start - text : start]):
+            case "frame", shape, device_ns, host_ns:
+                yield SeenFrame(np.frombuffer(data[start:place], dtype="<u2").reshape(shape), device_ns, host_ns)
+            case "pose", device_ns, position_mm, quaternion_wxyz:
+                yield SeenPose(device_ns, tuple(position_mm), tuple(quaternion_wxyz))
+            case "landmark", name, position_mm:
+                yield SeenLandmark(name, tuple(position_mm))
+            case _, report:
+                yield report
 
 
 # --- The growing map and the pressure during a recording, for a live view.
@@ -343,17 +328,14 @@ class LiveMap:
     def state(self, *, size: str = "", lump_base_mm: FloatArray | None = None) -> LiveState:
         """The present state for the view."""
         figures = self._map.figures if self._map else {"frames_used": 0.0, "frames_total": 0.0}
-        report = self._report
         return LiveState(
             tactile_map=self._snapshot(),
             pressure_kpa=self._pressure_kpa,
             window_kpa=self.window_kpa,
-            **{name: report[name] for name in ("frames", "frames_lost", "poses", "unseen") if name in report},
-            duration_s=(report.get("last_ns", 0) - report.get("first_ns", 0)) / 1e9,
+            **self._report,
             used_share=figures["frames_used"] / max(1.0, figures["frames_total"]),
             latency_ms=(time.monotonic_ns() - self._host_ns) / 1e6 if self._host_ns else 0.0,
             landmarks=tuple(self._landmarks),
-            touched=report.get("touched", ""),
             size=size,
             lump_base_mm=lump_base_mm,
         )

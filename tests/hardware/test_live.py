@@ -71,7 +71,7 @@ def state(scan) -> LiveState:
     seen = seen_of(scan)
     for start in range(0, len(seen), 25):
         live.take(seen[start : start + 25])
-    live.take([{"frames": 200, "frames_lost": 3, "poses": 120, "first_ns": 0, "last_ns": 995_000_000}])
+    live.take([{"frames": 200, "frames_lost": 3, "poses": 120, "duration_s": 0.995}])
     return live.state(size="largest size 15.0 mm")
 
 
