@@ -46,19 +46,10 @@ def cobs_encode(data: bytes) -> bytes:
 
     Every zero becomes the distance to the next one; runs of 254 bytes without a zero get a code of their own.
     """
-    out = bytearray()
-    rest = b"\0"
-    for block in data.split(b"\0"):
-        rest = block
-        while len(rest) >= 254:
-            out.append(255)
-            out += rest[:254]
-            rest = rest[254:]
-        out.append(len(rest) + 1)
-        out += rest
-    if len(out) > 1 and not rest and data[-1:] != b"\0":
-        del out[-1]  # a full run at the end says by itself where it ends
-    return bytes(out)
+    runs = [block[i : i + 254] for block in data.split(b"\0") for i in range(0, len(block) + 1, 254)]
+    if len(runs) > 1 and not runs[-1] and data[-1:] != b"\0":
+        del runs[-1]  # a full run at the end says by itself where it ends
+    return b"".join(bytes([len(run) + 1]) + run for run in runs)
 
 
 def cobs_decode(data: bytes) -> bytes | None:
@@ -146,6 +137,8 @@ _HELLO: Final = struct.Struct("<BBHI")  # rows, columns, saturation count, frame
 _END: Final = struct.Struct("<II")  # sent, dropped
 _POSE: Final = struct.Struct("<H7d")  # ns beyond the header's microseconds, x y z mm, w x y z
 _MAX_ID: Final = 64
+# The counter of frames has restarted when more seem to be missing: a silent device ends a recording long before.
+MOST_LOST: Final = 100_000
 
 
 def encode_hello(hello: readings.HelloReading) -> bytes:
@@ -190,9 +183,9 @@ class HeadParser(readings.Parser):
 
     def __init__(self, *, every: int = 1) -> None:
         self.packets = PacketParser()
-        self.sequence = readings.SequenceCheck()
         self.hello: readings.HelloReading | None = None
         self._every = every
+        self._expected: int | None = None
 
     def feed(self, data: bytes) -> list[readings.Reading]:
         found = [reading for packet in self.packets.feed(data) if (reading := self._read(packet)) is not None]
@@ -220,10 +213,11 @@ class HeadParser(readings.Parser):
         if shape is None or len(packet.payload) != 2 * shape[0] * shape[1]:
             self._misfit(f"a FRAME of {len(packet.payload)} bytes" + ("" if shape else " before its HELLO"))
             return None
-        restarts = self.sequence.restarts
-        lost = self.sequence.missing_before(packet.sequence // self._every)
+        sequence = packet.sequence // self._every
+        gap = 0 if self._expected is None else (sequence - self._expected) % 2**32
+        self._expected, restarted = sequence + 1, gap > MOST_LOST
         counts = np.frombuffer(packet.payload, dtype="<u2").reshape(shape)
-        return readings.FrameReading(counts, packet.device_us * 1000, lost, self.sequence.restarts > restarts)
+        return readings.FrameReading(counts, packet.device_us * 1000, 0 if restarted else gap, restarted)
 
     def _misfit(self, what: str) -> None:
         self.fault = f"it sent {what}"
@@ -239,7 +233,6 @@ class HeadParser(readings.Parser):
         if not readings.plausible((x, y, z), (qw, qx, qy, qz)) or rest_ns > 999:
             self._misfit(f"a POSE that can be none, {x:g} {y:g} {z:g} mm, {qw:g} {qx:g} {qy:g} {qz:g}")
             return None
-        self.sequence.missing_before(packet.sequence)
         flags = (why,) if why else ()
         return readings.PoseReading((x, y, z), (qw, qx, qy, qz), packet.device_us * 1000 + rest_ns, flags, tool)
 
@@ -256,15 +249,10 @@ class HeadParser(readings.Parser):
         return self.hello
 
 
-def frame_bytes_on_wire(taxels: int) -> int:
-    """Largest number of bytes of one frame: header, checksum, stuffing, a zero byte at each end."""
-    body = 14 + 2 * taxels + 4
-    return body + body // 254 + 1 + 2
-
-
 def needed_baud(taxels: int, *, rate_hz: float) -> int:
-    """Line rate in baud that the frames need, with start and stop bits."""
-    return round(frame_bytes_on_wire(taxels) * rate_hz * BITS_PER_BYTE_8N1)
+    """Line rate in baud for frames at their largest: header, checksum, stuffing, a zero byte at each end."""
+    body = HEADER.size + 2 * taxels + CRC_BYTES
+    return round((body + body // 254 + 1 + 2) * rate_hz * BITS_PER_BYTE_8N1)
 
 
 def check_link_rate(hello: readings.HelloReading, *, baud: int, every: int = 1, port: str = "head") -> None:

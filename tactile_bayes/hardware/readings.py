@@ -226,27 +226,6 @@ def _product(a: Quaternion, b: Quaternion) -> Quaternion:
     )
 
 
-MOST_LOST: Final = 100_000  #: More missing records than this are no loss: a silent device ends a recording long before.
-
-
-class SequenceCheck:
-    """Counts missing records by a 32-bit counter that wraps, and restarts: back, or `MOST_LOST` and more ahead."""
-
-    def __init__(self) -> None:
-        self._expected: int | None = None
-        self.restarts = 0
-
-    def missing_before(self, sequence: int) -> int:
-        """Number missing just before `sequence`; 0 when the counter restarted or is damaged."""
-        expected = sequence if self._expected is None else self._expected
-        gap = (sequence - expected) % 2**32
-        self._expected = (sequence + 1) % 2**32
-        if gap > MOST_LOST:
-            self.restarts += 1
-            return 0
-        return gap
-
-
 # --- Continuous device times, and the tracker's times on the head's clock.
 
 _WINDOW_NS: Final = 2_000_000_000

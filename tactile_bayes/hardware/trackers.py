@@ -485,7 +485,7 @@ class NdiPort(Port):
             words, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, start_new_session=True
         )
         theirs.close()
-        self._serial = _SocketLine(ours)
+        self._serial = _SocketLine(fileno=ours.detach())
         pipe = self._process.stdout
         assert pipe is not None
         told = pipe.readline().decode().strip() if select.select([pipe], [], [], READY_S)[0] else ""
@@ -502,28 +502,16 @@ class NdiPort(Port):
         self._process.wait()
 
 
-class _SocketLine:
-    """The part of a serial port that `Port` uses, over a socket."""
+class _SocketLine(socket.socket):
+    """A socket with the methods of a serial port that `Port` uses."""
 
-    def __init__(self, line: socket.socket) -> None:
-        self._line = line
-
-    def fileno(self) -> int:
-        return self._line.fileno()
+    write = socket.socket.sendall
 
     def read(self, size: int) -> bytes:
-        if size <= 0 or not select.select([self._line], [], [], _LOOK_S)[0]:
-            return b""
-        return self._line.recv(size)
-
-    def write(self, data: bytes) -> None:
-        self._line.sendall(data)
+        return self.recv(size) if size > 0 and select.select([self], [], [], _LOOK_S)[0] else b""
 
     def flush(self) -> None:
         """Do nothing: a socket has no buffer to flush here."""
-
-    def close(self) -> None:
-        self._line.close()
 
 
 def main(words: list[str]) -> int:

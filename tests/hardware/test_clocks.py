@@ -13,7 +13,6 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import ScanWriter, read_scan
 from tactile_bayes.hardware.readings import (
     LATEST_NS,
-    MOST_LOST,
     MOST_STEPS,
     STILL_NS,
     WRAPS_NS,
@@ -22,7 +21,6 @@ from tactile_bayes.hardware.readings import (
     FrameReading,
     PoseClock,
     PoseReading,
-    SequenceCheck,
     wrap_period,
 )
 from tactile_bayes.hardware.recorder import Line, Recorder, Report
@@ -262,14 +260,6 @@ def test_a_restart_is_no_wrap():
     assert wrap_period(2**32 * 1000 - 5, 10, passed_ns=15) == 2**32 * 1000
     assert wrap_period(2**32 * 1000 - 5, 10, passed_ns=S) is None
     assert wrap_period(50 * S, 0, passed_ns=FRAME_NS) is None
-
-
-@pytest.mark.parametrize(("jump", "lost"), [(1, 0), (4, 3), (MOST_LOST + 1, MOST_LOST), (MOST_LOST + 2, 0), (2**30, 0)])
-def test_a_counter_that_jumps_far_is_damaged_and_no_loss(jump, lost):
-    check = SequenceCheck()
-    check.missing_before(7)
-    assert check.missing_before(7 + jump) == lost
-    assert check.restarts == (jump > MOST_LOST + 1)
 
 
 def test_a_damaged_frame_counter_is_told():
