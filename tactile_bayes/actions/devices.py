@@ -7,7 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Thread
@@ -77,15 +77,14 @@ def _serve(emulators: list[Emulator], *, once: bool) -> None:
 
 def _device(kind: str, scan: Scan, protocol: str, faults: Faults, *, path: Path, held: Stage | None) -> Device:
     """Make the emulated device; an NDI tracker, which only answers, follows a shared stage itself."""
-    if kind == "head" and len(scan.frames):
+    if not len(scan.frames if kind == "head" else scan.poses):
+        what = "frames" if kind == "head" else "poses"
+        raise BadDataError(f"holds no {what}", way_out="give another scan", path=str(path))
+    if kind == "head":
         return EmulatedHead(scan)
-    if kind == "tracker" and len(scan.poses) and protocol == "ndi":
-        elapsed: Callable[[], float | None] | None = None if held is None else lambda: held.now()[1]
-        return EmulatedNdi(scan.poses, faults=faults, elapsed=elapsed)
-    if kind == "tracker" and len(scan.poses):
-        return EmulatedTracker(scan.poses, protocol=protocol, faults=faults)
-    what = "frames" if kind == "head" else "poses"
-    raise BadDataError(f"holds no {what}", way_out="give another scan", path=str(path))
+    if protocol == "ndi":
+        return EmulatedNdi(scan.poses, faults=faults, elapsed=None if held is None else lambda: held.now()[1])
+    return EmulatedTracker(scan.poses, protocol=protocol, faults=faults)
 
 
 def _link(tcp: str | None, *, after: int) -> Link:
@@ -108,11 +107,8 @@ def devices_action(
     elif pivot_url:
         _pivot(pivot_url, tracker_protocol, tool, duration)
     else:
-        ports = list_ports()
-        for port in ports:
-            click.echo(f"{port.url}  {port.description}: {port.guess}")
-        if not ports:
-            click.echo("no serial ports; other URLs: socket://HOST:PORT, rfc2217://HOST:PORT, a pseudo-terminal's path")
+        none = "no serial ports; other URLs: socket://HOST:PORT, rfc2217://HOST:PORT, a pseudo-terminal's path"
+        click.echo("\n".join(list_ports() or [none]))
 
 
 def _pivot(url: str, protocol: str, tool: str | None, duration_s: float) -> None:

@@ -33,8 +33,8 @@ from tactile_bayes.files.size_json import size_calibration_path
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.head import HeadParser
-from tactile_bayes.hardware.ports import Port, read_in_process
-from tactile_bayes.hardware.readings import Follower, HelloReading
+from tactile_bayes.hardware.ports import SILENT_S, Port, read_in_process
+from tactile_bayes.hardware.readings import Follower, HelloReading, Parser
 from tactile_bayes.hardware.recorder import LandmarkTouch, Line, Recorder, Report
 from tactile_bayes.hardware.serial_trackers import TRACKERS, check_head, open_tracker
 from tactile_bayes.options import RecordOptions
@@ -109,17 +109,13 @@ def calibration_age(request: Request, *, head_id: str, today: date) -> dict[str,
     if not request.array_calibration or request.uncalibrated:
         return {}
     found = read_array_calibration(request.array_calibration)
-    age = (today - found.day).days
-    if found.head_id != head_id and not request.accept_calibration:
-        raise UsageError(
-            f"{request.array_calibration} was measured on head {found.head_id!r}, this is {head_id!r}; calibrate this "
-            "head, or give --accept-calibration"
-        )
-    if not 0 <= age <= request.calibration_days and not request.accept_calibration:
-        raise UsageError(
-            f"{request.array_calibration} is of {found.day}, {age} days ago (at most {request.calibration_days:g}); "
-            "calibrate again, or give --accept-calibration"
-        )
+    age, fault = (today - found.day).days, ""
+    if found.head_id != head_id:
+        fault = f"was measured on head {found.head_id!r}, this is {head_id!r}; calibrate this head"
+    elif not 0 <= age <= request.calibration_days:
+        fault = f"is of {found.day}, {age} days ago (at most {request.calibration_days:g}); calibrate again"
+    if fault and not request.accept_calibration:
+        raise UsageError(f"{request.array_calibration} {fault}, or give --accept-calibration")
     return {"array_calibration_days": str(age)}
 
 
@@ -320,35 +316,31 @@ def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Li
     port = Port(request.head_url, baud=request.head_baud, role="head")
     stack.callback(port.close)
     hello = check_head(port, every=request.every)
-    start = head.encode_command(head.START, every=request.every)
     parser = HeadParser(every=request.every)
     parser.hello = hello
-    stop = head.encode_command(head.STOP)
-    tracker_port = None
+    start, stop = head.encode_command(head.START, every=request.every), head.encode_command(head.STOP)
+    devices: list[tuple[Port, Parser, bytes, bytes, float]] = [(port, parser, start, stop, SILENT_S)]
+    follower = Follower()
     if request.tracker_url:
         driver = TRACKERS[request.tracker_protocol]
-        tracker_port = open_tracker(
+        port = open_tracker(
             request.tracker_protocol, request.tracker_url, baud=request.tracker_baud, roms=request.tracker_rom
         )
-        stack.callback(tracker_port.close)
-        answer = driver.check(tracker_port, tool=request.tool, reference=request.reference)
-        for words in (f"no pose yet of {answer.unseen}" if answer.unseen else "", answer.remark):
+        stack.callback(port.close)
+        answer = driver.check(port, tool=request.tool, reference=request.reference)
+        for words in (f"no pose yet of {answer.unseen}" if answer.unseen else "", answer.read.remark):
             if words:
-                click.echo(f"{tracker_port.name}: {words}", err=True)
-    head_stream = read_in_process(port)
-    stack.callback(head_stream.close)
-    line = Line("head", port, head_stream, parser, start, stop)
-    if tracker_port is None:
-        head_stream.wait_until_ready()
-        return hello, (line, None), Follower()
-    tracker_stream = read_in_process(tracker_port)
-    stack.callback(tracker_stream.close)
-    for stream in (head_stream, tracker_stream):
-        stream.wait_until_ready()
-    tracker = Line(
-        "tracker", tracker_port, tracker_stream, answer.parser(), driver.start, driver.stop, silent_s=driver.silent_s
-    )
-    return hello, (line, tracker), Follower(answer.tool, answer.reference, inverse=request.invert_rotation)
+                click.echo(f"{port.name}: {words}", err=True)
+        devices.append((port, answer.parser(), driver.start, driver.stop, driver.silent_s))
+        follower = Follower(answer.tool, answer.reference, inverse=request.invert_rotation)
+    lines = []
+    for port, reads, start, stop, silent_s in devices:
+        stream = read_in_process(port)
+        stack.callback(stream.close)
+        lines.append(Line(port.role, port, stream, reads, start, stop, silent_s))
+    for line in lines:
+        line.stream.wait_until_ready()
+    return hello, (lines[0], lines[1] if len(lines) > 1 else None), follower
 
 
 def _check_fit(hello: HelloReading, head: HeadGeometry, request: Request) -> None:

@@ -280,9 +280,8 @@ def crc16(data: bytes) -> int:
 class EmulatedNdi(Device):
     """NDI tracker that answers with the poses of the present time, counted from TSTART; it never sends unasked.
 
-    Of the faults it has those that are a tracker's. A `wireless` tool has to be described by the host first. `clock`
-    gives seconds from anywhere; `elapsed` the seconds of the scan that other devices play too, None while it waits: by
-    default the scan begins with TSTART.
+    Of the faults it has those that are a tracker's. A `wireless` tool has to be described by the host first. `elapsed`
+    gives the seconds of the scan that other devices play too, None while it waits: by default it begins with TSTART.
     """
 
     def __init__(
@@ -291,13 +290,12 @@ class EmulatedNdi(Device):
         *,
         faults: Faults | None = None,
         wireless: bool = False,
-        clock: Callable[[], float] = time.monotonic,
         elapsed: Callable[[], float | None] | None = None,
     ) -> None:
         self.times_s = poses.time_s
         self._elapsed = elapsed
         self.described = b""
-        self._clock, faults = clock, faults or Faults()
+        faults = faults or Faults()
         self._tools = PlayedTools(poses, faults, names=("", ""))
         self._handles = (HANDLE + 1, HANDLE) if faults.breathe_mm else (HANDLE,)
         self._asked = 0
@@ -330,7 +328,7 @@ class EmulatedNdi(Device):
             case "INIT" | "COMM" | "TSTOP":
                 self._begun = None if name != "COMM" else self._begun
             case "TSTART":
-                self._begun = self._clock()
+                self._begun = time.monotonic()
             case "VER":
                 return "Emulated NDI tracker\nfor tests"
             case "PHSR":
@@ -356,7 +354,7 @@ class EmulatedNdi(Device):
     def _poses_now(self) -> bytes:
         if self._begun is None or self._port != "enabled":
             return _text(f"ERROR{_NOT_NOW:02X}")
-        elapsed = self._clock() - self._begun if self._elapsed is None else self._elapsed() or 0.0
+        elapsed = time.monotonic() - self._begun if self._elapsed is None else self._elapsed() or 0.0
         index = int(np.searchsorted(self.times_s - self.times_s[0], elapsed, side="right")) - 1
         put_away = elapsed > self.times_s[-1] - self.times_s[0] + 0.1
         frame = index + 1 + (round(1000 * elapsed) if put_away else 0)

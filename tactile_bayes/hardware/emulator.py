@@ -10,7 +10,6 @@ import socket
 import termios
 import time
 import tty
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -161,13 +160,13 @@ class Served:
 class Stage:
     """Clock of a scan that devices play together; `speed` is seconds of the scan in a second."""
 
-    def __init__(self, *, speed: float = 1.0, clock: Callable[[], float] = time.monotonic) -> None:
-        self._speed, self._clock = speed, clock
+    def __init__(self, *, speed: float = 1.0) -> None:
+        self.speed = speed
         self._begun: tuple[int, float | None] = (0, None)  # one value: devices look from threads of their own
 
     def begin(self) -> None:
         """Start playing from the beginning."""
-        self._begun = (self._begun[0] + 1, self._clock())
+        self._begun = (self._begun[0] + 1, time.monotonic())
 
     def end(self) -> None:
         """Return to the beginning and wait."""
@@ -176,11 +175,7 @@ class Stage:
     def now(self) -> tuple[int, float | None]:
         """Number of starts, and time of the scan in s since the last; None while waiting."""
         number, begun = self._begun
-        return number, None if begun is None else (self._clock() - begun) * self._speed
-
-    def wait_s(self, scan_s: float) -> float:
-        """Seconds that a stretch of the scan takes to play."""
-        return scan_s / self._speed
+        return number, None if begun is None else (time.monotonic() - begun) * self.speed
 
 
 class Emulator:
@@ -251,7 +246,7 @@ class Emulator:
         _, elapsed_s = self._stage.now()
         if elapsed_s is None:
             return _HOLD_S
-        return max(0.0, min(self._stage.wait_s(float(times[self._next] - times[0]) - elapsed_s), _IDLE_S))
+        return max(0.0, min((float(times[self._next] - times[0]) - elapsed_s) / self._stage.speed, _IDLE_S))
 
     def _hear(self) -> None:
         was_there = self._link.connected()

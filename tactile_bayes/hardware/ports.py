@@ -16,7 +16,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import serial
 from serial.tools.list_ports import comports
@@ -200,29 +200,19 @@ _CONTROLLERS: Final = {
 _ADAPTERS: Final = {0x0403: "FTDI", 0x10C4: "Silicon Labs", 0x067B: "Prolific", 0x1A86: "WCH"}
 
 
-class FoundPort(NamedTuple):
-    """A port: its URL, the system's description, the device probably on it."""
-
-    url: str
-    description: str
-    guess: str
+def list_ports() -> list[str]:
+    """The system's ports in order, each with its description and a guess from its USB ids; opens none of them."""
+    found = ((port.device, port.description or "", _guess(port.vid, port.product or "")) for port in comports())
+    return [f"{url}  {description}: {guess}" for url, description, guess in sorted(found)]
 
 
-def list_ports() -> list[FoundPort]:
-    """List the system's ports, in order, with a guess from their USB ids; opens none of them."""
-    found = [FoundPort(port.device, port.description or "", guess(port.vid, port.product or "")) for port in comports()]
-    return sorted(found)
-
-
-def guess(vendor: int | None, product: str) -> str:
+def _guess(vendor: int | None, product: str) -> str:
     """Guess the device on a port from its USB vendor and product name."""
     if vendor in _TRACKER_MAKERS:
         return f"tracker ({_TRACKER_MAKERS[vendor]})"
     if vendor in _CONTROLLERS or "head" in product.lower():
         return f"scan head, perhaps ({_CONTROLLERS.get(vendor or 0, product)})"
-    if vendor in _ADAPTERS:
-        return f"tracker on a serial adapter, perhaps ({_ADAPTERS[vendor]})"
-    return "unknown"
+    return f"tracker on a serial adapter, perhaps ({_ADAPTERS[vendor]})" if vendor in _ADAPTERS else "unknown"
 
 
 # --- The recorder's end of a reading process: pipe, bytes with arrival times, losses.

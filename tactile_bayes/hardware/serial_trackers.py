@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import DeviceError, UsageError
@@ -203,22 +203,37 @@ _RESTART_S: Final = 4.0
 _BOOT_S: Final = 12.0
 
 
-class Answer(NamedTuple):
-    """What a tracker answered before a recording."""
+class Answer:
+    """What a tracker answered before a recording, in one form of its records: `parser` makes one of these."""
 
-    parser: Callable[[], Parser]  #: Makes the parser that its records need.
-    hello: HelloReading | None
-    tools: Mapping[str, str]  #: Why a tool has no pose just now, by its name; empty where it has one.
-    remark: str  #: What is to be known of its records.
-    tool: str
-    """`tool`, `reference`: Names of the tools to follow, in full."""
-    reference: str | None
+    def __init__(self, parser: Callable[[], Parser]) -> None:
+        self.parser, self.read = parser, parser()
+        self.hello: HelloReading | None = None
+        self.tools: dict[str, str] = {}
+        """Why a tool has no pose just now, by its name; empty where it has one."""
+        self.tool = ""
+        self.reference: str | None = None
+        """`tool`, `reference`: Names of the tools to follow, in full."""
+
+    @property
+    def came(self) -> bool:
+        """True when a record came."""
+        return bool(self.tools or self.hello)
 
     @property
     def unseen(self) -> str:
         """The tools followed that are not seen just now, in words; empty where all are."""
         followed = [name for name in (self.tool, self.reference) if name is not None and self.tools.get(name)]
         return ", ".join(f"{name} ({self.tools[name]})" for name in followed)
+
+    def feed(self, data: bytes) -> None:
+        """Parse `data`."""
+        for reading in self.read.feed(data):
+            if isinstance(reading, HelloReading):
+                self.hello = reading
+            elif isinstance(reading, PoseReading | MissingReading) and len(self.tools) < _MOST_TOOLS:
+                why = reading.why if isinstance(reading, MissingReading) else ""
+                self.tools[reading.tool] = self.tools.get(reading.tool, why) and why
 
 
 class TrackerDriver(Record):
@@ -245,11 +260,11 @@ class TrackerDriver(Record):
         which none was chosen are a `UsageError`.
         """
         before = self._prepare(port, several=bool(tool or reference))
-        best, came = self._listen(port, tool, reference)
-        if not best.answered or (best.tools and set(best.tools.values()) == {NO_ROTATION}):
-            raise DeviceError(f"{port.name}: {self._unfit(best.parser, before, came, rate=port.has_line_rate)}")
-        followed = _chosen(best.tools, tool, reference, port)
-        return Answer(best.maker, best.hello, best.tools, best.parser.remark, *followed)
+        answer, came = self._listen(port, tool, reference)
+        if not answer.came or (answer.tools and set(answer.tools.values()) == {NO_ROTATION}):
+            raise DeviceError(f"{port.name}: {self._unfit(answer.read, before, came, rate=port.has_line_rate)}")
+        answer.tool, answer.reference = _chosen(answer.tools, tool, reference, port)
+        return answer
 
     def _prepare(self, port: Port, *, several: bool) -> bytes:
         """Set the tracker up; returns what came before it was asked for records."""
@@ -262,24 +277,28 @@ class TrackerDriver(Record):
             time.sleep(_BETWEEN_COMMANDS_S)
         return came + port.drain() if self.configure else came
 
-    def _listen(self, port: Port, *wanted: str | None) -> tuple[_Try, bytes]:
+    def _listen(self, port: Port, *wanted: str | None) -> tuple[Answer, bytes]:
         """Ask for records and read them in the form that fits best, for a while after the first of the tools wanted."""
         port.write(self.single)
-        makers = [self.parser, *([self.other_parser] if self.other_parser else [])]
-        tries, came, heard, begun = [_Try(maker) for maker in makers], b"", 0.0, time.monotonic()
+        tries = [Answer(parser) for parser in (self.parser, self.other_parser) if parser is not None]
+        came, heard, begun = b"", 0.0, time.monotonic()
         late = self.late
         while (now := time.monotonic()) < begun + ANSWER_S:
             if late and not heard and now > begun + ANSWER_S / 3:
                 port.write(late)
                 late = b""
-            if heard and now - heard > _LISTEN_S and all(map(tries[0].has, wanted)):
+            if (
+                heard
+                and now - heard > _LISTEN_S
+                and all(name is None or _called(tries[0].tools, name) for name in wanted)
+            ):
                 break
             data = port.read_some(_LISTEN_S / 2)
             came += data[: _MOST_KEPT - len(came)]
             for one in tries:
                 one.feed(data)
-            tries.sort(key=lambda one: (not one.answered, one.parser.garbage_bytes))
-            heard = heard or (time.monotonic() if tries[0].answered else 0.0)
+            tries.sort(key=lambda one: (not one.came, one.read.garbage_bytes))
+            heard = heard or (time.monotonic() if tries[0].came else 0.0)
         return tries[0], came
 
     def _unfit(self, parser: Parser, before: bytes, came: bytes, *, rate: bool) -> str:
@@ -295,33 +314,6 @@ class TrackerDriver(Record):
             if sum(isinstance(one, PoseReading | HelloReading) for one in driver.parser().feed(before + came)) > 1:
                 return f"{what}: these are records of {driver.title}; give --tracker-protocol {name}"
         return f"{what}; give another --tracker-protocol{', or its line rate' if rate else ''}"
-
-
-class _Try:
-    """One form of a protocol's records, tried on what comes."""
-
-    def __init__(self, maker: Callable[[], Parser]) -> None:
-        self.maker, self.parser = maker, maker()
-        self.hello: HelloReading | None = None
-        self.tools: dict[str, str] = {}
-
-    @property
-    def answered(self) -> bool:
-        """True when a record came."""
-        return bool(self.tools or self.hello)
-
-    def has(self, name: str | None) -> bool:
-        """True when a tool has come, or none is asked for."""
-        return name is None or bool(_called(self.tools, name))
-
-    def feed(self, data: bytes) -> None:
-        """Parse `data`."""
-        for reading in self.parser.feed(data):
-            if isinstance(reading, HelloReading):
-                self.hello = reading
-            elif isinstance(reading, PoseReading | MissingReading) and len(self.tools) < _MOST_TOOLS:
-                why = reading.why if isinstance(reading, MissingReading) else ""
-                self.tools[reading.tool] = self.tools.get(reading.tool, why) and why
 
 
 def _called(tools: Iterable[str], name: str) -> list[str]:
