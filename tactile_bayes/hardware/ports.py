@@ -202,11 +202,11 @@ _ADAPTERS: Final = {0x0403: "FTDI", 0x10C4: "Silicon Labs", 0x067B: "Prolific", 
 
 def list_ports() -> list[str]:
     """The system's ports in order, each with its description and a guess from its USB ids; opens none of them."""
-    found = ((port.device, port.description or "", _guess(port.vid, port.product or "")) for port in comports())
+    found = ((port.device, port.description or "", guess(port.vid, port.product or "")) for port in comports())
     return [f"{url}  {description}: {guess}" for url, description, guess in sorted(found)]
 
 
-def _guess(vendor: int | None, product: str) -> str:
+def guess(vendor: int | None, product: str) -> str:
     """Guess the device on a port from its USB vendor and product name."""
     if vendor in _TRACKER_MAKERS:
         return f"tracker ({_TRACKER_MAKERS[vendor]})"
