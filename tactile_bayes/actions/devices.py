@@ -59,8 +59,7 @@ def emulate_action(
         _serve(emulators, once=once)
     finally:
         for role, emulator in zip(roles, emulators, strict=True):
-            served = emulator.served
-            words = f"{served.sent} records sent, {served.dropped} dropped, {served.faulty} spoilt on request"
+            words = f"{emulator.sent} records sent, {emulator.dropped} dropped, {emulator.faulty} spoilt on request"
             click.echo(f"{role}: {words}" if kind == "both" else words, err=True)
 
 

@@ -37,7 +37,7 @@ from tactile_bayes.mapping.places import Orientation, orientation_of
 from tactile_bayes.posterior.bump import candidate_centres
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.presets import FIELD_COSINES, INTERVAL, RESEARCH_USE, VIRIDIS
+from tactile_bayes.presets import FIELD_COSINES, INTERVAL, PRESSURE_WINDOW_KPA, RESEARCH_USE, VIRIDIS
 from tactile_bayes.scans import ElementCalibration, HeadGeometry
 from tactile_bayes.shell import has_styles
 
@@ -318,12 +318,11 @@ def live_line(state: LiveState) -> str:
 
 
 def _pressure(state: LiveState, columns: int, *, colour: bool) -> str:
-    low, high = state.window_kpa
     words = f" {state.pressure_words:>8}  {_SAID[state.tone]}"
     width = max(10, min(40, columns - len(words) - 2))
     level = 0.0 if not np.isfinite(state.pressure_kpa) else state.pressure_kpa
     cells = ["#" if (i + 0.5) * _FULL_BAR_KPA / width <= level else "-" for i in range(width)]
-    for limit in (low, high):
+    for limit in PRESSURE_WINDOW_KPA:
         cells[min(width - 1, int(limit / _FULL_BAR_KPA * width))] = "|"
     text = f"[{''.join(cells)}]{words}"[:columns]
     return f"\x1b[{_TINT[state.tone]}m{text}\x1b[0m" if colour else text

@@ -201,7 +201,7 @@ class Keys:
     def _press(self, key: str) -> None:
         names = {"n": "sternal_notch", "x": "xiphoid", "p": "nipple"}
         if key in names:
-            self._recorder.touch(LandmarkTouch(names[key], scanhead_from_tracker=self._lever))
+            self._recorder.touch = LandmarkTouch(names[key], scanhead_from_tracker=self._lever)
         elif key == " " and self.waiting:
             self.waiting = False
             self._recorder.start()
@@ -316,8 +316,7 @@ def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Li
     port = Port(request.head_url, baud=request.head_baud, role="head")
     stack.callback(port.close)
     hello = check_head(port, every=request.every)
-    parser = HeadParser(every=request.every)
-    parser.hello = hello
+    parser = HeadParser(hello, every=request.every)
     start, stop = head.encode_command(head.START, every=request.every), head.encode_command(head.STOP)
     devices: list[tuple[Port, Parser, bytes, bytes, float]] = [(port, parser, start, stop, SILENT_S)]
     follower = Follower()

@@ -101,17 +101,11 @@ class ScanWriter:
 
     def _schema(self, kind: Any) -> int:
         data = build_file_descriptor_set(kind).SerializeToString(deterministic=True)
-        number: int = self._writer.register_schema(name=kind.DESCRIPTOR.full_name, encoding="protobuf", data=data)
-        return number
+        return int(self._writer.register_schema(name=kind.DESCRIPTOR.full_name, encoding="protobuf", data=data))
 
     def _channel(self, topic: str, kind: Any, **metadata: str) -> int:
-        number: int = self._writer.register_channel(
-            topic=topic,
-            message_encoding="protobuf",
-            schema_id=self._schema_of[kind],
-            metadata={"length_unit": "mm", **metadata},
-        )
-        return number
+        described, schema = {"length_unit": "mm", **metadata}, self._schema_of[kind]
+        return int(self._writer.register_channel(topic, "protobuf", schema, described))
 
     def add_frame(self, counts: scans.CountArray, *, device_ns: int, host_ns: int) -> None:
         """Add one (rows, columns) frame of raw counts."""

@@ -341,12 +341,8 @@ class EmulatedNdi(Device):
             case "PVWR":
                 self.described += bytes.fromhex(rest[6:])
                 self._port = "plugged in"
-            case "PINIT":
-                self._port = "initialised"
-            case "PENA":
-                self._port = "enabled"
-            case "PHF":
-                self._port = "none"
+            case "PINIT" | "PENA" | "PHF":
+                self._port = {"PINIT": "initialised", "PENA": "enabled", "PHF": "none"}[name]
             case _:
                 return None
         return "OKAY"

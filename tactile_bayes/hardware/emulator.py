@@ -10,7 +10,6 @@ import socket
 import termios
 import time
 import tty
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -148,15 +147,6 @@ class TcpLink:
 Link = PtyLink | TcpLink
 
 
-@dataclass(slots=True)
-class Served:
-    """Numbers of records sent, dropped and changed by faults."""
-
-    sent: int = 0
-    dropped: int = 0
-    faulty: int = 0
-
-
 class Stage:
     """Clock of a scan that devices play together; `speed` is seconds of the scan in a second."""
 
@@ -202,10 +192,11 @@ class Emulator:
         self._starts = device.starts
         self._round, self._next, self._finished_at = 0, 0, 0.0
         self._held_at, self._held = time.monotonic(), False
-        self.served = Served()
+        self.sent = self.dropped = self.faulty = 0
+        """Number of records sent, dropped and changed by faults since the last START."""
         self.unplugged = False
 
-    def run(self, *, once: bool = False) -> Served:
+    def run(self, *, once: bool = False) -> None:
         """Serve until the link breaks, or, with `once`, until a scan has been sent and read."""
         while not self.unplugged:
             self._step()
@@ -214,7 +205,6 @@ class Emulator:
                 if self._device.said_end or self._device.stopped or waited:
                     self._link.finish(LINGER_S)
                     self.unplugged = True
-        return self.served
 
     def _step(self) -> None:
         """Wait for the next event and handle it."""
@@ -226,7 +216,8 @@ class Emulator:
         number, elapsed_s = self._stage.now()
         if self._device.streaming and self._link.connected():
             if number != self._round and elapsed_s is not None:
-                self._round, self._next, self._finished_at, self.served = number, 0, 0.0, Served()
+                self._round, self._next, self._finished_at = number, 0, 0.0
+                self.sent = self.dropped = self.faulty = 0
             if elapsed_s is not None:
                 self._send_due(elapsed_s)
             elif not self._leads and time.monotonic() - self._held_at > (_HOLD_S if self._held else _SETTLE_S):
@@ -281,16 +272,16 @@ class Emulator:
             self._next += 1
             self._pass_on()  # at once: when this process was late, many are due and must not meet in the buffer
         if self._next >= len(times):
-            self._waiting += self._device.end(self.served.sent, self.served.dropped)
+            self._waiting += self._device.end(self.sent, self.dropped)
             self._finished_at = time.monotonic()
 
     def _send(self, record: bytes, moment_s: float) -> None:
         if not record:
             return
         if self._faults.stalls(moment_s) or len(self._waiting) + len(record) > BUFFER_BYTES:
-            self.served.dropped += 1
+            self.dropped += 1
             return
         disturbed = self._faults.disturb(record, self._rng)
-        self.served.faulty += disturbed != record
-        self.served.sent += bool(disturbed)
+        self.faulty += disturbed != record
+        self.sent += bool(disturbed)
         self._waiting += disturbed

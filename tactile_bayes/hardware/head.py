@@ -181,9 +181,9 @@ def encode_command(kind: int, *, every: int = 1) -> bytes:
 class HeadParser(readings.Parser):
     """Parser of a device in the open framing, head or tracker."""
 
-    def __init__(self, *, every: int = 1) -> None:
+    def __init__(self, hello: readings.HelloReading | None = None, *, every: int = 1) -> None:
         self.packets = PacketParser()
-        self.hello: readings.HelloReading | None = None
+        self.hello = hello
         self._every = every
         self._expected: int | None = None
 

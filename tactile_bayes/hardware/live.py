@@ -160,7 +160,6 @@ class LiveState(Record, eq=False):
     tactile_map: TactileMap | None = None
     """So far, with the patient's axes once both landmarks are known; None before there is one."""
     pressure_kpa: float = float("nan")  #: Mean of the last frame; NaN before the first.
-    window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA  #: Where frames count.
     frames: int = 0
     frames_lost: int = 0
     poses: int = 0
@@ -186,7 +185,7 @@ class LiveState(Record, eq=False):
             return "no size yet: no frames have come"
         if not self.poses:
             return "no size yet: the tracker has sent no pose"
-        low, high = self.window_kpa
+        low, high = PRESSURE_WINDOW_KPA
         return f"no size yet: no frame with a pose was pressed at {low:g} to {high:g} kPa"
 
     @property
@@ -223,7 +222,7 @@ class LiveState(Record, eq=False):
         """Tone for the pressure: ``low``, ``in``, ``high``, or ``off`` before the first frame."""
         if not np.isfinite(self.pressure_kpa):
             return "off"
-        low, high = self.window_kpa
+        low, high = PRESSURE_WINDOW_KPA
         return "low" if self.pressure_kpa < low else "high" if self.pressure_kpa > high else "in"
 
 
@@ -233,7 +232,6 @@ class LiveMap:
 
     head: HeadGeometry
     calibration: ElementCalibration
-    window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA
     _frames: list[SeenFrame] = field(default_factory=list)
     _poses: list[SeenPose] = field(default_factory=list)
     _report: dict[str, Any] = field(default_factory=dict)
@@ -293,9 +291,7 @@ class LiveMap:
             self._refit()
 
     def _map_on(self, plane: Plane) -> MapAccumulator:
-        return MapAccumulator(
-            self.head, self.calibration, plane_from_base=plane.plane_from_base, pressure_window_kpa=self.window_kpa
-        )
+        return MapAccumulator(self.head, self.calibration, plane_from_base=plane.plane_from_base)
 
     def _refit(self) -> None:
         """Move the map to the best-fit plane of the frames used so far, from time to time."""
@@ -331,7 +327,6 @@ class LiveMap:
         return LiveState(
             tactile_map=self._snapshot(),
             pressure_kpa=self._pressure_kpa,
-            window_kpa=self.window_kpa,
             **self._report,
             used_share=figures["frames_used"] / max(1.0, figures["frames_total"]),
             latency_ms=(time.monotonic_ns() - self._host_ns) / 1e6 if self._host_ns else 0.0,

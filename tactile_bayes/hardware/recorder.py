@@ -235,7 +235,8 @@ class Recorder:
         self._observer = observer
         self._now_ns = clock_ns
         self._zero_ns = clock_ns()
-        self._touch: LandmarkTouch | None = None
+        self.touch: LandmarkTouch | None = None
+        """The landmark for which the next poses are averaged."""
         self._last_pose: readings.PoseReading | None = None
         self._pose_ns = -1
         self._drain_until_ns: int | None = None
@@ -253,10 +254,6 @@ class Recorder:
         if self._tracker is not None:
             self._tracker.port.write(self._tracker.start)
 
-    def touch(self, landmark: LandmarkTouch) -> None:
-        """Average the next poses for a landmark."""
-        self._touch = landmark
-
     def stop(self, why: str) -> None:
         """End the recording once data on their way have arrived."""
         if not self.report.ended_by:
@@ -264,7 +261,7 @@ class Recorder:
             self._drain_until_ns = self._now_ns() + round(DRAIN_S * 1e9)
 
     def run(self, each_tick: Callable[[], None] = lambda: None) -> Report:
-        """Record until the end; `each_tick` is called many times a second and may call `stop`, `start` and `touch`.
+        """Record until the end; `each_tick`, called many times a second, may call `stop` and `start` and set `touch`.
 
         Whatever happens, the devices are told to stop and the account is complete.
         """
@@ -406,10 +403,10 @@ class Recorder:
         return (*reading.flags, "repeated")
 
     def _touched(self, reading: readings.PoseReading, host_ns: int) -> None:
-        touch = self._touch
+        touch = self.touch
         if touch is None or not touch.add(reading):
             return
-        self._touch = None
+        self.touch = None
         self.report.landmarks.append(str(touch))
         device_ns = max(0, self._pose_ns)
         self._sink.add_landmark(touch.name, touch.position_mm, device_ns=device_ns, host_ns=max(0, host_ns))

@@ -27,6 +27,7 @@ import numpy as np
 from tactile_bayes.errors import UsageError
 from tactile_bayes.hardware.live import LiveState, colour_limits, grey_levels
 from tactile_bayes.mapping.places import orientation_of
+from tactile_bayes.presets import PRESSURE_WINDOW_KPA
 
 _PAGE: Final = Path(__file__).with_name("live_page.html")
 # How long a page may take to ask, and to say goodbye: the view's process waits for all of them.
@@ -213,7 +214,7 @@ def document(state: LiveState) -> dict[str, Any]:
     return {
         "tone": state.tone,
         "pressure_kpa": round(state.pressure_kpa, 2) if known else None,
-        "window_kpa": list(state.window_kpa),
+        "window_kpa": list(PRESSURE_WINDOW_KPA),
         "figures": state.account_words,
         "size": state.size_words,
         "map": _map_document(state),

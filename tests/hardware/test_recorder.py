@@ -244,8 +244,8 @@ def test_a_landmark_is_where_the_apex_touches_however_the_handle_is_held():
     assert enough
     assert np.abs(result.position_mm - point).max() < 0.15
     assert 0.2 < result.spread_mm < 0.5
-    assert result.steady
     assert "spread 0." in str(result)
+    assert result.steady
 
 
 def test_a_landmark_that_slipped_says_so_and_doubtful_poses_do_not_count():
