@@ -35,7 +35,7 @@ from tactile_bayes.hardware import head
 from tactile_bayes.hardware.head import HeadParser
 from tactile_bayes.hardware.ports import SILENT_S, Port, read_in_process
 from tactile_bayes.hardware.readings import Follower, HelloReading, Parser
-from tactile_bayes.hardware.recorder import LandmarkTouch, Line, Recorder, Report
+from tactile_bayes.hardware.recorder import LandmarkTouch, Line, Observer, Recorder, Report
 from tactile_bayes.hardware.serial_trackers import TRACKERS, check_head, open_tracker
 from tactile_bayes.options import RecordOptions
 from tactile_bayes.presets import PRESSURE_RANGE_KPA, RESEARCH_USE
@@ -78,6 +78,7 @@ class Request(RecordOptions, kw_only=True):
 
 
 _NOMINAL_FULL_SCALE = 4095
+_PATHS = ("like", "head_geometry", "array_calibration", "landmarks")
 
 
 def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration, Landmarks | None]:
@@ -266,15 +267,14 @@ def make_recording(request: Request) -> tuple[Report, bool]:
         age = calibration_age(request, head_id=hello.device_id, today=date.today())
         session = request.session(hello, follower, facts) | age
         check_session(session, path=request.output)
-        observer = None
+        observer = Observer()
         if request.live or request.serve:
             view = live_view(
                 head, calibration, terminal=request.live, serve=request.serve, size_calibration=request.size_calibration
             )
             observer = stack.enter_context(view)
         stream = stack.enter_context(create_exclusive(request.output, force=request.force))
-        names = ("like", "head_geometry", "array_calibration", "landmarks")
-        inputs = {name: path for name in names if (path := getattr(request, name)) is not None}
+        inputs = {name: path for name in _PATHS if (path := getattr(request, name)) is not None}
         provenance = Provenance("record", request.settings(hello), hash_inputs(**inputs))
         try:
             writer = RecordingWriter(
@@ -297,8 +297,7 @@ def make_recording(request: Request) -> tuple[Report, bool]:
         )
         for name, position_mm in {} if landmarks is None else landmarks.points().items():
             writer.add_landmark(name, position_mm, device_ns=0, host_ns=0)
-            if observer is not None:
-                observer.landmark(name, position_mm)
+            observer.landmark(name, position_mm)
         signals = stack.enter_context(noted_signals())
         try:
             report = _run(recorder, signals, head, request)
@@ -372,7 +371,6 @@ def _run(recorder: Recorder, signals: list[str], head: HeadGeometry, request: Re
 
 # --- From scripts: the same recorder, started at once.
 
-_PATHS = ("like", "head_geometry", "array_calibration", "landmarks")
 _NAMED = ("output", "head_url", "duration_s", "tracker_url", "session_file")  #: Keywords of their own.
 
 

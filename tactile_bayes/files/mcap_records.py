@@ -142,8 +142,7 @@ class Messages:
 class McapRecords:
     """Content of a file, as far as it could be read."""
 
-    keep: Collection[str] | None = None
-    """Topics whose messages are kept; of others only the times are. None keeps all."""
+    keep: Collection[str]  #: Topics whose messages are kept; of others only the times are.
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     schemas: dict[int, str] = field(default_factory=dict)
@@ -187,7 +186,7 @@ class McapRecords:
             case number, published_ns, logged_ns, start, end:
                 if number not in self.by_channel:  # bodies of an unknown channel are kept until it is defined
                     channel = self.channels.get(number)
-                    keep = self.keep is None or channel is None or channel.topic in self.keep
+                    keep = channel is None or channel.topic in self.keep
                     self.by_channel[number] = Messages(keep=keep)
                 self.by_channel[number].add(published_ns, logged_ns, data[start:end])
             case Metadata():
@@ -200,8 +199,8 @@ class McapRecords:
                 self.channels[record.id] = record
 
 
-def read_records(path: Path, *, keep: Collection[str] | None = None) -> McapRecords:
-    """Read a file from front to back, with or without its index; of topics not in `keep` (None: all) only the times."""
+def read_records(path: Path, *, keep: Collection[str]) -> McapRecords:
+    """Read a file from front to back, with or without its index; of topics not in `keep` only the times."""
     records = McapRecords(keep=keep)
     with open_input(path) as stream, in_file(path), readable(path):
         _check_magic(stream, path)

@@ -7,6 +7,7 @@ import re
 import struct
 import time
 from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -47,7 +48,7 @@ class Faults(FaultOptions):
 
     def stalls(self, time_s: float) -> bool:
         """True when the device sends nothing at a time of the scan."""
-        return self.stall is not None and self.stall[0] <= time_s < self.stall[0] + self.stall[1]
+        return _within(self.stall, time_s)
 
     def disturb(self, record: bytes, rng: np.random.Generator) -> bytes:
         """Apply the faults to a record: unchanged, one bit changed, or dropped."""
@@ -61,6 +62,11 @@ class Faults(FaultOptions):
         return bytes(changed)
 
 
+def _within(span: tuple[float, float] | None, time_s: float) -> bool:
+    """True at the times of a fault, given by its begin and its length."""
+    return span is not None and span[0] <= time_s < span[0] + span[1]
+
+
 class Device:
     """An emulated device: it answers commands and sends records at their times; most wait for a command."""
 
@@ -68,7 +74,8 @@ class Device:
     starts = 0  #: Number of START commands so far; each begins the scan anew.
     streaming = False  #: True when the device sends, or will when the scan begins.
     stopped = False  #: True when the host's last command about sending was STOP.
-    said_end = False  #: True when the device has told the host that everything was sent, as some protocols do.
+    said_end = False  #: True when the device has told the host that everything was sent.
+    open_framing = False  #: True for a device of the open framing, which has a last message.
 
     def start(self) -> None:
         """Begin to send."""
@@ -96,18 +103,19 @@ class Device:
             yield packet
 
     def record(self, index: int) -> bytes:
-        """Bytes of one record; empty for a record left out, and where records are sent on request only."""
-        del index
-        return b""
+        """Bytes of one record; empty for a record left out."""
+        raise NotImplementedError
 
     def end(self, sent: int, dropped: int) -> bytes:
         """Last message, after which the device no longer streams; empty where there is none."""
-        del sent, dropped
-        return b""
+        self.streaming, self.said_end = False, self.open_framing
+        return head.encode_end(sent, dropped) if self.open_framing else b""
 
 
 class EmulatedHead(Device):
     """An emulated head in the open framing that sends a scan's frames at their own times."""
+
+    open_framing = True
 
     def __init__(self, scan: Scan) -> None:
         self.times_s = scan.frames.time_s
@@ -125,7 +133,7 @@ class EmulatedHead(Device):
 
     def hear(self, data: bytes) -> bytes:
         answer = b""
-        for packet in self._obeyed(self._commands.feed(data)):
+        for packet in self._obeyed(self._commands.packets(data)):
             if packet.kind == head.START:
                 self._every = max(1, packet.payload[0] if packet.payload else 1)
             if packet.kind in (head.ASK, head.START):
@@ -138,10 +146,6 @@ class EmulatedHead(Device):
         device_us = round(self.times_s[index] * 1e6)
         return head.encode_frame(self._scan.frames.counts[index], sequence=index, device_us=device_us)
 
-    def end(self, sent: int, dropped: int) -> bytes:
-        self.streaming, self.said_end = False, True
-        return head.encode_end(sent, dropped)
-
 
 _BREATH_S: Final = 4.0
 # Where the second tool is, turned against the tracker so that its frame is another one.
@@ -149,33 +153,26 @@ _REFERENCE_MM: Final = (250.0, -40.0, 30.0)
 _REFERENCE_TURN: Final = (0.8, 0.0, 0.6, 0.0)
 
 
-class PlayedTools:
-    """What a tracker knows while it plays a scan's poses, with the faults that are a tracker's.
+def played_tools(poses: TrackerPoses, faults: Faults, index: int, *, names: tuple[str, str]) -> list[ToolReading]:
+    """What a tracker knows at the n-th time of a scan, of a second tool first, with the faults that are a tracker's.
 
-    `names` are those of the tool and of a second one, which is fixed to the body and there where that breathes.
+    `names` are those of the tool and of the second one, which is fixed to the body and there where that breathes.
     """
-
-    def __init__(self, poses: TrackerPoses, faults: Faults, *, names: tuple[str, str]) -> None:
-        self._poses, self._faults, self._names = poses, faults, names
-
-    def readings(self, index: int) -> list[ToolReading]:
-        """Readings at the n-th time, of the second tool first."""
-        measured = index - index % max(1, self._faults.hold)  # the values of the latest measurement, at its own time
-        x, y, z = self._poses.position_mm[measured].tolist()
-        w, i, j, k = self._poses.quaternion_wxyz[measured].tolist()
-        seconds, rest = divmod(float(self._poses.time_s[index]), 1.0)
-        pose = PoseReading((x, y, z), (w, i, j, k), int(seconds) * _NS + round(rest * _NS))
-        hidden, breath_mm = self._faults.hide, self._faults.breathe_mm
-        time_s = float(self._poses.time_s[index] - self._poses.time_s[0])
-        bases = []
-        if breath_mm:
-            x, y, z = _REFERENCE_MM
-            y += breath_mm / 2 * math.sin(2 * math.pi * time_s / _BREATH_S)
-            bases = [PoseReading((x, y, z), _REFERENCE_TURN, pose.device_ns, tool=self._names[1])]
-            pose = pose_from_relative(pose, bases[0])._replace(tool=self._names[0])
-        if hidden is not None and hidden[0] <= time_s < hidden[0] + hidden[1]:
-            return [*bases, MissingReading("out of sight", pose.tool)]
-        return [*bases, pose]
+    measured = index - index % max(1, faults.hold)  # the values of the latest measurement, at its own time
+    x, y, z = poses.position_mm[measured].tolist()
+    w, i, j, k = poses.quaternion_wxyz[measured].tolist()
+    seconds, rest = divmod(float(poses.time_s[index]), 1.0)
+    pose = PoseReading((x, y, z), (w, i, j, k), int(seconds) * _NS + round(rest * _NS))
+    time_s = float(poses.time_s[index] - poses.time_s[0])
+    bases = []
+    if faults.breathe_mm:
+        x, y, z = _REFERENCE_MM
+        y += faults.breathe_mm / 2 * math.sin(2 * math.pi * time_s / _BREATH_S)
+        bases = [PoseReading((x, y, z), _REFERENCE_TURN, pose.device_ns, tool=names[1])]
+        pose = pose_from_relative(pose, bases[0])._replace(tool=names[0])
+    if _within(faults.hide, time_s):
+        return [*bases, MissingReading("out of sight", pose.tool)]
+    return [*bases, pose]
 
 
 class EmulatedTracker(Device):
@@ -183,11 +180,11 @@ class EmulatedTracker(Device):
 
     def __init__(self, poses: TrackerPoses, *, protocol: str, faults: Faults | None = None) -> None:
         self.times_s = poses.time_s
-        self._protocol = protocol
+        self._protocol, self.open_framing = protocol, protocol == "open"
         self._commands = PacketParser()
         self._faults = faults or Faults()
         names = ("Probe", "Reference") if protocol in ("open", "igtlink") else ("1", "2")
-        self._tools = PlayedTools(poses, self._faults, names=names)
+        self._tools = partial(played_tools, poses, self._faults, names=names)
 
     def greet(self) -> None:
         """Start sending in OpenIGTLink, whose servers send to whoever connects."""
@@ -196,8 +193,8 @@ class EmulatedTracker(Device):
 
     def hear(self, data: bytes) -> bytes:
         answer = b""
-        if self._protocol == "open":
-            for packet in self._obeyed(self._commands.feed(data)):
+        if self.open_framing:
+            for packet in self._obeyed(self._commands.packets(data)):
                 if packet.kind == head.ASK:
                     answer += head.encode_hello(HelloReading("emulated tracker", 0, 0, 0, 0.0))
                     answer += self.record(0) if self._faults.breathe_mm else b""
@@ -213,12 +210,7 @@ class EmulatedTracker(Device):
         return answer
 
     def record(self, index: int) -> bytes:
-        return b"".join(encoded(self._protocol, one, index) for one in self._tools.readings(index))
-
-    def end(self, sent: int, dropped: int) -> bytes:
-        """Encode an END in the open framing; other protocols have none."""
-        self.streaming, self.said_end = False, self._protocol == "open"
-        return head.encode_end(sent, dropped) if self.said_end else b""
+        return b"".join(encoded(self._protocol, one, index) for one in self._tools(index))
 
 
 PROTOCOLS: Final = ("fastrak", "fastrak-ascii", "liberty", "liberty-ascii", "bird", "open", "igtlink")
@@ -264,6 +256,8 @@ _BAD_CRC, _UNKNOWN, _NOT_NOW = 0x04, 0x01, 0x0C
 _POLYNOMIAL: Final = 0xA001
 _LISTED: Final = {1: "to be freed", 2: "plugged in", 3: "initialised", 4: "enabled"}
 """States of ports that PHSR asks for by numbers; by others it asks for all."""
+_LEADS_TO: Final = {"PVWR": "plugged in", "PINIT": "initialised", "PENA": "enabled", "PHF": "none"}
+"""The state of a tool's port after a command."""
 _LONGEST: Final = 4096
 
 
@@ -280,27 +274,26 @@ def crc16(data: bytes) -> int:
 class EmulatedNdi(Device):
     """NDI tracker that answers with the poses of the present time, counted from TSTART; it never sends unasked.
 
-    Of the faults it has those that are a tracker's. A `wireless` tool has to be described by the host first. `elapsed`
-    gives the seconds of the scan that other devices play too, None while it waits: by default it begins with TSTART.
+    Of the faults it has those that are a tracker's. `elapsed` gives the seconds of the scan
+    that other devices play too, None while it waits: by default it begins with TSTART.
     """
+
+    _port = "plugged in"
 
     def __init__(
         self,
         poses: TrackerPoses,
         *,
         faults: Faults | None = None,
-        wireless: bool = False,
         elapsed: Callable[[], float | None] | None = None,
     ) -> None:
         self.times_s = poses.time_s
         self._elapsed = elapsed
-        self.described = b""
         faults = faults or Faults()
-        self._tools = PlayedTools(poses, faults, names=("", ""))
+        self._tools = partial(played_tools, poses, faults, names=("", ""))
         self._handles = (HANDLE + 1, HANDLE) if faults.breathe_mm else (HANDLE,)
         self._asked = 0
         self._begun: float | None = None
-        self._port = "none" if wireless else "plugged in"
         self._rest = b""
 
     def hear(self, data: bytes) -> bytes:
@@ -338,11 +331,8 @@ class EmulatedNdi(Device):
             case "PHRQ":
                 self._port, self._asked = "asked for", self._asked + 1
                 return f"{HANDLE + self._asked - 1:02X}"
-            case "PVWR":
-                self.described += bytes.fromhex(rest[6:])
-                self._port = "plugged in"
-            case "PINIT" | "PENA" | "PHF":
-                self._port = {"PINIT": "initialised", "PENA": "enabled", "PHF": "none"}[name]
+            case _ if name in _LEADS_TO:
+                self._port = _LEADS_TO[name]
             case _:
                 return None
         return "OKAY"
@@ -355,7 +345,7 @@ class EmulatedNdi(Device):
         put_away = elapsed > self.times_s[-1] - self.times_s[0] + 0.1
         frame = index + 1 + (round(1000 * elapsed) if put_away else 0)
         body = bytes([len(self._handles)])
-        for handle, one in zip(self._handles, self._tools.readings(index), strict=True):
+        for handle, one in zip(self._handles, self._tools(index), strict=True):
             if put_away or isinstance(one, MissingReading):
                 status = _PORT_STATUS | (0 if put_away else _OUT_OF_VOLUME)
                 body += struct.pack("<BBII", handle, _MISSING, status, frame)

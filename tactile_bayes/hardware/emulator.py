@@ -23,7 +23,7 @@ _READ: Final = 4096
 _LOOK_S: Final = 0.01
 _LOOKS: Final = 25
 _IDLE_S: Final = 0.2
-# A follower repeats its first record so often while the scan waits, but not so soon after a START.
+# A follower repeats its first record so often while the scan waits, but not so soon after a START: it may begin now.
 _HOLD_S: Final = 0.01
 _SETTLE_S: Final = 0.5
 # How long `--once` waits for a host to read, and to say STOP to a device that does not tell its end.
@@ -191,7 +191,7 @@ class Emulator:
         self._waiting = bytearray()
         self._starts = device.starts
         self._round, self._next, self._finished_at = 0, 0, 0.0
-        self._held_at, self._held = time.monotonic(), False
+        self._hold_at = time.monotonic() + _SETTLE_S
         self.sent = self.dropped = self.faulty = 0
         """Number of records sent, dropped and changed by faults since the last START."""
         self.unplugged = False
@@ -220,9 +220,8 @@ class Emulator:
                 self.sent = self.dropped = self.faulty = 0
             if elapsed_s is not None:
                 self._send_due(elapsed_s)
-            elif not self._leads and time.monotonic() - self._held_at > (_HOLD_S if self._held else _SETTLE_S):
-                # not right after a START, when the scan is about to begin
-                self._held_at, self._held = time.monotonic(), True
+            elif not self._leads and time.monotonic() > self._hold_at:
+                self._hold_at = time.monotonic() + _HOLD_S
                 self._waiting += self._device.record(0)
         self._pass_on()
 
@@ -250,7 +249,7 @@ class Emulator:
     def _follow_commands(self) -> None:
         """Begin anew at each START, also while streaming; a device that leads starts the others too."""
         if self._device.starts != self._starts:
-            self._starts, self._held_at, self._held = self._device.starts, time.monotonic(), False
+            self._starts, self._hold_at = self._device.starts, time.monotonic() + _SETTLE_S
             if self._leads:
                 self._stage.begin()
         elif self._leads and (self._device.stopped or not self._link.connected()):

@@ -84,32 +84,28 @@ def encode_packet(kind: int, payload: bytes, *, sequence: int = 0, device_us: in
     return b"\0" + cobs_encode(body + zlib.crc32(body).to_bytes(CRC_BYTES, "little")) + b"\0"
 
 
-class PacketParser:
-    """Parser of packets from a stream; skips and counts garbage."""
+class PacketParser(readings.Parser):
+    """Parser of packets from a stream; skips and counts garbage: checksums that fail, senseless codes, noise."""
 
     def __init__(self) -> None:
-        self.damaged_bytes = 0
-        """Between zero bytes, and no packet: a checksum that fails, codes that make no sense, noise."""
-        self.foreign_version: int | None = None
-        """That of the last packet of another version of the framing."""
         self._rest = b""
 
-    def feed(self, data: bytes) -> list[Packet]:
+    def packets(self, data: bytes) -> list[Packet]:
         """Parse `data`; return the packets completed by it."""
         *parts, self._rest = (self._rest + data).split(b"\0")
         if len(self._rest) > _LONGEST:
-            self.damaged_bytes += len(self._rest)
+            self.garbage_bytes += len(self._rest)
             self._rest = b""
         return [packet for part in parts if part and (packet := self._decode(part)) is not None]
 
     def _decode(self, part: bytes) -> Packet | None:
         body = cobs_decode(part) if len(part) <= _LONGEST else None
         if body is None or len(body) < HEADER.size + CRC_BYTES or zlib.crc32(body) != _RESIDUE:
-            self.damaged_bytes += len(part)
+            self.garbage_bytes += len(part)
             return None
         version, kind, sequence, device_us = HEADER.unpack_from(body)
         if version != VERSION:
-            self.foreign_version = version
+            self.fault = f"it sent packets of version {version} of the framing, this program reads {VERSION}"
             return None
         return Packet(kind, sequence, device_us, body[HEADER.size : -CRC_BYTES])
 
@@ -178,21 +174,17 @@ def encode_command(kind: int, *, every: int = 1) -> bytes:
     return encode_packet(kind, payload)
 
 
-class HeadParser(readings.Parser):
+class HeadParser(PacketParser):
     """Parser of a device in the open framing, head or tracker."""
 
     def __init__(self, hello: readings.HelloReading | None = None, *, every: int = 1) -> None:
-        self.packets = PacketParser()
+        super().__init__()
         self.hello = hello
         self._every = every
         self._expected: int | None = None
 
     def feed(self, data: bytes) -> list[readings.Reading]:
-        found = [reading for packet in self.packets.feed(data) if (reading := self._read(packet)) is not None]
-        self.garbage_bytes, version = self.packets.damaged_bytes, self.packets.foreign_version
-        if version is not None:
-            self.fault = f"it sent packets of version {version} of the framing, this program reads {VERSION}"
-        return found
+        return [reading for packet in self.packets(data) if (reading := self._read(packet)) is not None]
 
     def _read(self, packet: Packet) -> readings.Reading | None:
         match packet.kind:
@@ -205,13 +197,13 @@ class HeadParser(readings.Parser):
             case 3 if len(packet.payload) >= _END.size:
                 return readings.EndReading(*_END.unpack_from(packet.payload))
             case _:
-                self._misfit(f"a packet of kind {packet.kind} with {len(packet.payload)} bytes")
+                self.fault = f"it sent a packet of kind {packet.kind} with {len(packet.payload)} bytes"
                 return None
 
     def _frame(self, packet: Packet) -> readings.FrameReading | None:
         shape = (self.hello.rows, self.hello.columns) if self.hello else None
         if shape is None or len(packet.payload) != 2 * shape[0] * shape[1]:
-            self._misfit(f"a FRAME of {len(packet.payload)} bytes" + ("" if shape else " before its HELLO"))
+            self.fault = f"it sent a FRAME of {len(packet.payload)} bytes" + ("" if shape else " before its HELLO")
             return None
         sequence = packet.sequence // self._every
         gap = 0 if self._expected is None else (sequence - self._expected) % 2**32
@@ -219,31 +211,30 @@ class HeadParser(readings.Parser):
         counts = np.frombuffer(packet.payload, dtype="<u2").reshape(shape)
         return readings.FrameReading(counts, packet.device_us * 1000, 0 if restarted else gap, restarted)
 
-    def _misfit(self, what: str) -> None:
-        self.fault = f"it sent {what}"
-
     def _pose(self, packet: Packet) -> readings.ToolReading | None:
         tool, _, why = readings.printable(packet.payload[_POSE.size :]).partition("\0")
         if len(packet.payload) < _POSE.size or max(len(tool), len(why)) > _MAX_ID:
-            self._misfit(f"a POSE of {len(packet.payload)} bytes")
+            self.fault = f"it sent a POSE of {len(packet.payload)} bytes"
             return None
         rest_ns, x, y, z, qw, qx, qy, qz = _POSE.unpack_from(packet.payload)
         if why and math.isnan(x):
             return readings.MissingReading(why, tool)
         if not readings.plausible((x, y, z), (qw, qx, qy, qz)) or rest_ns > 999:
-            self._misfit(f"a POSE that can be none, {x:g} {y:g} {z:g} mm, {qw:g} {qx:g} {qy:g} {qz:g}")
+            self.fault = f"it sent a POSE that can be none, {x:g} {y:g} {z:g} mm, {qw:g} {qx:g} {qy:g} {qz:g}"
             return None
         flags = (why,) if why else ()
         return readings.PoseReading((x, y, z), (qw, qx, qy, qz), packet.device_us * 1000 + rest_ns, flags, tool)
 
     def _hello(self, packet: Packet) -> readings.HelloReading | None:
         if len(packet.payload) < _HELLO.size:
-            self._misfit(f"a HELLO of {len(packet.payload)} bytes")
+            self.fault = f"it sent a HELLO of {len(packet.payload)} bytes"
             return None
         rows, columns, saturation, millihertz = _HELLO.unpack_from(packet.payload)
         name = readings.printable(packet.payload[_HELLO.size :])
         if self.hello is not None and (name, rows, columns) != self.hello[:3]:
-            self._misfit(f"a HELLO of {name!r} with {rows} x {columns} taxels beside that of {self.hello.device_id!r}")
+            self.fault = (
+                f"it sent a HELLO of {name!r} with {rows} x {columns} taxels beside that of {self.hello.device_id!r}"
+            )
             return None
         self.hello = readings.HelloReading(name, rows, columns, saturation, millihertz / 1000)
         return self.hello

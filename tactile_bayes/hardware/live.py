@@ -20,7 +20,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, Plane, apply, patient_from_plane
 from tactile_bayes.hardware.ports import PIPE_BYTES
 from tactile_bayes.hardware.readings import CountArray, PoseReading
-from tactile_bayes.hardware.recorder import Report
+from tactile_bayes.hardware.recorder import Observer, Report
 from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.cells import FramePoses, HeadMoments, distinct_poses, head_moments, poses_at
 from tactile_bayes.mapping.map import TactileMap
@@ -62,7 +62,7 @@ class SeenLandmark(NamedTuple):
 Seen = SeenFrame | SeenPose | SeenLandmark | dict[str, Any]
 
 
-class Feed:
+class Feed(Observer):
     """The recorder's end of the feed, a pipe; it observes the recording."""
 
     def __init__(self, pipe: int) -> None:
@@ -92,13 +92,11 @@ class Feed:
     def _send(self, *told: Any, counts: bytes = b"") -> None:
         text = json.dumps(told).encode()
         message = _SIZES.pack(len(text), len(counts)) + text + counts
-        if len(message) > select.PIPE_BUF:  # could go in by halves
-            self.missed += 1
-            return
-        try:
-            os.write(self._pipe, message)
-        except (BlockingIOError, BrokenPipeError):  # it is full, or the view was closed; the recording goes on
-            self.missed += 1
+        with suppress(BlockingIOError, BrokenPipeError):  # it is full, or the view was closed; the recording goes on
+            if len(message) <= select.PIPE_BUF:  # else it could go in by halves
+                os.write(self._pipe, message)
+                return
+        self.missed += 1
 
     def close(self) -> None:
         """Close the feed; the view ends after reading the rest of the pipe."""

@@ -161,24 +161,20 @@ class Follower:
         if isinstance(reading, PoseReading) and self._inverse:
             reading = reading._replace(quaternion_wxyz=_conjugate(reading.quaternion_wxyz))
         if reading.tool == self.tool:
-            yield from self._followed(reading, host_ns)
+            yield from self._release()
+            if self.reference is None or isinstance(reading, MissingReading):
+                yield reading, host_ns
+                return
+            self._held, base = (reading, host_ns), self._base
+            if base is not None and (self._fresh or base[0].device_ns == reading.device_ns is not None):
+                yield from self._release()
+                self._fresh = False
         elif reading.tool == self.reference:
             self._base = (reading, host_ns) if isinstance(reading, PoseReading) else None
             self._fresh = self._base is not None and self._held is None
             yield from self._release()
         else:
             tally(self.others, reading.tool)
-
-    def _followed(self, reading: ToolReading, host_ns: int) -> Iterator[tuple[ToolReading, int]]:
-        yield from self._release()
-        if self.reference is None or isinstance(reading, MissingReading):
-            yield reading, host_ns
-            return
-        self._held = reading, host_ns
-        base = self._base
-        if base is not None and (self._fresh or base[0].device_ns == reading.device_ns is not None):
-            yield from self._release()
-            self._fresh = False
 
     def _release(self) -> Iterator[tuple[ToolReading, int]]:
         if self._held is None:

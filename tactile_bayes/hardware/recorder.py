@@ -174,8 +174,8 @@ class Sink(Protocol):
         """Store what was added so far, so that it survives the end of this process."""
 
 
-class Observer(Protocol):
-    """Interface of a recording's spectator, which must never wait; it is told the account several times a second."""
+class Observer:
+    """A recording's spectator, which must never wait; it is told the account several times a second. This is nobody."""
 
     def landmark(self, name: str, position_mm: FloatArray) -> None: ...
     def frame(self, counts: readings.CountArray, device_ns: int) -> None: ...
@@ -232,7 +232,7 @@ class Recorder:
         self._rate_hz = rate_hz
         self._frame_span, self._pose_span = Span(), Span()
         self._begun_ns = self._heard_ns = 0
-        self._observer = observer
+        self._observer = observer or Observer()
         self._now_ns = clock_ns
         self._zero_ns = clock_ns()
         self.touch: LandmarkTouch | None = None
@@ -342,8 +342,7 @@ class Recorder:
         report.frames += 1
         report.last_ns, self._heard_ns = device_ns, host_ns
         report.longest_wait_ms = max(report.longest_wait_ms, (self._now_ns() - self._zero_ns - host_ns) / 1e6)
-        if self._observer is not None:
-            self._observer.frame(reading.counts, device_ns)
+        self._observer.frame(reading.counts, device_ns)
 
     def _pose(self, reading: readings.PoseReading, host_ns: int) -> None:
         host_ns -= self._zero_ns
@@ -373,8 +372,7 @@ class Recorder:
         if flags:
             serious = flags != ("repeated",)
             self._note(", ".join(flags), "tracker", device_ns, host_ns, serious=serious)
-        if self._observer is not None:
-            self._observer.pose(reading, device_ns)
+        self._observer.pose(reading, device_ns)
 
     def _missing(self, reading: readings.MissingReading, host_ns: int) -> None:
         """Count a pose that the tracker does not have, once frames come; the log has where a gap begins and ends."""
@@ -410,8 +408,7 @@ class Recorder:
         self.report.landmarks.append(str(touch))
         device_ns = max(0, self._pose_ns)
         self._sink.add_landmark(touch.name, touch.position_mm, device_ns=device_ns, host_ns=max(0, host_ns))
-        if self._observer is not None:
-            self._observer.landmark(touch.name, touch.position_mm)
+        self._observer.landmark(touch.name, touch.position_mm)
         self._note(str(touch), "tracker", device_ns, host_ns, serious=not touch.steady)
 
     def _note(self, text: str, device: str, device_ns: int, host_ns: int, *, serious: bool = True) -> None:
@@ -481,8 +478,7 @@ class Recorder:
         report.overrun_bytes = sum(line.stream.overrun_bytes for line in self._lines)
         if self.recording and self._tracker is not None and report.last_ns - self._pose_ns > _HIDDEN_NS:
             self._unseen(report.unseen or "nothing is sent", self._heard_ns)
-        if self._observer is not None:
-            self._observer.told(report)
+        self._observer.told(report)
 
     def _hush(self) -> None:
         """Send stop commands to the devices that are still there."""

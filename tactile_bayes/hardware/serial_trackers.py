@@ -49,12 +49,9 @@ class BirdParser(RecordParser):
     def _record(self, record: bytes) -> PoseReading | None:
         if not record[0] & 0x80 or any(byte & 0x80 for byte in record[1:]):
             return None
-        x, y, z, *turn = (word(record[i], record[i + 1]) for i in range(0, 2 * _WORDS, 2))
-        w, i, j, k = (number / 32768 for number in turn)
-        step = _SCALE_INCH / 32768 * MM_PER_INCH
-        if not plausible((x * step, y * step, z * step), (w, i, j, k)):
-            return None
-        return PoseReading((x * step, y * step, z * step), (w, i, j, k), tool=str(record[-1]) if self._group else "")
+        x, y, z, *turn = (word(record[i], record[i + 1]) / 32768 for i in range(0, 2 * _WORDS, 2))
+        inches = (_SCALE_INCH * x, _SCALE_INCH * y, _SCALE_INCH * z)
+        return _pose((*inches, *turn), str(record[-1]) if self._group else "")
 
 
 def word(low: int, high: int) -> int:
@@ -114,7 +111,7 @@ class FastrakParser(RecordParser):
             values = FASTRAK.unpack_from(record, 3) if record[-1:] == b" " else None
         else:
             values = _columns(record[3:-2]) if record[-2:] == b"\r\n" else None
-        return None if values is None else _polhemus_pose(values, error, station)
+        return None if values is None else _pose(values, str(station), error)
 
 
 def _columns(text: bytes) -> tuple[float, ...] | None:
@@ -139,7 +136,7 @@ class LibertyParser(RecordParser):
         fits = abs(size - LIBERTY.size + LIBERTY_HEADER_BYTES) <= 2
         if tag not in _TAGS or not 1 <= station <= 16 or command not in b"CP" or not fits or record[-1:] != b" ":
             return None
-        return _polhemus_pose(values, bytes([error]), station, time_ms, distortion)
+        return _pose(values, str(station), bytes([error]), time_ms, distortion)
 
 
 class LibertyAsciiParser(Parser):
@@ -173,11 +170,11 @@ class LibertyAsciiParser(Parser):
         *values, time_ms, distortion = (float(word) for word in words)
         if not math.isfinite(time_ms + distortion):
             return None
-        return _polhemus_pose(values, error, int(station), int(time_ms), int(distortion))
+        return _pose(values, str(int(station)), error, int(time_ms), int(distortion))
 
 
-def _polhemus_pose(
-    values: Sequence[float], error: bytes, station: int, time_ms: int | None = None, distortion: int = 0
+def _pose(
+    values: Sequence[float], tool: str, error: bytes = b" ", time_ms: int | None = None, distortion: int = 0
 ) -> PoseReading | None:
     """Pose from a place in inches and a quaternion; None for numbers that cannot be one. A space is no error."""
     x, y, z = (number * MM_PER_INCH for number in values[:3])
@@ -187,7 +184,7 @@ def _polhemus_pose(
     told: tuple[str, ...] = ("" if error == b" " else f"error {error.decode() if error.isalpha() else error[0]}",)
     told += (f"distortion {distortion}" if distortion else "",)
     device_ns = None if time_ms is None else time_ms * 1_000_000
-    return PoseReading((x, y, z), (w, i, j, k), device_ns, tuple(filter(None, told)), str(station))
+    return PoseReading((x, y, z), (w, i, j, k), device_ns, tuple(filter(None, told)), tool)
 
 
 # --- Drivers of the devices: setup, start, stop and identification.

@@ -102,14 +102,14 @@ class _Door(socket.socket):
 
 
 class LiveServer:
-    """Sends states to the pages whose address has the secret, a random one by default; port 0 takes a free one."""
+    """Sends states to the pages whose address has the secret, a random one; port 0 takes a free one."""
 
-    def __init__(self, host: str, port: int, *, token: str | None = None) -> None:
+    def __init__(self, host: str, port: int) -> None:
         try:
             import websockets.sync.server
         except ImportError:
             raise UsageError("--serve needs the package websockets; pip install 'tactile-bayes[live]'") from None
-        self._token = token or secrets.token_urlsafe(24)
+        self._token = secrets.token_urlsafe(24)
         self._news = threading.Condition()
         self._text, self._number, self._over = "", 0, False
         self._pages: set[Any] = set()

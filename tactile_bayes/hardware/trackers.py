@@ -455,7 +455,7 @@ def serve(tracker: NdiTracker, line: socket.socket) -> None:
             data = line.recv(4096)
             if not data:
                 return
-            for packet in commands.feed(data):
+            for packet in commands.packets(data):
                 if packet.kind == head.ASK:
                     wire = head.encode_hello(HelloReading(tracker.name, 0, 0, 0, 0.0))
                     wire += b"".join(head.encode_pose(one, sequence=0) for one in latest.values())

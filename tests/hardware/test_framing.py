@@ -100,7 +100,7 @@ def test_a_golden_frame_byte_by_byte():
     wire = bytes.fromhex("00 11 01 02 04 03 02 01 88 77 66 55 44 33 22 11 02 01 06 0a a8 de 89 98 00")
     counts = np.array([[0x0102, 0x0A00]], dtype=np.uint16)
     assert encode_frame(counts, sequence=0x01020304, device_us=0x1122334455667788) == wire
-    assert PacketParser().feed(wire) == [Packet(2, 0x01020304, 0x1122334455667788, body[14:])]
+    assert PacketParser().packets(wire) == [Packet(2, 0x01020304, 0x1122334455667788, body[14:])]
 
 
 def test_every_payload_comes_back():
@@ -124,7 +124,7 @@ def test_every_single_bit_error_of_a_frame_is_detected_and_costs_only_that_frame
     for bit in range(8 * len(wire)):
         broken = bytearray(wire)
         broken[bit // 8] ^= 1 << bit % 8
-        packets = PacketParser().feed(before + bytes(broken) + after)
+        packets = PacketParser().packets(before + bytes(broken) + after)
         numbers = [packet.sequence for packet in packets]
         # a flipped delimiter spoils what touches it, but each packet has its own on either side
         if 0 < bit // 8 < len(wire) - 1:
@@ -137,9 +137,9 @@ def test_every_single_bit_error_of_a_frame_is_detected_and_costs_only_that_frame
 def test_bytes_may_come_in_any_pieces(size):
     stream = b"".join(frame(i, sequence=i)[1] for i in range(9))
     parser = PacketParser()
-    found = [p.sequence for i in range(0, len(stream), size) for p in parser.feed(stream[i : i + size])]
+    found = [p.sequence for i in range(0, len(stream), size) for p in parser.packets(stream[i : i + size])]
     assert found == list(range(9))
-    assert parser.damaged_bytes == 0
+    assert parser.garbage_bytes == 0
 
 
 def insert_garbage(wires: list[bytes], garbage: list[tuple[int, bytes]]) -> bytes:
@@ -153,7 +153,7 @@ def check_garbage_between_packets(garbage: list[tuple[int, bytes]], cut: int) ->
     wires = [frame(i, sequence=i, shape=(2, 3))[1] for i in range(4)]
     stream = insert_garbage(wires, garbage)
     parser = PacketParser()
-    found = parser.feed(stream[:cut]) + parser.feed(stream[cut:])
+    found = parser.packets(stream[:cut]) + parser.packets(stream[cut:])
     assert [packet.sequence for packet in found if packet.kind == 2] == [0, 1, 2, 3]
 
 
@@ -197,9 +197,9 @@ def test_after_anything_the_next_packet_is_found_ten_thousand_times(data, cut):
 def test_noise_without_a_zero_is_let_go():
     parser = PacketParser()
     for _ in range(100):
-        parser.feed(b"\x55" * 4000)
-    assert parser.damaged_bytes >= 300_000
-    assert [p.sequence for p in parser.feed(frame(sequence=4)[1])] == [4]
+        parser.packets(b"\x55" * 4000)
+    assert parser.garbage_bytes >= 300_000
+    assert [p.sequence for p in parser.packets(frame(sequence=4)[1])] == [4]
 
 
 def test_gaps_wraps_and_restarts_of_the_sequence():
@@ -240,8 +240,9 @@ def test_another_version_is_told_apart_from_noise():
     body = bytes.fromhex("02 02 00 00 00 00") + bytes(8)
     wire = b"\0" + cobs_encode(body + zlib.crc32(body).to_bytes(4, "little")) + b"\0"
     parser = PacketParser()
-    assert parser.feed(wire) == []
-    assert (parser.foreign_version, parser.damaged_bytes) == (2, 0)
+    assert parser.packets(wire) == []
+    assert "packets of version 2 of the framing, this program reads 1" in parser.fault
+    assert parser.garbage_bytes == 0
 
 
 def test_a_payload_has_a_longest():
