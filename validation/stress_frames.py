@@ -39,7 +39,7 @@ from tactile_bayes.forward.simulate import (
     skin_perturbation,
     solid_head,
 )
-from tactile_bayes.forward.tissue import Layers, SceneBody, fat_thickness
+from tactile_bayes.forward.tissue import Layers
 from tactile_bayes.geometry import FloatArray, apply, inverse, quaternion_from_rotation, rotation_from_quaternion
 from tactile_bayes.scans import Scan, TrackerPoses
 
@@ -168,25 +168,24 @@ class _Model:
 
     @classmethod
     def of(cls, scene: Scene, physics: Physics, level: FloatArray) -> _Model:
-        body, lump = scene.body or SceneBody(), scene.solid_lumps[0]
-        fat = fat_thickness(body, scene.solid_lumps)
+        layers, lump = scene.layers, scene.solid_lumps[0]
         k = physics.gland_stiffening
         kpa = np.quantile(level[level > 4.0], [0.05, 0.95]) if k else [REFERENCE_KPA]
         stages = []
         for one in kpa:
             factor = 1.0 - k + k * float(one) / REFERENCE_KPA
-            stiffened = replace(body, gland_ratio=body.gland_ratio * factor)
+            stiffened = replace(layers, gland_ratio=layers.gland_ratio * factor)
             change = skin_perturbation(
-                condensed_lump(lump, stiffened, fat),
-                lump.stiffness_ratio * factor * body.fat_kpa,
+                condensed_lump(lump, stiffened),
+                lump.stiffness_ratio * factor * layers.fat_kpa,
                 square_mm=scene.head.pitch_mm,
             )
-            stages.append((_plain_head(scene, stiffened, fat), replace(change, x_mm=lump.x_mm, y_mm=lump.y_mm)))
-        grid = None if physics.varying is None else _grid(scene, body, fat, physics.varying, stages[0][0])
+            stages.append((_kept_head(scene.head, stiffened), replace(change, x_mm=lump.x_mm, y_mm=lump.y_mm)))
+        grid = None if physics.varying is None else _grid(scene, layers, physics.varying, stages[0][0])
         face = stages[0][0].face
         shear: tuple[FloatArray, ...] = ()
         if physics.friction:
-            shear = _shear_sinking(body.layers(fat), face.sensing.shape, face.pitch_mm)
+            shear = _shear_sinking(layers, face.sensing.shape, face.pitch_mm)
         return cls(physics, stages, [float(one) for one in kpa], grid, shear, _near(face.surface_mm))
 
     def frame(
@@ -252,13 +251,7 @@ class _Model:
         return surface
 
 
-@lru_cache(maxsize=8)
-def _kept_head(head: Any, body: SceneBody, fat_mm: float) -> SolidHead:
-    return solid_head(head, body.layers(fat_mm))
-
-
-def _plain_head(scene: Scene, body: SceneBody, fat_mm: float) -> SolidHead:
-    return _kept_head(scene.head, body, fat_mm)
+_kept_head = lru_cache(maxsize=8)(solid_head)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -278,9 +271,7 @@ def _scaled_head(head: SolidHead, root: FloatArray) -> SolidHead:
     return replace(head, plain=ContactStiffness(plain, head.plain.factor, head.plain.core))
 
 
-def _grid(
-    scene: Scene, body: SceneBody, fat_mm: float, varying: VaryingLayers, head: SolidHead
-) -> tuple[FloatArray, list[SolidHead]]:
+def _grid(scene: Scene, layers: Layers, varying: VaryingLayers, head: SolidHead) -> tuple[FloatArray, list[SolidHead]]:
     """The head at places 5 mm apart along the direction in which the layers vary; yaw is the strokes' own."""
     lump, strokes, face = scene.solid_lumps[0], scene.strokes, head.face
     angle = varying.angle_rad
@@ -290,11 +281,11 @@ def _grid(
     across = face.surface_mm[..., 0].ravel() * np.cos(turned) + face.surface_mm[..., 1].ravel() * np.sin(turned)
     middle = (across[:, None] + across[None, :]) / 2
     lump_at = lump.x_mm * np.cos(angle) + lump.y_mm * np.sin(angle)
-    own = fat_mm if varying.layer == "fat" else body.thickness_mm
+    own = layers.fat_mm if varying.layer == "fat" else layers.thickness_mm
     least, most = (
-        (LEAST_LAYER_MM, body.thickness_mm - LEAST_LAYER_MM)
+        (LEAST_LAYER_MM, layers.thickness_mm - LEAST_LAYER_MM)
         if varying.layer == "fat"
-        else (fat_mm + LEAST_LAYER_MM, np.inf)
+        else (layers.fat_mm + LEAST_LAYER_MM, np.inf)
     )
 
     def depth(at: FloatArray) -> FloatArray:
@@ -304,7 +295,7 @@ def _grid(
     table_mm = np.geomspace(ends.min() * 0.999, ends.max() * 1.001, _DEPTHS)
     rows, columns = face.sensing.shape
     table = np.stack(
-        [_by_offset(_with_depth(body, fat_mm, varying.layer, one), rows, columns, face.pitch_mm) for one in table_mm]
+        [_by_offset(_with_depth(layers, varying.layer, one), rows, columns, face.pitch_mm) for one in table_mm]
     )
     row, column = np.divmod(np.arange(rows * columns), columns)
     offset = np.abs(row[:, None] - row) * columns + np.abs(column[:, None] - column)
@@ -318,9 +309,9 @@ def _grid(
     return place, heads
 
 
-def _with_depth(body: SceneBody, fat_mm: float, layer: str, depth_mm: float) -> Layers:
+def _with_depth(layers: Layers, layer: str, depth_mm: float) -> Layers:
     depth_mm = float(depth_mm)
-    return body.layers(depth_mm) if layer == "fat" else replace(body, thickness_mm=depth_mm).layers(fat_mm)
+    return replace(layers, **{"fat_mm" if layer == "fat" else "thickness_mm": depth_mm})
 
 
 def _by_offset(layers: Layers, rows: int, columns: int, pitch_mm: float) -> FloatArray:

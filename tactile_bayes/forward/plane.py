@@ -143,11 +143,6 @@ class SurfaceCompliance(Record, eq=False):
     """`even`, `odd`: The body on x > 0, for loads symmetric and antisymmetric in x."""
 
     @property
-    def x_mm(self) -> FloatArray:
-        """(n,) centres of the cells."""
-        return 0.5 * (self.edges_mm[1:] + self.edges_mm[:-1])
-
-    @property
     def cell_mm(self) -> float:
         """Width of the cells."""
         return float(self.edges_mm[1] - self.edges_mm[0])
@@ -222,8 +217,7 @@ def _hole_compliance(
     held = _held_on_axis(mesh, even=even)
     x, z = mesh.nodes[:, 0], mesh.nodes[:, 1]
     held[0::2] |= x > x.max() * (1 - 1e-9)
-    base = z > body.layers.thickness_mm * (1 - 1e-9)
-    held |= np.repeat(base, 2)
+    held |= np.repeat(z > body.layers.thickness_mm * (1 - 1e-9), 2)
     free = np.flatnonzero(~held)
     place = np.full(len(held), -1)
     place[free] = np.arange(len(free))
@@ -233,9 +227,7 @@ def _hole_compliance(
     skin = skin[np.argsort(x[skin])]
     vertical = place[2 * skin + 1]
     lowered = np.where(vertical[:, None] >= 0, solution[vertical], 0.0)
-    average = skin_average(x[skin], edges_mm=edges_mm, even=even)
-    at_rim = solution[place[rim]]
-    return at_rim, average @ lowered
+    return solution[place[rim]], skin_average(x[skin], edges_mm=edges_mm, even=even) @ lowered
 
 
 def _rim_unknowns(mesh: QuadMesh, body: Body, held: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> IndexArray:

@@ -11,7 +11,7 @@ from tactile_bayes import presets
 from tactile_bayes.declarations import Meta, Record, as_dict, check, field, replace, says
 from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.contact import Head as Section
-from tactile_bayes.forward.tissue import Diameter, Place, Rib, SceneBody, SolidLump, check_solid, fat_thickness
+from tactile_bayes.forward.tissue import Diameter, Layers, Place, Rib, SceneBody, SolidLump, check_solid, fat_thickness
 from tactile_bayes.geometry import (
     FloatArray,
     apply,
@@ -225,6 +225,13 @@ class Scene(Timing):
         return "solid" if tissue else "empirical-gaussian"
 
     @property
+    def layers(self) -> Layers:
+        """The body without lumps."""
+        body = self.body or SceneBody()
+        fat_mm = fat_thickness(body, self.solid_lumps)
+        return Layers(fat_mm, body.thickness_mm, body.fat_kpa, body.gland_ratio, body.nu)
+
+    @property
     def stiff_balls(self) -> tuple[SolidLump, ...]:
         """The lumps of tissue and the balls of the ribs."""
         return (*self.solid_lumps, *(ball for rib in self.ribs for ball in rib.balls()))
@@ -288,8 +295,7 @@ def _rigid(rotation_deg: Rotation, offset_mm: tuple[float, float, float]) -> Flo
 
 def tissue_truth(scene: Scene) -> dict[str, Any]:
     """The body and its lumps as plain data; the balls of a rib do not count as lumps."""
-    body = scene.body or SceneBody()
-    fat = fat_thickness(body, scene.solid_lumps)
+    body, fat = scene.body or SceneBody(), scene.layers.fat_mm
     return {
         "lumps": [
             as_dict(lump)
@@ -343,8 +349,7 @@ def record(
     in order.
 
     What lies below the skin of `scene` is not used; `truth` is what the model of the tissue adds to the truth, where
-    `lumps` is a list of mappings with `x_mm` and `y_mm`. `rng` is split into independent streams, so that a longer scan
-    of the same seed keeps its gains and calibration. Without a `depth` the head wanders about 5 mm.
+    `lumps` is a list of mappings with `x_mm` and `y_mm`. Without a `depth` the head wanders about 5 mm.
     """
     gain_rng, element_rng, tracker_rng = rng.spawn(3)
     true_gain, calibration = _calibration(scene, rng=gain_rng)

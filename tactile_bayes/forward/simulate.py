@@ -26,7 +26,7 @@ from tactile_bayes.forward.scene import (
     record,
     tissue_truth,
 )
-from tactile_bayes.forward.tissue import MOST_SEAT, Body, Layers, SceneBody, SolidLump, fat_thickness
+from tactile_bayes.forward.tissue import MOST_SEAT, Body, Layers, SolidLump
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HEAD_PITCH_MM, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
 from tactile_bayes.progress import Progress, untold
@@ -199,16 +199,15 @@ class PlaneSection(Record, eq=False):
             raise BadDataError(
                 f"the scene has {many}", way_out=f"the {fidelity} model has one lump and no rib; use --fidelity solid"
             )
-        body = scene.body or SceneBody()
-        fat = fat_thickness(body, scene.solid_lumps)
-        lump = _cylinder(scene.solid_lumps[0], body, fat, fidelity) if scene.solid_lumps else None
+        layers = scene.layers
+        lump = _cylinder(scene.solid_lumps[0], layers, fidelity) if scene.solid_lumps else None
         width = scene.head.rows * scene.head.pitch_mm
         if shoulders == SHOULDERS_INSIDE and scene.head.rim_mm > width / 2:
             raise BadDataError(
                 f"head.rim_mm is {scene.head.rim_mm:g}",
                 way_out=f"in two dimensions the rim is cut into the array: give at most {width / 2:g} mm",
             )
-        return cls(scene, fidelity, scene.head.section(shoulders), body.layers(fat), lump)
+        return cls(scene, fidelity, scene.head.section(shoulders), layers, lump)
 
     @property
     def x_mm(self) -> float:
@@ -298,22 +297,23 @@ class PlaneSection(Record, eq=False):
         return over.as_taxels(self.scene.head.pitch_mm)
 
 
-def _cylinder(lump: SolidLump, body: SceneBody, fat_mm: float, fidelity: str) -> tuple[Body, float]:
+def _cylinder(lump: SolidLump, layers: Layers, fidelity: str) -> tuple[Body, float]:
     """Body and stiffness ratio of the lump's section."""
     if lump.height_mm is not None and lump.height_mm != lump.d_mm:
         raise BadDataError(
             f"lump[0].height_mm is {lump.height_mm:g}",
             way_out=f"the {fidelity} model has a circle: leave it out, or use --fidelity solid",
         )
-    seat = (fat_mm - lump.depth_mm) / (lump.d_mm / 2)
+    seat = (layers.fat_mm - lump.depth_mm) / (lump.d_mm / 2)
     if not -1e-9 <= seat <= MOST_SEAT + 1e-9:
         raise BadDataError(
-            f"the gland lies {fat_mm:g} mm deep, which seats lump[0] at {seat:.3g}",
+            f"the gland lies {layers.fat_mm:g} mm deep, which seats lump[0] at {seat:.3g}",
             way_out=f"the {fidelity} model has seats from 0 to {MOST_SEAT:g}; use --fidelity solid",
         )
     seat = float(np.clip(seat, 0.0, MOST_SEAT))
+    tissue = layers.thickness_mm, layers.fat_kpa, layers.gland_ratio, layers.poisson
     try:
-        section = Body(lump.d_mm, lump.depth_ratio, seat, body.thickness_mm, body.fat_kpa, body.gland_ratio, body.nu)
+        section = Body(lump.d_mm, lump.depth_ratio, seat, *tissue)
     except BadDataError as error:
         raise BadDataError(f"lump[0]: {error.what}", way_out=error.way_out) from None
     return section, lump.stiffness_ratio
@@ -514,12 +514,11 @@ def frames_at_poses(
 ) -> tuple[FloatArray, FloatArray]:
     """Pressures in kPa, (n, rows, columns), on the head at poses from `scanhead` to the scene's `plane`, without noise,
     and z in mm of its apex there, which the mean pressures decide."""
-    body, lumps = scene.body or SceneBody(), []
-    fat = fat_thickness(body, scene.solid_lumps)
-    head, count = _head(scene.head, body.layers(fat)), len(mean_kpa)
+    layers, lumps = scene.layers, []
+    head, count = _head(scene.head, layers), len(mean_kpa)
     for lump in scene.stiff_balls:
-        around = condensed_lump(lump, body, fat)
-        change = skin_perturbation(around, lump.stiffness_ratio * body.fat_kpa, square_mm=scene.head.pitch_mm)
+        around = condensed_lump(lump, layers)
+        change = skin_perturbation(around, lump.stiffness_ratio * layers.fat_kpa, square_mm=scene.head.pitch_mm)
         lumps.append(replace(change, x_mm=lump.x_mm, y_mm=lump.y_mm))
     pressure = np.empty((count, scene.head.rows, scene.head.columns))
     depth, touching = np.empty(count), None
@@ -531,9 +530,9 @@ def frames_at_poses(
     return pressure, depth
 
 
-def condensed_lump(lump: SolidLump, body: SceneBody, fat_mm: float) -> CondensedLump:
+def condensed_lump(lump: SolidLump, layers: Layers) -> CondensedLump:
     """Condense the body around a lump; the lump's stiffness and place do not matter here."""
-    return _condensed(mesh.LumpGeometry(lump.d_mm / 2, lump.vertical_mm / 2, lump.depth_mm, body.layers(fat_mm)))
+    return _condensed(mesh.LumpGeometry(lump.d_mm / 2, lump.vertical_mm / 2, lump.depth_mm, layers))
 
 
 # Exams of one body, and lumps of one size and depth in it, share these; a scene has few.

@@ -159,10 +159,6 @@ class SceneBody(Record):
     fat_mm: Annotated[float, Meta(gt=0, le=500)] | None = None
     """Depth of the boundary between fat and gland, mm. Left out, the lumps' seats decide; 15 mm without lumps."""
 
-    def layers(self, fat_mm: float) -> Layers:
-        """The body without lumps; `fat_mm` is as `fat_thickness` has it."""
-        return Layers(fat_mm, self.thickness_mm, self.fat_kpa, self.gland_ratio, self.nu)
-
 
 class SolidLump(Record):
     """A lump of stiff or soft tissue: a ball, or with another height a spheroid about the vertical.

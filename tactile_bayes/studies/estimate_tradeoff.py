@@ -79,9 +79,9 @@ UNKNOWN = Deviation(float("nan"), float("nan"), float("nan"))
 
 def deviation(answers: Sequence[SizeAnswer], reference: SizeAnswer | None) -> Deviation:
     """How far answers lie from a reference; NaN where one of them, or the reference, has no number of the same kind."""
-    if reference is None or not answers or any(one.quantities.keys() != reference.quantities.keys() for one in answers):
+    if reference is None or reference.reported is None or not answers:
         return UNKNOWN
-    if reference.reported is None:
+    if any(one.quantities.keys() != reference.quantities.keys() for one in answers):
         return UNKNOWN
     name = SIZE if SIZE in reference.quantities else WIDTHS[0]
     return Deviation(

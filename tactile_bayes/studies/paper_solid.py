@@ -75,8 +75,7 @@ def fit_raster(made: TactileMap, settings: SolidSettings) -> RasterFit:
     spread over their cells and the Gaussian is averaged there; what remains in both is the average over a taxel.
 
     The lowest minimum between widths of half a taxel and three quarters of the radius is sought with the amplitude, and
-    a free level, eliminated, as in `paper.fit_line`: steps of Gauss and Newton do not settle on a faint bump in its
-    trough.
+    a free level, eliminated, as in `paper.fit_line` (see `plane.fit_shape`).
     """
     radius_mm, free = settings.fit_radius_mm, settings.background == "free"
     cells = replace(window_cells(made, (0.0, 0.0), radius_mm=radius_mm), cell_mm=0.0)
@@ -149,7 +148,7 @@ class SolidSettings(CaseSettings, kw_only=True):
     """`reach_mm`, `lines_mm`: The head stands at steps of the taxels' pitch out to `reach_mm` either side across it, on
     lines at these distances either side along it, which must be whole steps."""
     fit_radius_mm: float = FIT_RADIUS_MM  #: Eq 7 is fitted within this distance of the lump's axis.
-    rank_tolerance: float = RANK_TOLERANCE  #: See `solid.skin_perturbation`.
+    rank_tolerance: float = RANK_TOLERANCE  #: See `simulate.skin_perturbation`.
     mesh_reach_mm: float = MeshSize().reach_mm  #: Radius at which the mesh ends, on a rim that does not move.
     background: Background = "free"  #: ``"free"``: Eq 7's level is fitted; ``"fixed"``: it is 1.
     flat_field: bool = True  #: True when each taxel is divided by what it reads of the same body without the lump.

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, field, replace
+from tactile_bayes.declarations import Record, as_dict, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.mesh import lump_mesh
 from tactile_bayes.forward.plane import TactileLine, build_line, head_positions, rim_nodes
 from tactile_bayes.forward.scene import Scene
-from tactile_bayes.forward.tissue import Body, SceneBody, fat_thickness
+from tactile_bayes.forward.tissue import Body
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.select import first_seconds
@@ -116,12 +116,10 @@ def case_of(scene: Scene, *, head: str | None = None) -> LumpCase:
     if scene.lumps or scene.ribs or len(scene.solid_lumps) != 1:
         many = "bumps" if scene.lumps else "a rib" if scene.ribs else f"{len(scene.solid_lumps)} lumps"
         raise BadDataError(f"the scene has {many}", way_out="give one lump of tissue: d_mm, depth_ratio")
-    (lump,), body = scene.solid_lumps, scene.body or SceneBody()
+    (lump,), tissue = scene.solid_lumps, as_dict(scene.layers) | {"mean_kpa": scene.background.mean_kpa}
     if lump.vertical_mm != lump.d_mm:
         raise BadDataError(f"lump[0].height_mm is {lump.vertical_mm:g}", way_out="leave it out: both models are round")
-    seat = (fat_thickness(body, [lump]) - lump.depth_mm) / (lump.d_mm / 2)
-    tissue: dict[str, Any] = {"mean_kpa": scene.background.mean_kpa, "poisson": body.nu}
-    tissue |= {name: getattr(body, name) for name in ("fat_kpa", "gland_ratio", "thickness_mm")}
+    seat = (tissue.pop("fat_mm") - lump.depth_mm) / (lump.d_mm / 2)
     section = scene.head.section(head or SHOULDERS_INSIDE)
     array = scene.head if head is None else scene.head.with_shoulders(head)
     case = LumpCase(

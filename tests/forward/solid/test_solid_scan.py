@@ -310,10 +310,9 @@ def test_another_programs_rib_is_met_frame_by_frame(shared_data: Path) -> None:
 
 
 def one_ball(lump: SolidLump) -> tuple[SolidHead, SkinPerturbation]:
-    body = SceneBody()
-    fat = fat_thickness(body, [lump])
-    change = skin_perturbation(condensed_lump(lump, body, fat), lump.stiffness_ratio * body.fat_kpa)
-    return solid_head(Head(), body.layers(fat)), change
+    layers = Scene(solid_lumps=(lump,)).layers
+    change = skin_perturbation(condensed_lump(lump, layers), lump.stiffness_ratio * layers.fat_kpa)
+    return solid_head(Head(), layers), change
 
 
 def poses_and_frames(path: Path, skin: np.ndarray, latency_ms: float) -> list[tuple[np.ndarray, np.ndarray]]:
