@@ -21,28 +21,16 @@ from tactile_bayes.progress import Progress, untold
 # --- Text on a terminal: lines break between words at its width, the size and the verdict are bold, cautions coloured.
 
 BOLD, RED, YELLOW, CYAN = "1", "31", "33", "36"
-# How a line begins -> its style; the first that fits. A pipe, a file and NO_COLOR get none of them.
+# Style -> how its lines begin. A pipe, a file and NO_COLOR get none of them.
 STYLES: Final = {
-    "error: ": RED,
-    "failed: ": RED,
-    "CAUTION: ": YELLOW,
-    "caution: ": YELLOW,
-    "doubtful: ": f"{BOLD};{YELLOW}",
-    "Doubtful: ": YELLOW,
-    "To check: ": CYAN,
-    "note: ": CYAN,
-    "$ ": BOLD,
-    "sound: ": BOLD,
-    "needed: ": BOLD,
-    "tactile errs ": BOLD,
-    "The mass has ": BOLD,
-    "No change shown": BOLD,
-    "Not compared": BOLD,
-    "No common size": BOLD,
-    "largest size ": BOLD,
-    "No estimate: ": BOLD,
-    "No lump found": BOLD,
-    "No size: ": BOLD,
+    RED: ("error: ", "failed: "),
+    YELLOW: ("CAUTION: ", "caution: ", "Doubtful: "),
+    f"{BOLD};{YELLOW}": ("doubtful: ",),
+    CYAN: ("To check: ", "note: "),
+    BOLD: (
+        *("$ ", "sound: ", "needed: ", "tactile errs ", "The mass has ", "No change shown", "Not compared"),
+        *("No common size", "largest size ", "No estimate: ", "No lump found", "No size: "),
+    ),
 }
 LEAST_COLUMNS: Final = 20  #: Below it nothing is wrapped: a terminal without a size says 0.
 MOST_NAME: Final = 40  #: Columns of a row's name up to which the text beside it stays in its own column.
@@ -86,10 +74,7 @@ def has_styles(environment: Mapping[str, str] = os.environ) -> bool:
 
 
 def dressed(text: str, *, columns: int, styles: bool) -> str:
-    """The text for a terminal of that width, in lines that break between words.
-
-    A document (JSON) is left as it is: it is read by programs.
-    """
+    """The text for a terminal of that width, in lines that break between words; JSON, read by programs, as it is."""
     if columns < LEAST_COLUMNS or text.lstrip()[:1] in ("{", "["):
         return text
     return "\n".join(_dressed_line(line, columns, styles=styles) for line in text.split("\n"))
@@ -109,7 +94,7 @@ def _dressed_line(line: str, columns: int, *, styles: bool) -> str:
         filled = "".join(letter + _WIDE * _is_wide(letter) for letter in line)
         whole = wrapper.wrap(re.sub(_UNIT, _JOINED, filled))
         line = f"{end}\n".join(whole).replace(_JOINED, " ").replace(_WIDE, "")
-    style = next((style for lead, style in STYLES.items() if line.startswith(lead)), "") if styles else ""
+    style = next((style for style, leads in STYLES.items() if line.startswith(leads)), "") if styles else ""
     return "\n".join(f"\x1b[{style}m{part}\x1b[0m" for part in line.split("\n")) if style else line
 
 

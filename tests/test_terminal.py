@@ -105,7 +105,7 @@ def test_a_terminal_without_a_size_gets_the_text_as_it_is():
 
 
 def test_every_lead_of_a_finding_has_a_style():
-    assert set(LEADS.values()) <= set(STYLES)
+    assert set(LEADS.values()) <= {lead for leads in STYLES.values() for lead in leads}
     wrapped = dressed(f"CAUTION: {SENTENCE}", columns=40, styles=True)
     assert ESCAPES.sub("", wrapped) == dressed(f"CAUTION: {SENTENCE}", columns=40, styles=False)
     assert all(line.startswith("\x1b[33m") and line.endswith("\x1b[0m") for line in wrapped.split("\n"))
