@@ -80,17 +80,16 @@ def learn_from_exams(
     that by which they were sized, where it is in no file that they name; `fewest`: masses with repeats that it takes.
     """
     groups, left_out = _repeats(exams)
-    one_by_one = [repeat for group in groups for repeat in group]
-    name, digest = _calibration_named(one_by_one)
-    calibration = _calibration(name, digest, size_calibration) if one_by_one else None
-    masses = []
+    one_by_one, masses = [repeat for group in groups for repeat in group], []
+    if not groups:
+        learn_repeatability([], fewest=fewest or FEWEST_MASSES)  # refuses them
+    name, digest = one_by_one[0].calibration, one_by_one[0].calibration_sha256
+    calibration = _calibration(one_by_one, size_calibration)
     for group in groups:
-        assert calibration is not None
         alone = [log_size_alone(calibration, read_shape(one.exam.folder / SHAPE)) for one in group]
         first, values = group[0].exam, np.array(alone)
         masses.append(RepeatedExams(first.of_mass, first.mass, values[:, 0], values[:, 1]))
     learned = learn_repeatability(masses, fewest=fewest or FEWEST_MASSES)
-    assert calibration is not None
     found = learned.repeatability
     entries = [
         size_json.RepeatedMass(
@@ -168,21 +167,15 @@ def _read(exam: ExamFolder) -> _Repeat | str:
     )
 
 
-def _calibration_named(repeats: Sequence[_Repeat]) -> tuple[str, str]:
-    """Name and digest of the one calibration that sized all exams; empty without exams."""
-    found: dict[str, _Repeat] = {}
-    for repeat in repeats:
-        found.setdefault(repeat.calibration_sha256, repeat)
-    if len(found) > 1:
-        named = ", ".join(f"{one.exam.name} by {one.calibration}" for one in list(found.values())[:2])
+def _calibration(repeats: Sequence[_Repeat], given: str | None) -> BodyCalibration:
+    """The one calibration that sized all exams: the one given, or that of its name, or a shipped one."""
+    name, digest = repeats[0].calibration, repeats[0].calibration_sha256
+    digests = list(dict.fromkeys(one.calibration_sha256 for one in repeats))
+    if len(digests) > 1:
+        another = next(one for one in repeats if one.calibration_sha256 == digests[1])
+        named = ", ".join(f"{one.exam.name} by {one.calibration}" for one in (repeats[0], another))
         way_out = "their spreads are not comparable: run the campaign with one"
-        raise BadDataError(f"the exams were sized by {len(found)} calibrations ({named})", way_out=way_out)
-    first = next(iter(found.values()), None)
-    return ("", "") if first is None else (first.calibration, first.calibration_sha256)
-
-
-def _calibration(name: str, digest: str, given: str | None) -> BodyCalibration:
-    """The calibration with this digest: the one given, or that of the name, or a shipped one."""
+        raise BadDataError(f"the exams were sized by {len(digests)} calibrations ({named})", way_out=way_out)
     names = [name, *size_json.SHIPPED] if given is None else [given]
     paths = [path for one in names if (path := size_json.size_calibration_path(one)) is not None]
     path = next((path for path in paths if (given is not None or path.is_file()) and sha256(path) == digest), None)
