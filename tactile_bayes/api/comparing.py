@@ -238,6 +238,7 @@ def compare_estimates(
 def _compared(
     visits: Sequence[Sequence[Answer]], calibration: BodyCalibration, settings: Settings, comparing: Comparing
 ) -> Compared:
+    """Sizes of the visits, where codes and places do not contradict that they are of one mass."""
     found = [[answer for answer in maps if answer.shape is not None] for maps in visits]
     missing = [words for number, maps in enumerate(visits, start=1) if (words := _missing(maps, f"visit {number}"))]
     contradicted = contradictions([_scans(one) for one in visits])
@@ -248,10 +249,33 @@ def _compared(
         return Compared("no_estimate", "; ".join(missing), "scan the mass again, or leave that visit out")
     if unfit := without_calibration([one.report for maps in visits for one in maps]):
         return Compared("no_estimate", unfit, "compare maps that have a size each")
-    refused, apart, doubts = _by_place(found, comparing)
-    if refused is not None:
-        return refused
-    return _sized(found, calibration, settings, apart=apart, doubts=doubts)
+    of_maps = [[place for answer in maps if (place := place_of(answer.report)) is not None] for maps in found]
+    places = [Place.mean_of(one) for one in of_maps]
+    away = tuple(
+        None if first is None or later is None else apart(first, later, registration_mm=comparing.registration_mm)
+        for first, later in ((places[0], later) for later in places[1:])
+    )
+    doubts = [
+        f"the masses of visits 1 and {number} lie {one.distance_mm:.0f} mm apart "
+        f"(one mass: SD {one.sd_mm:.0f} mm each way)"
+        for number, one in enumerate(away, start=2)
+        if one is not None and one.doubtful
+    ]
+    doubts += [
+        f"the masses on the maps of visit {number} lie too far apart for one"
+        for number, maps in enumerate(of_maps, start=1)
+        if one_place_probability(maps, registration_mm=comparing.registration_mm) < LEAST_PROBABILITY
+    ]
+    unknown = [str(number) for number, place in enumerate(places, start=1) if place is None]
+    if not comparing.same_mass and doubts:
+        advice = "compare exams of one mass; if it is one, --same-mass says so (a wider posture: --registration-mm)"
+        return Compared("not_one_mass", "; ".join(doubts), advice, away)
+    if not comparing.same_mass and unknown:
+        reason = f"no landmarks show where the mass of visit {' and '.join(unknown)} lies in the patient"
+        return Compared("not_one_mass", reason, "touch both landmarks, or say --same-mass", away)
+    doubts += [f"no landmarks show where the mass of visit {number} lies" for number in unknown]
+    taken = [Finding("taken_as_one", f"{text}; taken as one mass because you say so") for text in doubts]
+    return _sized(found, calibration, settings, apart=away, doubts=taken)
 
 
 def _missing(maps: Sequence[Answer], visit: str) -> str:
@@ -263,37 +287,6 @@ def _missing(maps: Sequence[Answer], visit: str) -> str:
     if silent and len(silent) == len(maps):
         return f"{visit}: {silent[0].reason}"
     return f"a lump was found on {found} of {len(maps)} maps of {visit}"
-
-
-def _by_place(
-    visits: Sequence[Sequence[Answer]], comparing: Comparing
-) -> tuple[Compared | None, tuple[Apart | None, ...], list[Finding]]:
-    """Refusal where the places do not show one mass, the distances from the first visit, and what else speaks of it."""
-    of_maps = [[place for answer in maps if (place := place_of(answer.report)) is not None] for maps in visits]
-    places = [Place.mean_of(one) for one in of_maps]
-    found = tuple(
-        None if first is None or later is None else apart(first, later, registration_mm=comparing.registration_mm)
-        for first, later in ((places[0], later) for later in places[1:])
-    )
-    doubts = [
-        f"the masses of visits 1 and {number} lie {one.words}"
-        for number, one in enumerate(found, start=2)
-        if one is not None and one.doubtful
-    ]
-    doubts += [
-        f"the masses on the maps of visit {number} lie too far apart for one"
-        for number, maps in enumerate(of_maps, start=1)
-        if one_place_probability(maps, registration_mm=comparing.registration_mm) < LEAST_PROBABILITY
-    ]
-    unknown = [str(number) for number, place in enumerate(places, start=1) if place is None]
-    if not comparing.same_mass and doubts:
-        advice = "compare exams of one mass; if it is one, --same-mass says so (a wider posture: --registration-mm)"
-        return Compared("not_one_mass", "; ".join(doubts), advice, found), (), []
-    if not comparing.same_mass and unknown:
-        reason = f"no landmarks show where the mass of visit {' and '.join(unknown)} lies in the patient"
-        return Compared("not_one_mass", reason, "touch both landmarks, or say --same-mass", found), (), []
-    doubts += [f"no landmarks show where the mass of visit {number} lies" for number in unknown]
-    return None, found, [Finding("taken_as_one", f"{text}; taken as one mass because you say so") for text in doubts]
 
 
 def _sized(

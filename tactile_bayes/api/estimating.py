@@ -247,13 +247,6 @@ def _options(settings: Settings, calibration: Calibration | None, tactile_map: T
     return SamplerSettings(**asked, size_priors=size_priors(settings))
 
 
-def estimated_at(found: SizeEstimate, place: tuple[float, float]) -> SizeEstimate:
-    """The estimate of the same map at another place on it."""
-    settings = replace(found.settings, centre_mm=place)
-    there = estimate_one(found.tactile_map, settings, scans=found.provenance.scans)
-    return replace(there, provenance=replace(there.provenance, inputs=found.provenance.inputs), name=found.name)
-
-
 def estimate_inputs(settings: Settings, tactile_map: TactileMap) -> tuple[Calibration | None, SamplerSettings]:
     """What `estimate_one` takes for a map: calibration and options."""
     _, calibration, _ = choose_calibration(settings, tactile_map)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tactile_bayes.api.arguments import PathLike, door, path_of
-from tactile_bayes.api.estimating import estimated_at, input_digests
+from tactile_bayes.api.estimating import estimate_one, input_digests
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, SizedExam, SizeEstimate, check_one_mass, size_priors
 from tactile_bayes.declarations import replace
@@ -19,12 +19,12 @@ from tactile_bayes.files.map_nc import write_posterior
 from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.files.reports import EstimateReport, PooledReport
 from tactile_bayes.files.size_json import default_for, read_size_calibration, size_calibration_path
-from tactile_bayes.findings import Finding
+from tactile_bayes.findings import by_weight
 from tactile_bayes.options import PRIORS
 from tactile_bayes.posterior.estimate import way_to_head
 from tactile_bayes.report.estimate_document import side_of
 from tactile_bayes.report.exam_words import Exam
-from tactile_bayes.report.pooled import elsewhere, pooled_report
+from tactile_bayes.report.pooled import elsewhere, pooled_findings, pooled_report
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import LEAST_PROBABILITY
 from tactile_bayes.size.pooling import DISAGREE, PooledEstimate, pool_maps
@@ -41,8 +41,11 @@ def one_mass(found: Sequence[SizeEstimate]) -> tuple[SizeEstimate, ...]:
     """Estimates of the mass that most maps show; those of a place that somebody gave stay as they are."""
     same = list(found)
     for i, place in elsewhere([one.answer.report for one in found]).items():
-        if found[i].settings.centre_mm is None:
-            same[i] = estimated_at(found[i], place)
+        one = found[i]
+        if one.settings.centre_mm is None:
+            settings, made = replace(one.settings, centre_mm=place), one.provenance
+            there = estimate_one(one.tactile_map, settings, scans=made.scans)
+            same[i] = replace(there, provenance=replace(there.provenance, inputs=made.inputs), name=one.name)
     return tuple(same)
 
 
@@ -73,11 +76,6 @@ class PooledSize(SizedExam, eq=False, dict=True, kw_only=True):
     @property
     def _found(self) -> PooledEstimate:
         return self.pooled
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """What speaks against the size, cautions first."""
-        return self.pooled_report.findings
 
     @property
     def document(self) -> dict[str, Any]:
@@ -133,6 +131,7 @@ def pool_answers(
         *first, last = [f"{one.max_size_mm.median:.1f}" for one in reports if one.max_size_mm is not None]
         sizes = f"{', '.join(first)} and {last}" if first else last
         pooled = replace(pooled, reason=f"{pooled.reason}, {sizes} mm")
+    pooled = replace(pooled, findings=by_weight(pooled_findings(pooled, reports)))
     # pooled files have the key `calibration`, and the priors together
     recorded = settings.recorded()
     prior = {name: recorded.pop(name) for name in PRIORS}

@@ -24,7 +24,7 @@ from tactile_bayes.inference.ensemble import DrawGroup, inference_data
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.result import Estimate, Mass, inference_groups
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.estimate_document import estimate_report, leading_size, patient_mm, side_of
+from tactile_bayes.report.estimate_document import estimate_report, patient_mm, side_of
 from tactile_bayes.report.estimate_figures import draw_fit, draw_map, draw_size
 from tactile_bayes.report.estimate_text import estimate_summary, estimate_text, exams_label
 from tactile_bayes.report.exam_words import Exam, ExamMap, Given, exam_map
@@ -129,7 +129,7 @@ class Sized(Record, eq=False, dict=True):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What speaks against the size, cautions first."""
-        raise NotImplementedError
+        return self._found.findings
 
     @property
     def verdict(self) -> Verdict:
@@ -146,13 +146,13 @@ class Sized(Record, eq=False, dict=True):
 
     def _rows(self) -> Iterator[tuple[str, str]]:
         """Names and values of the notebook's table."""
-        if self._size is None:
-            return
-        leads = leading_size(self._size)
-        for name in EXTREMES:
-            yield f"{'largest' if name == 'max_size_mm' else 'smallest'} size", repr(self._drawn(leads, name))
-        if leads is not self._size:
-            yield f"largest size {exams_label(self._size.figures.get('between_map_sd'))}", repr(self.max_size_mm)
+        if (size := self._size) is not None:
+            for name, words in zip(EXTREMES, ("largest size", "smallest size"), strict=True):
+                yield words, repr(self._drawn(size.leading, name))
+            if size.another_exam is not None:
+                yield f"largest size {exams_label(size.figures.get('between_map_sd'))}", repr(self.max_size_mm)
+        if (chance := getattr(self, "detected_probability", None)) is not None:
+            yield "probability of a lump", f"{chance:.2f}"
 
     def _repr_html_(self) -> str:
         told = "".join(f"<p>{escape(line)}</p>" for line in finding_lines(self.findings, paper=True))
@@ -175,15 +175,6 @@ class MassEstimate(Sized, eq=False, dict=True):
     @property
     def _found(self) -> Estimate:
         return self.mass.estimate
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """What speaks against its size, cautions first."""
-        return self._found.findings
-
-    def _rows(self) -> Iterator[tuple[str, str]]:
-        yield from super()._rows()
-        yield "probability of a lump", f"{self.detected_probability:.2f}"
 
     @property
     def centre_mm(self) -> tuple[float, float]:
@@ -306,16 +297,6 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
     def detected_probability(self) -> float | None:
         """Probability that the lump, or the likeliest rise, is one where half of the exams hold one; None untested."""
         return self.estimate.probability
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """What speaks against the answer, cautions first."""
-        return self.estimate.findings
-
-    def _rows(self) -> Iterator[tuple[str, str]]:
-        yield from super()._rows()
-        if self.detected_probability is not None:
-            yield "probability of a lump", f"{self.detected_probability:.2f}"
 
     @property
     def amplitude(self) -> Draws | None:

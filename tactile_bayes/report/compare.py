@@ -27,8 +27,9 @@ from tactile_bayes.inference.draws import Quantity, normal_quantile
 from tactile_bayes.options import Comparing
 from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.estimate_document import share_words
 from tactile_bayes.size.pooling import Repeatability
-from tactile_bayes.size.visits import VOLUME, Change, Compared, JointSizes, doubling_days, straight_line
+from tactile_bayes.size.visits import VOLUME, Change, Compared, JointSizes, straight_line
 
 # --- The report, as `compare --json` prints it.
 
@@ -83,9 +84,6 @@ class Detectable(Record):
 class Rate(Interval):
     """Specific growth rate of the volume in percent per day."""
 
-    median: float
-    low: float
-    high: float
     probability: Annotated[float, Meta(gt=0, lt=1)]
 
 
@@ -254,10 +252,7 @@ def compare_report(
     provenance: Provenance,
     repeatability: Repeatability | None = None,
 ) -> CompareReport:
-    """Report of a comparison from what `estimate` says of each visit's maps.
-
-    `repeatability`: of the site, where the comparison used one.
-    """
+    """Report of a comparison from what `estimate` says of each visit's maps; `repeatability`: the site's, if used."""
     joint, days = compared.joint, comparing.days
     dated = [None] * len(visits) if days is None else days
     later = () if joint is None else range(1, len(visits))
@@ -308,7 +303,9 @@ def _change(compared: Compared, later: int, comparing: Comparing, probability: f
         told = AnotherChange(another.between_map_sd, other.percent(probability), other.probability_above(0.0))
     if days is not None:
         q, apart = change.log_summary(probability), days[later] - days[0]
-        rate = GrowthRate(apart, *_rates([VOLUME * one / apart for one in (q.median, q.low, q.high)], probability))
+        rate = GrowthRate(
+            apart, *growth_rates([VOLUME * one / apart for one in (q.median, q.low, q.high)], probability)
+        )
     return ChangeReport(
         earlier=1,
         later=later + 1,
@@ -331,10 +328,10 @@ def verdict(change: Change) -> Literal["grown", "shrunk", "no_change_shown"]:
     return "shrunk" if q.high < 0.0 else "no_change_shown"
 
 
-def _rates(growth: Sequence[float], probability: float) -> tuple[Rate, Doubling]:
+def growth_rates(growth: Sequence[float], probability: float) -> tuple[Rate, Doubling]:
     """A growth rate in percent of the volume per day, and the doubling times, at its median and its ends."""
     median, low, high = (100.0 * one for one in growth)
-    times = Doubling(*(doubling_days(growth[i]) for i in (0, 2, 1)))
+    times = Doubling(*(float(np.log(2.0) / growth[i]) if growth[i] > 0 else None for i in (0, 2, 1)))
     return Rate(median, low, high, probability), times
 
 
@@ -342,7 +339,7 @@ def _trend(joint: JointSizes, days: Sequence[float], probability: float) -> Tren
     """Straight line of ln d over all visits."""
     line = straight_line(*joint.moments, days)
     half = float(normal_quantile(np.array(0.5 + probability / 2))) * line.sd
-    rates = _rates([VOLUME * (line.per_day + one) for one in (0.0, -half, half)], probability)
+    rates = growth_rates([VOLUME * (line.per_day + one) for one in (0.0, -half, half)], probability)
     return TrendReport(len(days), days[-1] - days[0], *rates, line.departure)
 
 
@@ -424,7 +421,7 @@ def _visit_line(visit: Visit) -> str:
     q = visit.max_size_mm
     if q is None:
         return f"{head}: no size"
-    return f"{head}: largest size {q.median:.1f} mm ({q.low:.1f} to {q.high:.1f}, {_share(q)} interval)"
+    return f"{head}: largest size {q.median:.1f} mm ({q.low:.1f} to {q.high:.1f}, {share_words(q)} interval)"
 
 
 def _place_line(place: VisitPlace, *, name: bool = False) -> list[str]:
@@ -442,8 +439,8 @@ def _change_lines(change: ChangeReport) -> list[str]:
     odds = [(one.percent, chance_text(one.probability, 3)) for one in change.grown_by]
     more = "".join(f"; that it has grown by more than {percent:g} %: {chance}" for percent, chance in odds)
     lines = [
-        f"Change of the diameter, visit {change.earlier} to {change.later}: {median} % ({low} to {high} %, {_share(q)} "
-        "interval).",
+        f"Change of the diameter, visit {change.earlier} to {change.later}: {median} % ({low} to {high} %, "
+        f"{share_words(q)} interval).",
         f"Probability that it {_direction(change.probability_grown)}{more}.",
     ]
     if another is None:
@@ -506,7 +503,3 @@ def _model_line(report: CompareReport) -> str:
 def signed(percent: float) -> str:
     """Whole percent with its sign; none has no sign."""
     return f"{round(percent):+d}" if round(percent) else "0"
-
-
-def _share(q: Quantity) -> str:
-    return f"{100 * q.probability:g} %"

@@ -32,11 +32,6 @@ from tactile_bayes.size.draws import EXTREMES, SIZES, SizePosterior
 WIDTHS = ("amplitude", "sigma_x_mm", "sigma_y_mm", "background", "noise_sd")
 
 
-def leading_size(size: SizePosterior) -> SizePosterior:
-    """The posterior of a size that leads; see `leading`."""
-    return size if size.another_exam is None else size.another_exam
-
-
 def estimate_quantities(estimate: Estimate, tactile_map: TactileMap, *, probability: float) -> dict[str, Quantity]:
     """Summaries of all quantities that an estimate has draws of, by name; empty without an estimate."""
     if estimate.map_posterior is None or estimate.draws is None:
@@ -285,14 +280,8 @@ def scene_report(choice: SceneChoice) -> reports.SceneReport:
         beside=scene.extra or None,
         structures=tuple(
             reports.StructureReport(
-                name=one.name,
-                odds=_if_finite(one.odds),
-                odds_are_a_bound=one.bound,
-                supported=one.supported,
-                used=one.used,
-                change_sigma_x_sd=_if_finite(one.change_x_sd),
-                change_sigma_y_sd=_if_finite(one.change_y_sd),
-                place=one.place,
+                *(one.name, _if_finite(one.odds), one.bound, one.supported, one.used),
+                *(_if_finite(one.change_x_sd), _if_finite(one.change_y_sd), one.place),
             )
             for one in choice.structures
         ),
@@ -359,6 +348,11 @@ def _pair(supposed: Suppositions | None, median_mm: float, names: tuple[str, str
     pair = [] if supposed is None else [supposed[name] for name in names if name in supposed]
     moves = any(abs(one.max_size_mm.median / median_mm - 1) >= LEAST_CHANGE for one in pair)
     return pair if moves and len(pair) == 2 else []
+
+
+def share_words(size: Quantity | reports.Interval) -> str:
+    """The probability of an interval, such as 95 %."""
+    return f"{100 * size.probability:g} %"
 
 
 def size_words(size: Quantity | reports.Interval, places: int = 1) -> str:
@@ -434,8 +428,8 @@ def mass_words(mass: MassReport, here: MassReport | None) -> str:
     if size is None:
         told = f"no size: {mass.reason}"
     else:
-        share = f"{100 * size.probability:g} %"
-        told = f"largest size {size.median:.1f} mm ({share} interval {size.low:.1f} to {size.high:.1f} mm)"
+        ends = f"{share_words(size)} interval {size.low:.1f} to {size.high:.1f} mm"
+        told = f"largest size {size.median:.1f} mm ({ends})"
     if here is not None:
         for pair in touching_masses([here, mass]):
             told += f"; may be one lump with mass {here.number}, {together_words(pair)}"

@@ -16,7 +16,6 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.result import Estimate, FittedCells, fitted_cells
-from tactile_bayes.report.estimate_document import leading_size
 from tactile_bayes.report.estimate_text import exams_label, no_estimate_line
 from tactile_bayes.report.figure_file import figure_file, finish, load_matplotlib
 from tactile_bayes.report.map import draw_panel, map_figure
@@ -107,7 +106,7 @@ def draw_size(
     Where the largest size has two intervals, the densities are of the one that leads, and a bar below has the other,
     with what it supposes. Draws that are not finite are left out. `name`: nothing that identifies a person.
     """
-    leads = leading_size(size)
+    leads = size.leading
     rows = [("largest", "max_size_mm", _MAX_COLOUR, "-"), ("smallest", "min_size_mm", _MIN_COLOUR, "--")]
     both = [getattr(leads, which).ravel() for _, which, _, _ in rows]
     alike, more = float(np.mean(np.isclose(*both))), ""

@@ -14,7 +14,6 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, UsageError
 from tactile_bayes.files.reports import (
     EstimateReport,
-    Interval,
     MassReport,
     Place,
     Point,
@@ -29,7 +28,7 @@ from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
 from tactile_bayes.mapping.places import ClockPosition, clock_position, clock_text
 from tactile_bayes.mapping.plausibility import WHY_NOT
 from tactile_bayes.posterior.verdict import chance_text
-from tactile_bayes.report.estimate_document import from_xiphoid, others, patient_mm, size_words
+from tactile_bayes.report.estimate_document import from_xiphoid, others, patient_mm, share_words, size_words
 from tactile_bayes.report.estimate_text import shape_text, smallest_text
 from tactile_bayes.size.pooling import DISAGREE
 
@@ -57,12 +56,9 @@ class ExamMass(Record, eq=False):
 
 
 class ExamMap(Record, eq=False):
-    """One map of an exam, with its estimate and its masses, the reported one first.
+    """One map of an exam, with its estimate and its masses, the reported one first."""
 
-    `tactile_map` is None where only the estimate is at hand.
-    """
-
-    tactile_map: TactileMap | None
+    tactile_map: TactileMap | None  #: None where only the estimate is at hand.
     report: EstimateReport
     masses: tuple[ExamMass, ...]
 
@@ -178,7 +174,7 @@ def headline(exam: Exam) -> str:
     size, masses = exam.largest, exam.main.masses
     if size is not None:
         what = "Lump of" if len(masses) < 2 else f"{len(masses)} masses, mass {masses[0].number}"
-        interval = f"{_percent(size)} interval {size.low:.1f} to {size.high:.1f} mm"
+        interval = f"{share_words(size)} interval {size.low:.1f} to {size.high:.1f} mm"
         return f"{what} about {size.median:.1f} mm, {interval}"
     if exam.disagrees:
         return capital(exam.report.reason)
@@ -200,7 +196,7 @@ def size_sentences(exam: Exam) -> Iterator[str]:
     report, size = exam.report, exam.largest
     if size is None:
         return
-    share = _percent(size)
+    share = share_words(size)
     yield f"The largest diameter is about {size.median:.1f} mm (the middle of its probable values)."
     yield f"With a probability of {share} it lies between {size.low:.1f} and {size.high:.1f} mm{_supposed(exam)}."
     alike, spread = report.max_size_mm, report.figures.get("between_map_sd")
@@ -249,7 +245,7 @@ def nothing_sentences(exam: Exam) -> Iterator[str]:
         for number, one in enumerate(() if exam.pooled is None else exam.pooled.maps, start=1):
             size = one.max_size_mm
             if size is not None:
-                ends = f"{_percent(size)}: {size.low:.1f} to {size.high:.1f} mm"
+                ends = f"{share_words(size)}: {size.low:.1f} to {size.high:.1f} mm"
                 yield f"By map {number} alone the largest diameter is about {size.median:.1f} mm ({ends})."
         return
     report, tactile_map = exam.main.report, exam.main.tactile_map
@@ -391,15 +387,10 @@ def facts(exam: Exam) -> Iterator[tuple[str, str]]:
     """What the scans say of the exam, with what was given for the page."""
     if exam.given.name:
         yield "Name", exam.given.name
-    for key, words in (("subject", "Subject"), ("side", "Side"), ("mass", "Mass"), ("visit", "Visit"),
-                       ("posture", "Posture"), ("examiner", "Examiner")):  # fmt: skip
+    for key in ("subject", "side", "mass", "visit", "posture", "examiner"):
         values = list(dict.fromkeys(scan[key] for scan in exam.scans if scan.get(key)))
         if values:
             more = f" and {len(values) - 2} more" if len(values) > 2 else ""
-            yield words, ", ".join(value[:24] for value in values[:2]) + more
+            yield key.capitalize(), ", ".join(value[:24] for value in values[:2]) + more
     if exam.given.day:
         yield "Date", exam.given.day
-
-
-def _percent(quantity: Quantity | Interval) -> str:
-    return f"{100 * quantity.probability:g} %"

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 _PATIENT: Final = Orientation("-x", "+y", PATIENT_WORDS, (0.0, 1.0))
 HALF_MM: Final = 30.0  #: Half the side of the square about the mass that is drawn.
 STEP_MM: Final = 1.0
+_MOST_VISITS: Final = 4
 
 
 class DrawnMap(Record, eq=False):
@@ -54,12 +55,6 @@ class DrawnMap(Record, eq=False):
     def of(cls, tactile_map: TactileMap, report: EstimateReport) -> DrawnMap:
         """A map with the lump of its estimate."""
         return cls(tactile_map, centre_of(report.centre_mm), *ellipse_of(report))
-
-    @property
-    def rotation(self) -> FloatArray:
-        """(2, 2) from the plane's x and y to the patient's; the plane's own without landmarks."""
-        there = self.tactile_map.patient_from_plane
-        return np.eye(2) if there is None else there[:2, :2]
 
 
 class LaidMap(Record, eq=False):
@@ -104,9 +99,10 @@ def _laid(maps: Sequence[DrawnMap], size: Quantity | None, view: Orientation) ->
         one, centre = drawn.tactile_map, drawn.centre_mm
         if centre is None:
             continue
-        rotation = drawn.rotation if in_patient else np.eye(2)
+        rotation = np.eye(2)  # from the plane's x and y
         if in_patient:
             assert one.patient_from_plane is not None
+            rotation = one.patient_from_plane[:2, :2]
             places.append((rotation @ centre + one.patient_from_plane[:2, 3]) * [-1.0, 1.0])
         x, y = np.tensordot(np.linalg.inv(rotation), about, axes=1) + np.reshape(centre, (2, 1, 1))
         values.append(_nearest(one, x, y))
@@ -135,6 +131,11 @@ def _nearest(tactile_map: TactileMap, x_mm: FloatArray, y_mm: FloatArray) -> Flo
     return np.where(inside, found, np.nan)
 
 
+def _shown(laid: Sequence[LaidMap]) -> list[int]:
+    """The visits whose maps are drawn: the first and the last ones."""
+    return [0, *range(max(1, len(laid) - _MOST_VISITS + 1), len(laid))]
+
+
 def common_limits(maps: Sequence[LaidMap]) -> tuple[float, float]:
     """Values at the ends of the colours, one range for all maps."""
     return svg.spread_limits(np.concatenate([one.values[np.isfinite(one.values)] for one in maps]))
@@ -144,7 +145,6 @@ def common_limits(maps: Sequence[LaidMap]) -> tuple[float, float]:
 
 TITLE: Final = "Tactile exams over time"
 _SCALE: Final = 0.7  #: Of life size, of the maps.
-_MOST_MAPS: Final = 4
 
 
 class Course(Record):
@@ -172,7 +172,7 @@ def growth_page(compared: Compared, report: CompareReport, visits: Sequence[Sequ
     """Full HTML page of a comparison; equal comparisons give equal text."""
     laid, view = on_common_axes(report, visits, middle=True)
     limits, words = common_limits(laid), visits[0][0].tactile_map.recipe.value_words
-    shown = [0, *range(max(1, len(laid) - _MOST_MAPS + 1), len(laid))]
+    shown = _shown(laid)
     facts = (("Name", course.name), ("Patient", course.patient), ("Side", course.side), ("Mass", course.mass))
     return page(
         "growth",
@@ -306,8 +306,6 @@ def _mark(one: _Point, scale: float, *, row: int, named: bool) -> Iterator[str]:
 
 # --- Picture of a comparison: the visits' maps on common axes and colours, their difference, and the change of size.
 
-_MOST_VISITS: Final = 4
-
 
 def draw_comparison(
     compared: Compared,
@@ -321,11 +319,9 @@ def draw_comparison(
 
     Maps of a visit are averaged about the mass. With landmarks on all maps the axes are the patient's, at the first
     visit's place, and later visits are moved so that the mass lies on itself. Without, they are the plane's.
-
-    `visits`: maps of each visit; `path`: written as PNG, PDF or SVG; None writes nothing.
     """
     laid, view = on_common_axes(report, visits)
-    shown = [0, *range(max(1, len(laid) - _MOST_VISITS + 1), len(laid))]
+    shown = _shown(laid)
     foot = f"{view.words}; later visits are moved so that the mass lies on itself; maps of a visit are averaged."
     with figure_file(path, size_in=(4.0 * (len(shown) + 1), 7.4), foot=foot, force=force) as figure:
         exam = named_exam("", report.provenance.get("scans", ()))

@@ -9,7 +9,7 @@ import numpy as np
 from tactile_bayes.declarations import UNSET
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
 from tactile_bayes.files.reports import POOLED, EstimateReport, Interval, MassReport, PooledMap, PooledReport
-from tactile_bayes.findings import Finding, by_weight, capital, finding_lines, finding_summary, verdict
+from tactile_bayes.findings import Finding, capital, finding_lines, finding_summary, verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.presets import MATCH_MM, RESEARCH_USE
@@ -104,12 +104,11 @@ def pooled_report(
     size, used = pooled.size, pooled.calibration or calibration
     head = unknown_head(used.recipe.head)
     largest, smallest = (None if size is None else size.summarise(one, probability=probability) for one in EXTREMES)
-    findings = by_weight(_findings(pooled, reports))
     return PooledReport(
         schema=POOLED,
         status=pooled.status,
-        verdict=verdict(findings, answered=size is not None),
-        entries=tuple(one.entry for one in findings),
+        verdict=verdict(pooled.findings, answered=size is not None),
+        entries=tuple(one.entry for one in pooled.findings),
         reason=pooled.reason,
         max_size_mm=largest,
         min_size_mm=smallest,
@@ -143,7 +142,7 @@ def _map(index: int, name: str, report: EstimateReport, pooled: PooledEstimate) 
     )
 
 
-def _findings(pooled: PooledEstimate, reports: Sequence[EstimateReport]) -> Iterator[Finding]:
+def pooled_findings(pooled: PooledEstimate, reports: Sequence[EstimateReport]) -> Iterator[Finding]:
     """What speaks against the size: of the maps in which a lump was found, and of the maps together."""
     if pooled.status == DISAGREE and pooled.one_place is not None and pooled.one_place < LEAST_PROBABILITY:
         yield disagreement(pooled.reason, pooled.one_place)

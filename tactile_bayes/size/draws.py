@@ -249,6 +249,11 @@ class SizePosterior(Record, eq=False):
         given = self.max_size_mm[np.isfinite(self.max_size_mm)]
         return float(np.median(given)) if given.size else float("nan")
 
+    @property
+    def leading(self) -> SizePosterior:
+        """The sizes that lead, as `files.reports.Sized.leading` has it."""
+        return self if self.another_exam is None else self.another_exam
+
     def reshaped(self, shape: tuple[int, ...]) -> SizePosterior:
         """The same draws as arrays of another shape, (chain, draw)."""
         another = None if self.another_exam is None else self.another_exam.reshaped(shape)

@@ -10,6 +10,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Labels, normal_quantile, paired_points, stratified_quantiles
 from tactile_bayes.size.bodies import BodyCalibration, known_body, suppositions
@@ -298,6 +299,7 @@ class PooledEstimate(Record, eq=False):
     """Probability that maps of one mass come out as far apart in size or farther, by the spread of
     `one_size_probability` and, where a second interval is told, by the paper's maps; None without several maps."""
     one_place: float | None = None  #: Likewise for the places of their masses in the patient; None without landmarks.
+    findings: tuple[Finding, ...] = ()  #: Findings against the size, cautions first.
 
 
 def pool_maps(

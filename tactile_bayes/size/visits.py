@@ -79,11 +79,6 @@ class Apart(Record):
         """True where one mass would come out so far apart in less than `LEAST_SAME`."""
         return self.probability < LEAST_SAME
 
-    @property
-    def words(self) -> str:
-        """Distance with its SD, for people."""
-        return f"{self.distance_mm:.0f} mm apart (one mass: SD {self.sd_mm:.0f} mm each way)"
-
 
 def apart(earlier: Place, later: Place, *, registration_mm: float = REGISTRATION_MM) -> Apart:
     """Compare the places of two visits; `registration_mm` is s, the SD each way of one mass's place between two."""
@@ -407,10 +402,7 @@ class Trend(Record):
 
 
 def straight_line(log_size: FloatArray, covariance: FloatArray, days: Sequence[float]) -> Trend:
-    """Fit ln d of several visits by generalised least squares, with flat priors of level and slope.
-
-    The covariance holds what the visits share, so that it cancels in the slope.
-    """
+    """Fit ln d of several visits by generalised least squares, flat priors; what they share cancels in the slope."""
     columns = np.stack([np.ones(len(days)), np.array(days) - np.mean(days)], axis=1)
     weighted = np.linalg.solve(covariance, columns)
     spread = np.linalg.inv(columns.T @ weighted)
@@ -419,11 +411,6 @@ def straight_line(log_size: FloatArray, covariance: FloatArray, days: Sequence[f
     square, dof = left @ np.linalg.solve(covariance, left), len(days) - 2
     departure = float(chdtrc(dof, square)) if dof > 0 else None
     return Trend(float(line[0]), float(line[1]), float(np.sqrt(spread[1, 1])), departure)
-
-
-def doubling_days(rate_per_day: float) -> float | None:
-    """Doubling time of the volume in days by a specific growth rate; None where the volume does not grow."""
-    return float(np.log(2.0) / rate_per_day) if rate_per_day > 0 else None
 
 
 class Compared(Record, eq=False):

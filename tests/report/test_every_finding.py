@@ -96,7 +96,8 @@ class Made:
         estimate = replace(one.estimate, findings=self.findings)
         self.estimate = replace(one, tactile_map=self.map, estimate=estimate)
         self.answer = self.estimate.answer
-        self.pooled = replace(pooled, pooled_report=replace(pooled.pooled_report, **told))
+        together = replace(pooled.pooled, findings=self.findings)
+        self.pooled = replace(pooled, pooled=together, pooled_report=replace(pooled.pooled_report, **told))
         inside = replace(compared.compared, findings=self.findings)
         self.compared = replace(compared, compared=inside, report=replace(compared.report, **told))
 

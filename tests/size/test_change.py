@@ -12,6 +12,7 @@ from plain_calibration import plain_calibration
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
+from tactile_bayes.report.compare import growth_rates
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, ShapePrior
 from tactile_bayes.size.pooling import POOLED_DRAWS, SizePriors, pooled_size
@@ -24,7 +25,6 @@ from tactile_bayes.size.visits import (
     AmplitudeLaw,
     JointSizes,
     SharedBody,
-    doubling_days,
     joint_sizes,
     straight_line,
     visit_calibrations,
@@ -394,6 +394,8 @@ def test_a_straight_line_through_equal_independent_visits_is_least_squares():
 
 
 def test_a_volume_that_grows_by_one_percent_a_day_doubles_in_69_days():
-    assert doubling_days(0.01) == pytest.approx(69.3, abs=0.1)
-    assert doubling_days(0.0) is None
-    assert doubling_days(-0.01) is None
+    rate, doubling = growth_rates([0.01, 0.0, 0.02], 0.9)
+    assert (rate.median, rate.low, rate.high, rate.probability) == (1.0, 0.0, 2.0, 0.9)
+    assert (doubling.median, doubling.shortest) == pytest.approx((69.3, 34.7), abs=0.1)
+    assert doubling.longest is None
+    assert growth_rates([-0.01, -0.02, 0.01], 0.9)[1].median is None
