@@ -137,9 +137,9 @@ def finding_lines(findings: Iterable[Finding], severity: Severity | None = None,
     return [f"{LEADS[one.severity]}{one.sentence(paper=paper)}." for one in shown]
 
 
-def finding_summary(findings: Iterable[Finding], severity: Severity, *, most: int, paper: bool = False) -> list[str]:
+def finding_summary(findings: Iterable[Finding], severity: Severity, *, most: int) -> list[str]:
     """The first findings of one severity in one line that counts the others; empty without any."""
-    texts = [one.sentence(paper=paper) for one in by_weight(findings) if one.severity == severity]
+    texts = [one.sentence() for one in by_weight(findings) if one.severity == severity]
     return joined(texts, most=most, lead=LEADS[severity])
 
 

@@ -73,12 +73,15 @@ def estimate_file(
     return replace(found, name=path.stem)
 
 
-def input_digests(files: Mapping[str, Path], settings: Settings, calibration: Calibration | None) -> dict[str, str]:
+def input_digests(
+    files: Mapping[str, Path | None], settings: Settings, calibration: Calibration | None
+) -> dict[str, str]:
     """Digests of an estimate's inputs by role, with that of the site's repeatability where there is one.
 
     One of sizes by another calibration is refused: another form has another slope, so another spread.
     """
-    digests, found = hash_inputs(**files), settings.repeatability
+    digests = hash_inputs(**{role: path for role, path in files.items() if path is not None})
+    found = settings.repeatability
     if found is None:
         return digests
     if found.sha256:
@@ -115,8 +118,7 @@ def estimate_one(
     options = _options(settings, calibration, tactile_map)
     if notice is not None and (line := many_cells(tactile_map, options.fit_radius_mm)) is not None:
         notice(line)
-    files = {**(inputs or {}), **({"size_calibration": source} if source else {})}
-    files |= {"settings": settings.settings_file} if settings.settings_file else {}
+    files = {**(inputs or {}), "size_calibration": source, "settings": settings.settings_file}
     digests = input_digests(files, settings, calibration)
     if calibration is not None:
         calibration = calibration_for(tactile_map, calibration)
@@ -180,6 +182,15 @@ def _with_place(
     return replace(estimate, findings=by_weight((*side, *estimate.findings, *touching)))
 
 
+def named_calibration(settings: Settings, normalise: str) -> tuple[Path | None, Calibration | None]:
+    """The calibration that was named or given, else the shipped one for maps normalised so, with its path."""
+    given = settings.size_calibration
+    if given is not None and not isinstance(given, str):
+        return None, given
+    path = size_calibration_path(given or default_for(normalise))
+    return path, None if path is None else read_size_calibration(path)
+
+
 def choose_calibration(
     settings: Settings, tactile_map: TactileMap
 ) -> tuple[Path | None, Calibration | None, NoSize | None]:
@@ -187,13 +198,9 @@ def choose_calibration(
 
     None where there is none; then with why the shipped one was not used, unless the user decided.
     """
-    if settings.size_calibration is None or isinstance(settings.size_calibration, str):
-        path = size_calibration_path(settings.size_calibration or default_for(tactile_map.recipe.normalise))
-        if path is None:
-            return None, None, None
-        calibration = read_size_calibration(path)
-    else:
-        path, calibration = None, settings.size_calibration
+    path, calibration = named_calibration(settings, tactile_map.recipe.normalise)
+    if calibration is None:
+        return None, None, None
     if tactile_map.background is None and calibration.recipe.normalise != tactile_map.recipe.normalise:
         why_none = _level_unknown(tactile_map, _options(settings, None, tactile_map))
         if settings.size_calibration is None:

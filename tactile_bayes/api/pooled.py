@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tactile_bayes.api.arguments import PathLike, door, path_of
-from tactile_bayes.api.estimating import estimate_one, input_digests
+from tactile_bayes.api.estimating import estimate_one, input_digests, named_calibration
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, SizedExam, SizeEstimate, check_one_mass, size_priors
 from tactile_bayes.declarations import replace
@@ -18,7 +18,6 @@ from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError
 from tactile_bayes.files.map_nc import write_posterior
 from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.files.reports import EstimateReport, PooledReport
-from tactile_bayes.files.size_json import default_for, read_size_calibration, size_calibration_path
 from tactile_bayes.findings import by_weight
 from tactile_bayes.options import PRIORS
 from tactile_bayes.posterior.estimate import way_to_head
@@ -178,18 +177,13 @@ def common_calibration(
     answers: Sequence[Answer], settings: Settings, *, names: Sequence[str], inputs: Mapping[str, Path]
 ) -> tuple[BodyCalibration, dict[str, str]]:
     """The calibration that sizes all these maps together, and the digests of all files by role."""
-    path, calibration = None, settings.size_calibration
+    ways = sorted({answer.normalise for answer in answers})
+    if settings.size_calibration is None and len(ways) > 1:
+        way_out = "pool maps made by one recipe: make the others again with `map`"
+        raise BadDataError(f"the maps were normalised in several ways ({', '.join(ways)})", way_out=way_out)
+    path, calibration = named_calibration(settings, ways[0])
     if calibration is None:
-        ways = sorted({answer.normalise for answer in answers})
-        if len(ways) > 1:
-            way_out = "pool maps made by one recipe: make the others again with `map`"
-            raise BadDataError(f"the maps were normalised in several ways ({', '.join(ways)})", way_out=way_out)
-        calibration = default_for(ways[0])
-    if isinstance(calibration, str):
-        path = size_calibration_path(calibration)
-        if path is None:
-            raise UsageError("--pool needs a size calibration; leave out --size-calibration none")
-        calibration = read_size_calibration(path)
+        raise UsageError("--pool needs a size calibration; leave out --size-calibration none")
     if not isinstance(calibration, BodyCalibration):
         what = path or settings.calibration_name
         raise UsageError(
@@ -199,5 +193,4 @@ def common_calibration(
         if differs := calibration.recipe.head_differences(answer.head):
             what = f"{name}: the calibration is for another head: {'; '.join(differs)}"
             raise BadDataError(what, way_out=way_to_head(answer.head))
-    files = {**inputs, **({"size_calibration": path} if path else {})}
-    return calibration, input_digests(files, settings, calibration)
+    return calibration, input_digests({**inputs, "size_calibration": path}, settings, calibration)

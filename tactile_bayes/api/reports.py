@@ -170,18 +170,10 @@ _IN_PYTHON = Path("what was given in Python")  #: What messages call a map or an
 
 
 class ExportedFiles(Record):
-    """What an export wrote.
+    """What an export wrote."""
 
-    Parameters
-    ----------
-    paths
-        Of the files.
-    notes
-        What a user should know of them, such as that they name no patient.
-    """
-
-    paths: tuple[Path, ...]
-    notes: tuple[str, ...] = ()
+    paths: tuple[Path, ...]  #: Of the files.
+    notes: tuple[str, ...] = ()  #: What a user should know of them, such as that they name no patient.
 
 
 @takes(IdentityOptions)

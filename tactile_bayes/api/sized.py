@@ -382,13 +382,7 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
 
     @door
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
-        """Draw the posterior of the size; without a size the map with the places looked at.
-
-        Parameters
-        ----------
-        path
-            Also write it there, as PNG, PDF or SVG.
-        """
+        """Draw the posterior of the size, or else the map; with a path also write it, as PNG, PDF or SVG."""
         size = self.estimate.size
         if size is None:
             return self.plot_map(path, force=force)
@@ -401,13 +395,7 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
 
     @door
     def plot_fit(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
-        """Draw data, fit and residual of the fit window side by side; without an estimate the map.
-
-        Parameters
-        ----------
-        path
-            Also write it there, as PNG, PDF or SVG.
-        """
+        """Draw data, fit and residual of the fit window, or else the map; with a path also write it."""
         if self.status != "estimate":
             return self.plot_map(path, force=force)
         return draw_fit(self.tactile_map, self.estimate, path_of(path), name=self._titled, force=force)

@@ -28,10 +28,7 @@ StatedSize = Quantity | Interval
 
 
 def read_stated_size(path: Path, number: int | None = None) -> StatedSize | None:
-    """The largest size that an estimate states, in mm with its interval; None where there was no estimate.
-
-    `number`: which estimate of a list, from 1; a list of one needs none.
-    """
+    """The largest size that an estimate states, mm; `number`: which of a list, from 1; a list of one needs none."""
     head = first_bytes(path, 8)
     if is_json(head):
         return _from_json(path, number)

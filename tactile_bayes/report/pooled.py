@@ -30,10 +30,7 @@ MOST_NAMED = 4
 
 
 def elsewhere(reports: Sequence[EstimateReport]) -> dict[int, tuple[float, float]]:
-    """Maps that report another mass than the common one, with the place of that one on each, mm.
-
-    Empty where a map with a lump has no landmarks, or no two maps show a mass at one place.
-    """
+    """Maps that report another mass than the common one, with its place on each, mm; empty without landmarks."""
     maps = _masses(reports)
     common = _common(maps)
     there = {} if common is None else {i: _nearest(masses, common) for i, masses in maps.items()}
@@ -173,11 +170,7 @@ def pooled_findings(pooled: PooledEstimate, reports: Sequence[EstimateReport]) -
 
 
 def disagreement(what: str, probability: float, if_exams_differ: float | None = None) -> Finding:
-    """Caution where maps are not of one size, or not of one mass.
-
-    `probability`, `if_exams_differ`: of maps of one mass that are as far apart or farther, by the spread supposed and
-    by the paper's.
-    """
+    """Caution where maps are not of one size or mass: one gives maps so far apart with these probabilities only."""
     patients = ""
     if if_exams_differ is not None:
         patients = f" ({chance_text(if_exams_differ, 3)} if exams differ as those of patients did)"

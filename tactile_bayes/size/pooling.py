@@ -73,11 +73,8 @@ class SizePriors(Record):
 def draw_sizes(
     bump: BumpDraws, *, calibration: Calibration, priors: SizePriors, rng: np.random.Generator
 ) -> SizePosterior:
-    """Draw sizes from the (chain, draw) joint draws of one map.
-
-    Eq 6 by axes uses of the priors the spread, for the interval of another exam, and nothing else.
-    """
-    if isinstance(calibration, SizeCalibration):
+    """Draw sizes from the (chain, draw) joint draws of one map."""
+    if isinstance(calibration, SizeCalibration):  # which has the interval of another exam alone of the priors
         another = priors.another_exam or priors.between_maps
         return push_sizes(bump, calibration=calibration, rng=rng, another_exam=another)
     size = pooled_size([ShapeDraws.of(bump)], calibration=calibration, priors=priors, rng=rng)
@@ -209,14 +206,11 @@ def pooled_size(
 
 
 class _Pool(Record, eq=False, dict=True):
-    """Draws of the maps of a mass before a spread between maps is added, with (n, `DIMENSIONS`) points.
-
-    `half` is (n, 2): half the log axis ratio of the lump, in two components; `first_axis` see there.
-    """
+    """Draws of the maps of a mass before a spread between maps is added, with (n, `DIMENSIONS`) points."""
 
     drawn: MassMaps
     points: FloatArray
-    half: FloatArray
+    half: FloatArray  #: (n, 2) half the log axis ratio of the lump, in two components.
     first_axis: FloatArray
     replicates: Labels
     calibration: BodyCalibration
@@ -315,9 +309,10 @@ def pool_maps(
     When fewer than half of the maps show the lump, but for `silent` ones that cannot, there is no size: those that do
     may be the noise's. Maps that are not of one size have none in common.
     """
-    places = [i for i, shape in enumerate(shapes) if shape is not None]
-    if 2 * len(places) < len(shapes) - silent or not places:
-        return PooledEstimate("no_estimate", f"a lump was found on {len(places)} of {len(shapes)} maps")
+    found_on = sum(shape is not None for shape in shapes)
+    few = f"a lump was found on {found_on} of {len(shapes)} maps"
+    if 2 * found_on < len(shapes) - silent or not found_on:
+        return PooledEstimate("no_estimate", few)
     # one order whatever the caller's, so that the order leaves no trace in the draws
     in_order = sorted(((shape, i) for i, shape in enumerate(shapes) if shape is not None), key=lambda one: one[0].order)
     used, places = [shape for shape, _ in in_order], [i for _, i in in_order]
@@ -349,11 +344,10 @@ def pool_maps(
         return PooledEstimate("no_estimate", f"no positive size in {size.invalid} of {size.d_x_mm.size} draws")
     outside = [f"map {i + 1}: {text}" for i, middle in named for text in at_depth.outside(*middle)]
     outside += at_depth.beyond_lumps(size.median_mm)
-    reason = "" if len(places) == len(shapes) else f"a lump was found on {len(places)} of {len(shapes)} maps"
-    if len(used) > 1:
-        weights = {
-            f"weight_{sorted(places).index(i) + 1}": size.figures[f"weight_{j + 1}"] for j, i in enumerate(places)
-        }
+    reason = "" if found_on == len(shapes) else few
+    if found_on > 1:
+        at = {i: number for number, i in enumerate(sorted(places), start=1)}
+        weights = {f"weight_{at[i]}": size.figures[f"weight_{j}"] for j, i in enumerate(places, start=1)}
         size = replace(size, figures={**size.figures, **weights})
     return replace(found, status="estimate", reason=reason, size=size, outside=tuple(outside))
 
@@ -417,9 +411,5 @@ def log_size_alone(calibration: BodyCalibration, shape: ShapeDraws) -> tuple[flo
 def size_alone(
     shape: ShapeDraws, *, calibration: BodyCalibration, priors: SizePriors, rng: np.random.Generator
 ) -> SizePosterior:
-    """Size by a map alone from the draws that pooling keeps of it, without fitting the map again.
-
-    It has the draws of the map one by one, as `estimate_map` gives them, paired with other random points.
-    """
-    used: Sequence[ShapeDraws] = [shape]
-    return pooled_size(used, calibration=calibration.for_maps([shape]), priors=priors, rng=rng)
+    """Size by a map alone from the draws that pooling keeps of it, one by one as `estimate_map` gives them."""
+    return pooled_size([shape], calibration=calibration.for_maps([shape]), priors=priors, rng=rng)

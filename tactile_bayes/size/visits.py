@@ -44,13 +44,10 @@ VOLUME: Final = 3.0  #: d ln V / d ln d of a lump that keeps its form.
 
 
 class Place(Record, eq=False):
-    """Place of a mass at one visit: x and y in the patient's frame, and the covariance of the maps' centres.
-
-    What posture and landmarks add between visits is no part of it.
-    """
+    """Place of a mass at one visit in the patient's frame; what posture and landmarks add is no part of it."""
 
     centre_mm: FloatArray
-    covariance_mm2: FloatArray
+    covariance_mm2: FloatArray  #: Of the maps' centres.
 
     @classmethod
     def mean_of(cls, places: Sequence[Place]) -> Place | None:
