@@ -169,7 +169,7 @@ class Comparison(Told, eq=False):
         return draw_comparison(self.compared, self.report, self._drawn(), path_of(path), force=force)
 
     def _drawn(self) -> list[list[DrawnMap]]:
-        return [[DrawnMap.of(one.tactile_map, one.answer.report) for one in visit] for visit in self.visits]
+        return [[DrawnMap(one.tactile_map, one.answer.report) for one in visit] for visit in self.visits]
 
     def __repr__(self) -> str:
         cautions = finding_lines(self.findings, "caution", paper=True)

@@ -84,8 +84,8 @@ def estimate(tactile_map: Any, *, progress: Callable[[int, int], None] | None = 
     True
     """
     given = map_of(tactile_map)
-    inputs = {} if given.path is None else {"map": given.path}
-    found = estimate_one(given.tactile_map, settings_of(settings), inputs=inputs, scans=given.scans, progress=progress)
+    inputs, used = {"map": given.path}, settings_of(settings)
+    found = estimate_one(given.tactile_map, used, inputs=inputs, scans=given.scans, progress=progress)
     return replace(found, name="" if given.path is None else given.path.stem)
 
 

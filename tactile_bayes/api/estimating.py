@@ -102,7 +102,7 @@ def estimate_one(
     tactile_map: TactileMap,
     settings: Settings,
     *,
-    inputs: Mapping[str, Path] | None = None,
+    inputs: Mapping[str, Path | None] | None = None,
     scans: Sequence[Mapping[str, str]] = (),
     progress: Progress | None = None,
     notice: Notice | None = None,

@@ -15,7 +15,7 @@ from tactile_bayes.api.arguments import PathLike, door, in_keywords, output_path
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, UsageError
-from tactile_bayes.files.map_nc import write_posterior
+from tactile_bayes.files.map_nc import OF_A_MAP, write_posterior
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.findings import Finding, Verdict, finding_lines, verdict
@@ -38,9 +38,6 @@ from tactile_bayes.size.terms import head_profile
 if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
-
-_SHAPES = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm", "angle_rad", "background", "noise_sd")
-
 
 # --- What all estimates of a size have in common, and the masses of a map.
 
@@ -347,7 +344,7 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
         return Draws(values, unit, self.probability, found.draws.labels, found.draws.effective_draws)
 
     def _columns(self) -> dict[str, Draws]:
-        shapes = {name: draws for name in _SHAPES if (draws := self._of_shape(name)) is not None}
+        shapes = {name: draws for name in OF_A_MAP if (draws := self._of_shape(name)) is not None}
         return {**super()._columns(), **shapes}
 
     def _groups(self) -> dict[str, DrawGroup]:

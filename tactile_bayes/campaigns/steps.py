@@ -351,7 +351,7 @@ def make_growth(
     compared = compare_answers(answers, settings, comparing, names=visits, files=files)
     report = compared.report.checked()
     drawn = [
-        [DrawnMap.of(read_map(path), one.report) for path, one in zip(paths, maps, strict=True)]
+        [DrawnMap(read_map(path), one.report) for path, one in zip(paths, maps, strict=True)]
         for paths, maps in zip(files, answers, strict=True)
     ]
     page = growth_page(compared.compared, report, drawn, course)

@@ -199,7 +199,7 @@ def _check_lattice(axes: Mapping[str, FloatArray], cell_mm: float) -> None:
 # --- Posteriors as netCDF that arviz opens: every draw of a map's parameters and of the sizes, and what goes with them.
 
 POSTERIOR_SCHEMA = "tactile-bayes/posterior/1"
-_OF_A_MAP: Final = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm", "angle_rad", "background", "noise_sd")
+OF_A_MAP: Final = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm", "angle_rad", "background", "noise_sd")
 _OF_A_SIZE: Final = ("d_x_mm", "d_y_mm", "max_size_mm", "min_size_mm")
 
 
@@ -240,7 +240,7 @@ def _draws_of(found: Estimate | SizePosterior) -> tuple[str, dict[str, FloatArra
         return "pooled", {name: np.atleast_2d(getattr(found, name)) for name in _OF_A_SIZE}, found.figures
     if found.map_posterior is None or found.draws is None:
         raise ValueError("no estimate, so no posterior to write")
-    draws = {name: getattr(found.map_posterior, name) for name in _OF_A_MAP}
+    draws = {name: getattr(found.map_posterior, name) for name in OF_A_MAP}
     if found.size is not None:
         draws |= {name: getattr(found.size, name) for name in _OF_A_SIZE}
     return found.draws.method, draws, {} if found.diagnostics is None else found.diagnostics.as_dict()

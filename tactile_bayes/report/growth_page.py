@@ -44,17 +44,10 @@ _MOST_VISITS: Final = 4
 
 
 class DrawnMap(Record, eq=False):
-    """A map and its lump: its place, diameters along its own axes, and the angle from x to the first."""
+    """A map with the lump of its estimate."""
 
     tactile_map: TactileMap
-    centre_mm: tuple[float, float] | None  #: On the plane; None where none was found.
-    axes_mm: tuple[float, float] | None = None  #: None without a size.
-    angle_deg: float = 0.0
-
-    @classmethod
-    def of(cls, tactile_map: TactileMap, report: EstimateReport) -> DrawnMap:
-        """A map with the lump of its estimate."""
-        return cls(tactile_map, centre_of(report.centre_mm), *ellipse_of(report))
+    report: EstimateReport
 
 
 class LaidMap(Record, eq=False):
@@ -80,25 +73,28 @@ def on_common_axes(
     sizes = [visit.max_size_mm for visit in report.visits]
     laid = []
     for maps, size in zip(visits, sizes, strict=True):
-        if middle and all(one.centre_mm is None for one in maps):
+        centres = [centre_of(one.report.centre_mm) for one in maps]
+        if middle and not any(centres):
             first = maps[0].tactile_map
             x, y = (float(axis[0] + axis[-1]) / 2 for axis in (first.x_mm, first.y_mm))
-            maps = [DrawnMap(first, (x, y))]
-        laid.append(_laid(maps, size, view))
+            maps, centres = maps[:1], [(x, y)]
+        laid.append(_laid(maps, centres, size, view))
     return laid, view
 
 
-def _laid(maps: Sequence[DrawnMap], size: Quantity | None, view: Orientation) -> LaidMap:
+def _laid(
+    maps: Sequence[DrawnMap], centres: Sequence[tuple[float, float] | None], size: Quantity | None, view: Orientation
+) -> LaidMap:
     """Mean of a visit's maps about its mass, on the screen's axes."""
     along = np.arange(-HALF_MM, HALF_MM + STEP_MM / 2, STEP_MM)
     right, up = np.meshgrid(along, along)
     signs = np.array([1.0 if axis[0] == "+" else -1.0 for axis in (view.right, view.up)])
     about, in_patient = np.stack([signs[0] * right, signs[1] * up]), view is _PATIENT
     values, places, ring = [], [], None
-    for drawn in maps:
-        one, centre = drawn.tactile_map, drawn.centre_mm
+    for drawn, centre in zip(maps, centres, strict=True):
         if centre is None:
             continue
+        one, (axes_mm, angle_deg) = drawn.tactile_map, ellipse_of(drawn.report)
         rotation = np.eye(2)  # from the plane's x and y
         if in_patient:
             assert one.patient_from_plane is not None
@@ -106,9 +102,8 @@ def _laid(maps: Sequence[DrawnMap], size: Quantity | None, view: Orientation) ->
             places.append((rotation @ centre + one.patient_from_plane[:2, 3]) * [-1.0, 1.0])
         x, y = np.tensordot(np.linalg.inv(rotation), about, axes=1) + np.reshape(centre, (2, 1, 1))
         values.append(_nearest(one, x, y))
-        if ring is None and size is not None and drawn.axes_mm is not None:
-            largest = max(drawn.axes_mm)
-            shape = svg.ellipse_mm(drawn.axes_mm, drawn.angle_deg) * size.median / largest  # as its map has it
+        if ring is None and size is not None and axes_mm is not None:
+            shape = svg.ellipse_mm(axes_mm, angle_deg) * size.median / max(axes_mm)  # as its map has it
             ring = signs[:, None] * (rotation @ shape)
     if not values:
         return LaidMap(np.full(right.shape, np.nan), np.zeros(2), None)

@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from plain_reports import compare_report
+from plain_reports import compare_report, estimate_report
 from posterior_maps import bump_map, bump_values, grid_map
 
 import tactile_bayes as tb
 from tactile_bayes.api.maps import Map
 from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import replace
+from tactile_bayes.files.reports import Place
 from tactile_bayes.geometry import rigid
 from tactile_bayes.mapping.map import MapRecipe
 from tactile_bayes.presets import RESEARCH_USE
@@ -29,6 +30,7 @@ PLACE = np.array([60.0, 90.0])
 BESIDE = np.array([12.0, 6.0])
 """From the mass to a second bump, in the patient's frame: to the patient's right, and up."""
 VISITS = tuple(Visit(number, day, None, None, ()) for number, day in ((1, None), (2, 90.0)))
+FOUND = estimate_report(centre_mm=Place(0.0, 0.0))
 REFUSED = compare_report(reason="a test", visits=VISITS)
 
 
@@ -43,7 +45,7 @@ def visit(angle_rad: float, *, height: float, landmarks: bool = True) -> DrawnMa
     frame = np.eye(3)
     frame[:2, :2] = patient_from_plane
     transform = rigid(frame, np.array([*PLACE, 0.0])) if landmarks else None
-    return DrawnMap(replace(made, patient_from_plane=transform, plane_from_base=np.eye(4)), (0.0, 0.0))
+    return DrawnMap(replace(made, patient_from_plane=transform, plane_from_base=np.eye(4)), FOUND)
 
 
 def images(*visits: DrawnMap):
@@ -78,7 +80,7 @@ def test_without_landmarks_the_axes_are_the_planes() -> None:
 
 
 def test_a_visit_without_a_lump_is_left_empty() -> None:
-    found = images(visit(0.0, height=0.4), replace(visit(0.0, height=0.4), centre_mm=None))
+    found = images(visit(0.0, height=0.4), replace(visit(0.0, height=0.4), report=estimate_report()))
     assert np.ma.getmaskarray(found[1].get_array()).all()
 
 
@@ -217,8 +219,8 @@ def test_grids_lie_as_their_files_read_and_scans_without_landmarks_as_every_pict
     away = (10.0, 6.0)
     values = bump_values(amplitude=0.4, x=0.0, y=0.0, sigma_x=3.0, sigma_y=3.0) - 1.0
     made = grid_map(bump_values(amplitude=0.3, x=away[0], y=away[1], sigma_x=2.0, sigma_y=2.0) + values)
-    scan = DrawnMap(replace(made, recipe=MapRecipe("scan", "gain", 1.0), plane_from_base=np.eye(4)), (0.0, 0.0))
-    grid = DrawnMap(replace(made, recipe=MapRecipe("grid", "gain", 1.0), plane_from_base=None), (0.0, 0.0))
+    scan = DrawnMap(replace(made, recipe=MapRecipe("scan", "gain", 1.0), plane_from_base=np.eye(4)), FOUND)
+    grid = DrawnMap(replace(made, recipe=MapRecipe("grid", "gain", 1.0), plane_from_base=None), FOUND)
     for drawn, place, edges in (
         (scan, (-10.0, 6.0), ["+x", "-x", "+y", "-y"]),
         (grid, (10.0, -6.0), ["-x", "+x", "-y", "+y"]),

@@ -207,7 +207,7 @@ def campaign_card(made: Made) -> str:
 
 
 def drawn(made: Made) -> Any:
-    maps = [[DrawnMap.of(made.map, made.answer.report)] for _ in range(2)]
+    maps = [[DrawnMap(made.map, made.answer.report)] for _ in range(2)]
     return draw_comparison(made.compared.compared, made.compared.report, maps, None)
 
 
