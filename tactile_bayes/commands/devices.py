@@ -6,7 +6,7 @@ from typing import get_args
 
 import click
 
-from tactile_bayes.commands.options import FORCE, SPEED, FilePath, FiniteRange, command, output, takes
+from tactile_bayes.commands.options import FORCE, SPEED, FilePath, FiniteRange, command, number, output, takes
 from tactile_bayes.declarations import names_of
 from tactile_bayes.options import FaultOptions, RecordOptions
 from tactile_bayes.presets import TrackerProtocol
@@ -84,14 +84,7 @@ def emulate_command() -> None:
     help=f"Protocol of the tracker to rotate: {', '.join(PROTOCOLS)}.",
 )
 @takes(RecordOptions, "tool")
-@click.option(
-    "--duration",
-    type=FiniteRange(min=0.2),
-    default=10.0,
-    show_default=True,
-    metavar="S",
-    help="How long to rotate it, s.",
-)
+@number("--duration", FiniteRange(min=0.2), 10.0, "How long to rotate it, s.", metavar="S")
 def devices_command() -> None:
     """List the serial ports and the devices that are probably on them.
 

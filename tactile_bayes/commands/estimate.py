@@ -152,7 +152,7 @@ _PERCENT = tuple(100 * share for share in GROWN_BY)
     "exams as alike as simulated ones and as the paper's."
 )  # fmt: skip
 @options.takes(Settings, "seed", "interval")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@options.JSON
 @options.output(
     "GROWTH.html", "HTML", "Write one page: the maps on common axes, the size at each visit, and the change."
 )
@@ -175,7 +175,7 @@ def compare_command() -> None:
 
 @options.command("report", "pages.report_action")
 @click.argument("files", metavar="MAP.nc... [POST.nc|ESTIMATE.json]", nargs=-1, required=True, type=_FILE)
-@click.option("-o", "--output", metavar="EXAM.html", required=True, type=_FILE, help="Page to write.")
+@options.output("EXAM.html", None, "Page to write.", required=True)
 @options.page_options("EXAM.pdf", "Tactile exam")
 @click.option("--date", "day", default="", metavar="YYYY-MM-DD", help="Date to print on the page. Default: none.")
 @options.takes(

@@ -8,6 +8,7 @@ from typing import Final
 
 import click
 
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.commands.options import FORCE, JSON, SESSION, FilePath, command, figure, output, path_option, takes
 from tactile_bayes.declarations import names_of
 from tactile_bayes.files.arrays_layout import GridOptions, Stated, layout_lines
@@ -17,13 +18,7 @@ from tactile_bayes.presets import CORRECTIONS, METHODS
 
 @command("demo", "exam.demo_action")
 @output("DIR", None, "Folder for the files.", default=Path("tactile-bayes-demo"), show_default=True)
-@click.option(
-    "--method",
-    type=click.Choice(METHODS[:3]),
-    default="importance",
-    show_default=True,
-    help="Method of the first estimate; see `estimate --help`.",
-)
+@takes(Settings, "method", type=click.Choice(METHODS[:3]), help="Method of the first estimate; see `estimate --help`.")
 @click.option("--force", is_flag=True, help="Overwrite the files of an earlier demo.")
 def demo_command() -> None:
     """Run the main job on an embedded scan: map, estimate, and the report of a trial.

@@ -286,14 +286,16 @@ def figure(meaning: str, name: str = "--figure") -> Decorator:
     return click.option(name, metavar="FIG.png|.pdf|.svg", type=FilePath(writes="figure"), help=meaning)
 
 
-def number(name: str, kind: _ParamType, default: float, meaning: str) -> Decorator:
+def number(name: str, kind: _ParamType, default: float, meaning: str, **attributes: Any) -> Decorator:
     """An option of a number with a default that its help shows."""
-    return click.option(name, type=kind, default=default, show_default=True, help=meaning)
+    return click.option(name, type=kind, default=default, show_default=True, help=meaning, **attributes)
 
 
-def path_option(name: str, metavar: str, meaning: str, **attributes: Any) -> Decorator:
+def path_option(
+    name: str, metavar: str, meaning: str, *, writes: Format | None = None, required: bool = False
+) -> Decorator:
     """An option that names a file or a folder."""
-    return click.option(name, metavar=metavar, type=FilePath(), help=meaning, **attributes)
+    return click.option(name, metavar=metavar, type=FilePath(writes=writes), help=meaning, required=required)
 
 
 def page_options(metavar: str, title: str) -> Decorator:

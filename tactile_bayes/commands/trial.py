@@ -29,12 +29,7 @@ _FILE = options.FilePath()
 )
 @options.JSON
 @options.output("REPORT.json", "JSON", "Write the report as JSON to this file.")
-@click.option(
-    "--html",
-    metavar="REPORT.html",
-    type=options.FilePath(writes="HTML"),
-    help="Write tables and figures as one self-contained page.",
-)
+@options.path_option("--html", "REPORT.html", "Write tables and figures as one self-contained page.", writes="HTML")
 @options.path_option("--pdf", "REPORT.pdf", options.PRINTED)
 @options.path_option("--protocol", "FILE.toml", "Pre-specified analysis; the report records its hash.")
 @options.FORCE
@@ -102,7 +97,7 @@ def campaign_init_command() -> None:
 
 @options.command("run", "campaign.campaign_run_action", within=campaign_command)
 @click.argument("exams", metavar="EXAMS.csv", type=_FILE)
-@click.option("-o", "--output", required=True, metavar="DIR", type=_FILE, help="Folder for all files.")
+@options.output("DIR", None, "Folder for all files.", required=True)
 @options.takes(CampaignOptions, "excision", "columns", "protocol")
 @options.takes(Settings, "method", help="As `estimate`.")
 @options.takes(
