@@ -224,10 +224,7 @@ def to_plain(record: object, *, digits: int = 9) -> Any:
 
 
 def rounded(value: T, digits: int = 9, *, lists: bool = False) -> T:
-    """A record, or plain data, whose floats have so many significant digits, as files have them.
-
-    With `lists` every tuple is a list, as in JSON.
-    """
+    """A record, or plain data, whose floats have so many significant digits; with `lists` tuples become lists."""
     found: Any = value
     if isinstance(value, msgspec.Struct):
         found = type(value)(**{name: rounded(getattr(value, name), digits) for name in value.__struct_fields__})
@@ -455,13 +452,12 @@ def _parts(kind: Any, value: Any, where: str) -> Iterator[tuple[str, Any, Any]]:
         for one in map(_bare, _members(kind)):
             args = get_args(one)
             if _is_array(one):
-                yield from (
-                    (f"{where}[{i}]", one if isinstance(part, list) else float, part) for i, part in enumerate(value)
-                )
-            if get_origin(one) is tuple and args[-1] is not Ellipsis:
-                yield from ((f"{where}[{i}]", of, part) for i, (of, part) in enumerate(zip(args, value, strict=False)))
-            elif get_origin(one) in (list, tuple):
-                yield from ((f"{where}[{i}]", args[0], part) for i, part in enumerate(value))
+                args = tuple(one if isinstance(part, list) else float for part in value)
+            elif get_origin(one) is list or args[-1:] == (...,):
+                args = args[:1] * len(value)
+            elif get_origin(one) is not tuple:
+                continue
+            yield from ((f"{where}[{i}]", of, part) for i, (of, part) in enumerate(zip(args, value, strict=False)))
 
 
 def _record_for(kind: Any, value: Any) -> Any:

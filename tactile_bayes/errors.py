@@ -63,10 +63,7 @@ def check_number(
     whole: bool = False,
     open_ends: bool = False,
 ) -> None:
-    """Refuse what is no finite number, or lies outside a range, with a `UsageError` that says what can be given.
-
-    `open_ends` refuses the range's ends themselves.
-    """
+    """Refuse what is no finite number, or outside a range (`open_ends`: or at its ends), and say what can be given."""
     if isinstance(value, numbers.Integral if whole else numbers.Real) and not isinstance(value, bool):
         number = float(value)
         inside = (least is None or number >= least) and (most is None or number <= most)

@@ -95,8 +95,7 @@ def estimate_action(
         if map_figure or fit_figure:
             raise UsageError("--map-figure and --fit-figure draw one map; leave out --pool")
         answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
-        printed = {"as_json": as_json, "verbose": verbose}
-        return estimate_pool(maps, answers, settings, output, figure, **printed, force=force)
+        return estimate_pool(maps, answers, settings, output, figure, as_json=as_json, verbose=verbose, force=force)
     if len(maps) == 1:
         with progress_bar("effective draws") as progress:
             found = estimate_file(

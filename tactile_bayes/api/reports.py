@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from tactile_bayes.api.arguments import PathLike, path_of, takes
 from tactile_bayes.api.estimates import estimated, listed, settings_of
-from tactile_bayes.api.estimating import estimate_file
+from tactile_bayes.api.estimating import Notice, estimate_file
 from tactile_bayes.api.maps import Map
 from tactile_bayes.api.pooled import PooledSize, pool_estimates
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
@@ -34,9 +34,6 @@ from tactile_bayes.report.exam_words import Exam, Given, exam_map, headline
 from tactile_bayes.report.pages import PageFiles
 
 # --- The page of an exam from files: maps are estimated, an estimate is taken as it is, repeats are pooled.
-
-Notice = Callable[[str], None]
-Scans = Sequence[Mapping[str, str]]
 
 
 def exam_of_files(
@@ -88,8 +85,7 @@ def _from_estimate(source: Path, path: Path | None) -> Exam:
         report = checked_report(document, EstimateReport, path=source)
     else:
         report = read_estimate(source)
-    scans: Scans = scans_of(report.provenance)
-    tactile_map = None
+    tactile_map, scans = None, scans_of(report.provenance)
     if path is not None:
         if sha256(path) not in [one.sha256 for one in report.origin.inputs if one.role == "map"]:
             raise BadDataError(f"is not the estimate of {path}", way_out="give the map it names", path=str(source))
@@ -146,22 +142,19 @@ def exam_report(
     given = listed(files)
     if not given:
         raise UsageError("nothing was given to report; give maps, or an estimate")
-    exam = replace(_exam(given, settings), given=words)
+    exam: Exam
+    if all(isinstance(one, str | Path) for one in given):
+        exam = exam_of_files([path_of(one) for one in given], lambda: settings_of(settings), typed=settings)
+    elif len(given) == 1 and isinstance(given[0], PooledSize):
+        exam = given[0].exam()
+    else:
+        used = settings_of(settings)
+        if len(given) > 1:
+            refuse_checkpoint(used)
+        exam = exam_of(estimated(given, settings), used)
+    exam = replace(exam, given=words)
     page.write(exam_page(exam))
     return headline(exam)
-
-
-def _exam(given: Sequence[Any], settings: dict[str, Any]) -> Exam:
-    """The exam of files alone, or of what Python holds."""
-    if all(isinstance(one, str | Path) for one in given):
-        return exam_of_files([path_of(one) for one in given], lambda: settings_of(settings), typed=settings)
-    if len(given) == 1 and isinstance(given[0], PooledSize):
-        exam: Exam = given[0].exam()
-        return exam
-    used = settings_of(settings)
-    if len(given) > 1:
-        refuse_checkpoint(used)
-    return exam_of(estimated(given, settings), used)
 
 
 # --- Export of maps and estimates to the files that other systems take.

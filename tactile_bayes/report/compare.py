@@ -140,12 +140,8 @@ class ChangeReport(Record):
     @property
     def for_alike_exams_only(self) -> bool:
         """True where a change is shown, but not if exams differ as patients' did."""
-        another = self.another_exam
-        return (
-            self.verdict != "no_change_shown"
-            and another is not None
-            and another.percent.low <= 0 <= another.percent.high
-        )
+        shown, another = self.verdict != "no_change_shown", self.another_exam
+        return shown and another is not None and another.percent.low <= 0 <= another.percent.high
 
 
 class CompareReport(Report, kw_only=True):

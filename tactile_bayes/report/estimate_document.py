@@ -83,12 +83,8 @@ def lump_place(
     if posterior is None:
         return None
     x_mm, y_mm = posterior.x_mm.ravel(), posterior.y_mm.ravel()
-    return clock_position(
-        tactile_map,
-        (float(np.median(x_mm)), float(np.median(y_mm))),
-        side=side_of(scans),
-        covariance_mm2=np.cov(x_mm, y_mm),
-    )
+    centre = float(np.median(x_mm)), float(np.median(y_mm))
+    return clock_position(tactile_map, centre, side=side_of(scans), covariance_mm2=np.cov(x_mm, y_mm))
 
 
 def place_line(place: Position) -> str:
