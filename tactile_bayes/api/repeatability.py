@@ -83,8 +83,7 @@ def learn_from_exams(
     one_by_one, masses = [repeat for group in groups for repeat in group], []
     if not groups:
         learn_repeatability([], fewest=fewest or FEWEST_MASSES)  # refuses them
-    name, digest = one_by_one[0].calibration, one_by_one[0].calibration_sha256
-    calibration = _calibration(one_by_one, size_calibration)
+    calibration, used = _calibration(one_by_one, size_calibration)
     for group in groups:
         alone = [log_size_alone(calibration, read_shape(one.exam.folder / SHAPE)) for one in group]
         first, values = group[0].exam, np.array(alone)
@@ -103,14 +102,13 @@ def learn_from_exams(
     ]
     settings = {"prior": {"median": PRIOR_MEDIAN, "log_sd": PRIOR_LOG_SD}}
     inputs = {f"draws_{i}": repeat.digest for i, repeat in enumerate(one_by_one, start=1)}
-    provenance = Provenance(COMMAND, settings, {"size_calibration": digest, **inputs})
-    shown = Path(name).name  # a file's folder may say whose it is
+    provenance = Provenance(COMMAND, settings, {"size_calibration": used.sha256, **inputs})
     return size_json.RepeatabilityFile(
         schema="tactile-bayes/repeatability/1",
         research_use=RESEARCH_USE,
         between_map_sd=found.sd,
         probability=PROBABILITY,
-        calibration=size_json.UsedCalibration(shown, digest, calibration.recipe.normalise),
+        calibration=used,
         half_width=_half_widths(one_by_one, found.sd),
         repeats=entries,
         left_out=left_out,
@@ -167,7 +165,7 @@ def _read(exam: ExamFolder) -> _Repeat | str:
     )
 
 
-def _calibration(repeats: Sequence[_Repeat], given: str | None) -> BodyCalibration:
+def _calibration(repeats: Sequence[_Repeat], given: str | None) -> tuple[BodyCalibration, size_json.UsedCalibration]:
     """The one calibration that sized all exams: the one given, or that of its name, or a shipped one."""
     name, digest = repeats[0].calibration, repeats[0].calibration_sha256
     digests = list(dict.fromkeys(one.calibration_sha256 for one in repeats))
@@ -187,7 +185,8 @@ def _calibration(repeats: Sequence[_Repeat], given: str | None) -> BodyCalibrati
     calibration = size_json.read_size_calibration(path)
     if not isinstance(calibration, BodyCalibration):
         raise UsageError(f"the spread between exams is learned through a calibration over bodies, which {name} is not")
-    return calibration
+    shown = Path(name).name  # a file's folder may say whose it is
+    return calibration, size_json.UsedCalibration(shown, digest, calibration.recipe.normalise)
 
 
 def _half_widths(repeats: Sequence[_Repeat], sd: float) -> size_json.HalfWidth:

@@ -215,9 +215,15 @@ def takes(record: type[Record], *names: str, **attributes: Any) -> Decorator:
     `attributes` of `click.option` stand in place of them.
     """
 
+    return _several(*(_option(record, name, attributes) for name in names))
+
+
+def _several(*options: Decorator) -> Decorator:
+    """Options in the order of a command's help."""
+
     def add(command: Callable[..., Any]) -> Callable[..., Any]:
-        for name in reversed(names):
-            command = _option(record, name, attributes)(command)
+        for option in reversed(options):
+            command = option(command)
         return command
 
     return add
@@ -301,16 +307,11 @@ def path_option(
 def page_options(metavar: str, title: str) -> Decorator:
     """``--pdf``, ``--title`` and ``--name``: how a page is printed, and what is printed on it."""
 
-    def add(function: Callable[..., Any]) -> Callable[..., Any]:
-        for one in (
-            click.option("--name", default="", help="Name to print on the page. Default: none."),
-            click.option("--title", default="", help=f"Title of the page. Default: {title}."),
-            path_option("--pdf", metavar, PRINTED),
-        ):
-            function = one(function)
-        return function
-
-    return add
+    return _several(
+        path_option("--pdf", metavar, PRINTED),
+        click.option("--title", default="", help=f"Title of the page. Default: {title}."),
+        click.option("--name", default="", help="Name to print on the page. Default: none."),
+    )
 
 
 PRINTED: Final = "Also print it to PDF, by an installed Chromium or WeasyPrint."

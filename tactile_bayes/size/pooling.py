@@ -147,10 +147,7 @@ def lump_shape(
 
 
 def _axis_ratio(one: ShapeDraws) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance of q and r; where nobody measured r, it is within twice the SD of q about 0.
-
-    It was left out because the map does not speak for it.
-    """
+    """Mean and covariance of q and r; where nobody measured r, as no map speaks for it, within twice q's SD of 0."""
     both = np.stack([one.q, one.r], axis=-1)
     both = both[np.isfinite(both).all(axis=1)]
     mean, covariance = both.mean(axis=0), np.cov(both.T)
