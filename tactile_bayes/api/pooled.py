@@ -21,8 +21,6 @@ from tactile_bayes.files.reports import EstimateReport, PooledReport
 from tactile_bayes.findings import by_weight
 from tactile_bayes.options import PRIORS
 from tactile_bayes.posterior.estimate import way_to_head
-from tactile_bayes.report.estimate_document import side_of
-from tactile_bayes.report.exam_words import Exam
 from tactile_bayes.report.pooled import elsewhere, pooled_findings, pooled_report
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import LEAST_PROBABILITY
@@ -99,10 +97,6 @@ class PooledSize(SizedExam, eq=False, dict=True, kw_only=True):
         """Write the draws of a size, with its report."""
         assert self.pooled.size is not None
         write_posterior(path, self.pooled.size, provenance=self.provenance, report=self.pooled_report, force=force)
-
-    def exam(self) -> Exam:
-        scans = self.provenance.scans
-        return Exam(tuple(one.page_map(side_of(scans)) for one in self.maps), self.pooled_report, scans)
 
 
 def pool_answers(

@@ -27,7 +27,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import estimate_report, patient_mm, side_of
 from tactile_bayes.report.estimate_figures import draw_fit, draw_map, draw_size
 from tactile_bayes.report.estimate_text import estimate_summary, estimate_text, exams_label
-from tactile_bayes.report.exam_words import Exam, ExamMap, Given, exam_map
+from tactile_bayes.report.exam_words import Exam, Given, exam_map
 from tactile_bayes.report.figure_file import named_exam
 from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.scans import HeadShape
@@ -247,8 +247,12 @@ class SizedExam(Sized, eq=False, dict=True, kw_only=True):
         return draw_size(size, path, **shown, force=force)
 
     def exam(self) -> Exam:
-        """What a page of the exam shows."""
-        raise NotImplementedError
+        """What a page of the exam shows: its map, or all maps and the size that was pooled from them."""
+        scans = self.provenance.scans
+        check_one_mass(scans)
+        maps: Sequence[Any] = getattr(self, "maps", (self,))
+        shown = tuple(exam_map(one.tactile_map, one.answer.report, side=side_of(scans)) for one in maps)
+        return Exam(shown, getattr(self, "pooled_report", None), scans)
 
     @door
     def report(
@@ -367,15 +371,6 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
             estimate_summary(estimate, report),
             estimate_text(estimate, report),
         )
-
-    def page_map(self, side: str) -> ExamMap:
-        """The map as a page of the exam shows it; `side` is the breast, as the scans have it."""
-        return exam_map(self.tactile_map, self.answer.report, side=side)
-
-    def exam(self) -> Exam:
-        scans = self.provenance.scans
-        check_one_mass(scans)
-        return Exam((self.page_map(side_of(scans)),), None, scans)
 
     @door
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
