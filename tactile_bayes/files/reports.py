@@ -23,12 +23,11 @@ from tactile_bayes.files.documents import dump_json
 from tactile_bayes.findings import Finding, FindingEntry, Verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.places import Position
+from tactile_bayes.options import Above0, Least0
 
 ESTIMATE: Final = "tactile-bayes/estimate/1"
 POOLED: Final = "tactile-bayes/pooled/1"
 Chance = Annotated[float, Meta(ge=0, le=1)]
-Least0 = Annotated[float, Meta(ge=0)]
-Above0 = Annotated[float, Meta(gt=0)]
 Number1 = Annotated[int, Meta(ge=1)]
 Length = Annotated[float, Meta(gt=0, le=500)]
 Diameter = Length | None

@@ -10,21 +10,11 @@ import numpy as np
 
 from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, field
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.reports import (
-    Above0,
-    Chance,
-    Entries,
-    EstimateReport,
-    Interval,
-    Judgement,
-    Least0,
-    Number1,
-    Report,
-)
+from tactile_bayes.files.reports import Chance, Entries, EstimateReport, Interval, Judgement, Number1, Report
 from tactile_bayes.findings import Finding, capital, finding_lines, finding_summary
 from tactile_bayes.findings import verdict as verdict_of
 from tactile_bayes.inference.draws import Quantity, normal_quantile
-from tactile_bayes.options import Comparing
+from tactile_bayes.options import Above0, Comparing, Least0
 from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import share_words

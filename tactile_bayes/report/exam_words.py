@@ -12,15 +12,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, UsageError
-from tactile_bayes.files.reports import (
-    EstimateReport,
-    MassReport,
-    Place,
-    Point,
-    PooledReport,
-    centre_of,
-    ellipse_of,
-)
+from tactile_bayes.files.reports import EstimateReport, MassReport, Place, Point, PooledReport, centre_of, ellipse_of
 from tactile_bayes.findings import capital
 from tactile_bayes.geometry import apply
 from tactile_bayes.inference.draws import Quantity
