@@ -140,8 +140,7 @@ def _import_scan(source: Path, output: Path, wanted: Wanted) -> list[str]:
         files = wanted.beside.items()
         beside = [of_poses(path, wanted.arrays) if name == "poses" else _BESIDE[name](path) for name, path in files]
         scan, notes = import_arrays(source, wanted.arrays, beside)
-    session = {} if wanted.session_file is None else {"session": wanted.session_file}
-    inputs = hash_inputs(source=source, **session, **wanted.beside)
+    inputs = hash_inputs(source=source, session=wanted.session_file, **wanted.beside)
     settings = {"as": "scan", "lost": list(lost), "correct": list(wanted.corrections), **wanted.arrays.given}
     scan = corrected(with_session(scan, wanted.session_file), wanted.corrections)
     provenance = Provenance("import", settings, inputs=inputs)

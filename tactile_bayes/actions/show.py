@@ -64,8 +64,7 @@ def describe_scan(scan: Scan) -> list[str]:
     """Summary of a scan in a few lines."""
     times, poses = scan.frames.time_s, scan.poses
     span = float(times[-1] - times[0]) if len(times) else 0.0
-    calibration = scan.element_calibration
-    saturated = int((scan.frames.counts >= calibration.saturation_count).sum())
+    saturated = int((scan.frames.counts >= scan.element_calibration.saturation_count).sum())
     duplicates = int((np.diff(poses.time_s) == 0).sum())
     marks = [] if scan.landmarks is None else [name.replace("_", " ") for name in scan.landmarks.points()]
     return [

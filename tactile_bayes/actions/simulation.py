@@ -47,8 +47,8 @@ def simulate_action(
     used = drawn.seed if seed is None else seed
     with progress_bar("frames") as progress:
         made = simulate(drawn, rng=np.random.default_rng(used), fidelity=fidelity, head=head, progress=progress)
-    files = {"scene": scene} | ({"session": session_file} if session_file else {})
-    provenance = Provenance("simulate", {"model": made.truth["model"]}, inputs=hash_inputs(**files), seed=used)
+    inputs = hash_inputs(scene=scene, session=session_file)
+    provenance = Provenance("simulate", {"model": made.truth["model"]}, inputs, seed=used)
     write_scan(output, with_session(made.scan, session_file), provenance=provenance, truth=made.truth, force=force)
     shape = f": {made.truth['shape']}" if made.truth.get("shape") else ""
     lines = [f"{output}: scan, seed {used}", *describe_scan(made.scan), f"model {made.truth['model']}{shape}"]

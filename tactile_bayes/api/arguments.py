@@ -79,8 +79,7 @@ def takes(
     fields = {name: default_of(record, name) for record in records for name in names_of(record) if name not in without}
 
     def made(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
-        shown = inspect.signature(function).parameters
-        own = [one for one in shown.values() if one.kind is not one.VAR_KEYWORD]
+        own = [one for one in inspect.signature(function).parameters.values() if one.kind is not one.VAR_KEYWORD]
         known, entered = [*(one.name for one in own), *fields], door(function)
 
         @wraps(function)

@@ -128,7 +128,7 @@ def analyse(
     """Analyse a trial; `protocol` and `title` are of the pre-specified analysis, where there is one."""
     confidence = Intervals(INTERVAL, method=settings.intervals, resamples=settings.resamples, seed=settings.seed)
     kept = {name: value for name, value in as_dict(settings).items() if name != "seed"}
-    inputs = hash_inputs(**trial.files, **({} if protocol is None else {"protocol": protocol}))
+    inputs = hash_inputs(**trial.files, protocol=protocol)
     made = Provenance("validate", {"interval_probability": INTERVAL, **kept}, inputs, seed=settings.seed)
     report = summarise(
         trial, confidence=confidence, error_ratio=settings.error_ratio, seed=settings.seed, provenance=made.as_dict()

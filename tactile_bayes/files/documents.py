@@ -105,8 +105,7 @@ def _object(pairs: list[tuple[str, Any]], *, way_out: str) -> dict[str, Any]:
 def load_toml(path: Path, *, way_out: str) -> dict[str, Any]:
     """Read a TOML file. Too large, too deep or a number that no double holds is an error."""
     with in_file(path):
-        text = read_text(path, most=TOML_BYTES, way_out=way_out)
-        return parse_toml(text, way_out=way_out)
+        return parse_toml(read_text(path, most=TOML_BYTES, way_out=way_out), way_out=way_out)
 
 
 def parse_toml(text: str, *, way_out: str) -> dict[str, Any]:

@@ -44,9 +44,9 @@ class Provenance(Record):
         }
 
 
-def hash_inputs(**paths: Path) -> dict[str, str]:
-    """Digests of the inputs by role, for `Provenance.inputs`."""
-    return {role: sha256(path) for role, path in paths.items()}
+def hash_inputs(**paths: Path | None) -> dict[str, str]:
+    """Digests of the inputs by role, for `Provenance.inputs`; None is no file."""
+    return {role: sha256(path) for role, path in paths.items() if path is not None}
 
 
 def scan_facts(scan: Scan, file_sha256: str = "") -> dict[str, str]:

@@ -197,8 +197,7 @@ def _of_one_tool(
     header: Line, kinds: Sequence[str], rows: Sequence[Line], names: Sequence[str], given: Stated
 ) -> tuple[dict[str, int], list[Line]]:
     """Columns of one tool, which may stand beside others (as NDI writes them) or in rows between theirs."""
-    first = names[3]
-    sets = [i for i, kind in enumerate(kinds) if kind == first]
+    sets = [i for i, kind in enumerate(kinds) if kind == names[3]]
     at = sets[0]
     if len(sets) > 1:
         numbered = [f"{i + 1}{_port_before(header.fields[:one])}" for i, one in enumerate(sets)]
@@ -486,8 +485,7 @@ def _of_blocks(lines: Sequence[Line], blocks: Sequence[Sequence[Line]], stated: 
     frames = np.array([[line.values for line in block] for block in blocks], dtype=np.float64)
     arrays = {"frames": frames}
     first = blocks[0][0].number
-    titles = [line for line in lines if not line.is_numbers]
-    times = _times_between(titles, [block[0].number for block in blocks])
+    times = _times_between([line for line in lines if not line.is_numbers], [block[0].number for block in blocks])
     if times is not None:
         arrays["frame_time_s"] = times
         notes.append("times of the frames by the lines above them")

@@ -88,7 +88,7 @@ def read_text_table(path: Path, decimal: str | None = None) -> tuple[list[Line],
     separator = separator_of(texts)
     if not separator:
         raise BadDataError("holds no table of numbers", way_out="give one frame or pose a line", path=str(path))
-    split, before = [], 0
+    split = []
     for i, one in enumerate(texts, start=1):
         if one.strip():
             fields = fields_of(one.lstrip("# "), separator)  # numpy writes it before names
@@ -96,11 +96,9 @@ def read_text_table(path: Path, decimal: str | None = None) -> tuple[list[Line],
                 fields = fields_of(one, separator)
             while len(fields) > 1 and not fields[-1]:
                 fields.pop()
-            split.append((i, one, fields, i > before + 1))
-            before = i
+            split.append((i, one, fields, i > 1 and not texts[i - 2].strip()))
     way_out = "state which, --decimal comma" if decimal is None else ""
-    commas = with_comma((fields for _, _, fields, _ in split), way_out=way_out)
-    comma = decimal != "point" and bool(commas)
+    comma = bool(with_comma((fields for _, _, fields, _ in split), way_out=way_out)) and decimal != "point"
     lines = [
         Line(i, text, fields, [number(one, decimal_comma=comma) for one in fields], after)
         for i, text, fields, after in split
@@ -120,7 +118,7 @@ def separator_of(texts: Sequence[str], marks: Sequence[str] = ()) -> str:
         rows = [row for text in sample if _of_numbers(row := fields_of(text, separator), marks)]
         numbers = sum(_is_number(field, marks) for row in rows for field in row)
         made[separator] = numbers, numbers - sum(map(len, rows))
-    best = max(made, key=lambda one: made[one])
+    best = max(made, key=made.__getitem__)
     return best if made[best][0] else ""
 
 

@@ -20,10 +20,8 @@ from tactile_bayes.scans import TrackerPoses
 
 POOL_S = 0.02
 POOL_TAXELS = 2
-# Neighbouring frames share errors over less than this.
-SHARED_S = 0.2
-# A stroke is a run in one direction over at least this far.
-LEAST_REACH_MM = 10.0
+SHARED_S = 0.2  #: Neighbouring frames share errors over less than this.
+LEAST_REACH_MM = 10.0  #: A stroke is a run in one direction over at least this far.
 _CHUNK = 512
 
 
@@ -176,8 +174,7 @@ LEAST_AGREEMENT = 0.8
 # Another convention that agrees better by this, and nearly wholly, is reported: by chance that is rare.
 BETTER_BY = 0.005
 NEARLY_WHOLE = 0.98
-# A motion narrower than this across its longest way (SD, mm) has no normal.
-LEAST_SPREAD_MM = 3.0
+LEAST_SPREAD_MM = 3.0  #: A motion narrower than this across its longest way (SD, mm) has no normal.
 
 
 def corrected_quaternions(wxyz: FloatArray, corrections: Iterable[str]) -> FloatArray:
