@@ -18,7 +18,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, principal_axes
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
-from tactile_bayes.mapping.select import SelectedFrames, frame_figures, refuse_without_frames, timing_figures
+from tactile_bayes.mapping.select import SelectedFrames, chunks, frame_figures, refuse_without_frames, timing_figures
 from tactile_bayes.scans import HeadShape, Landmarks
 
 RATE_HZ: Final = (5.0, 2000.0)  #: Of frames.
@@ -122,10 +122,8 @@ def _still(part: SelectedFrames) -> BoolArray:
     """(n,) True for frames that repeat the one before."""
     counts = part.scan.frames.counts
     still = np.zeros(len(counts), dtype=bool)
-    for start in range(1, len(counts), _CHUNK):
-        here = slice(start, start + _CHUNK)
-        before = counts[start - 1 : start - 1 + _CHUNK][: len(counts[here])]
-        still[here] = (counts[here] != before).mean(axis=(1, 2)) <= _STILL_TAXELS
+    for here in chunks(len(counts) - 1, _CHUNK):
+        still[1:][here] = (counts[1:][here] != counts[:-1][here]).mean(axis=(1, 2)) <= _STILL_TAXELS
     return still
 
 
@@ -135,7 +133,7 @@ def _stillness(part: SelectedFrames, still: BoolArray) -> Iterator[tuple[str, fl
     if len(time_s) < 2 or not used:
         return
     yield "repeated_share", float((still & part.used).sum()) / used
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
+    edges = np.flatnonzero(np.diff(still, prepend=False, append=False))
     frozen = np.zeros(len(time_s), dtype=bool)
     for first, last in edges.reshape(-1, 2).tolist():
         if time_s[last - 1] - time_s[first - 1] >= FROZEN_S:
