@@ -105,12 +105,11 @@ def _import_each(sources: tuple[Path, ...], folder: Path, wanted: Wanted) -> tup
 
 def _kind(source: Path, output: Path | None, wanted: Wanted) -> str:
     """Scan or map: as asked, by the output's suffix, by options that only scans have, else by the source's."""
-    suffix = "" if output is None else output.suffix.lower()
     if wanted.kind is not None:
         return wanted.kind
-    if source.suffix.lower() == ".mcap" or suffix == ".mcap" or (suffix != ".nc" and wanted.of_a_scan):
-        return "scan"
-    return "scan" if suffix != ".nc" and source.suffix.lower() in ARRAY_SUFFIXES else "map"
+    given, suffix = source.suffix.lower(), "" if output is None else output.suffix.lower()
+    arrays = suffix != ".nc" and (wanted.of_a_scan or given in ARRAY_SUFFIXES)
+    return "scan" if arrays or ".mcap" in (given, suffix) else "map"
 
 
 def _import(source: Path, output: Path, wanted: Wanted) -> list[str]:

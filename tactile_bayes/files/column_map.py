@@ -181,9 +181,9 @@ def _reading(row: _Row, reading: ReadingColumns, mapping: ColumnMap) -> dict[str
         status = "not_detected"
     elif text and text not in mapping.not_done:
         status, size = "detected", row.size(reading.size, factor)
-    sd, low, high = (row.number(column, factor) for column in (reading.sd, reading.low, reading.high))
-    probability = None if low is None else reading.probability
-    if status == "detected" and reading.low and low is not None and probability is None:
+    spread = {f"{name}_mm": row.number(getattr(reading, name), factor) for name in ("sd", "low", "high")}
+    probability = None if spread["low_mm"] is None else reading.probability
+    if status == "detected" and reading.low and spread["low_mm"] is not None and probability is None:
         what = "is an interval's end without probability"
         raise row.table.error(row.line, reading.low, what, way_out="add it to the mapping")
     return {
@@ -192,9 +192,7 @@ def _reading(row: _Row, reading: ReadingColumns, mapping: ColumnMap) -> dict[str
         "replicate": reading.replicate,
         "size_mm": size,
         "status": status,
-        "sd_mm": sd,
-        "low_mm": low,
-        "high_mm": high,
+        **spread,
         "probability": probability,
         "reader": (row.cells[reading.reader] or None) if reading.reader else None,
         "visit": reading.visit,

@@ -487,10 +487,9 @@ def _spacing(grid: Grid, *, given: float | None) -> tuple[float, list[str]]:
             raise UsageError(f"a grid needs --spacing-mm, the side of its square cells in mm{told}")
         value, agrees = float(given), mm is None or np.isclose(given, mm, rtol=1e-2, atol=0.0)
         notes = [] if agrees else [f"{told}; {given:g} mm was taken, as stated"]
-    if not 0 < value < 1000:
-        raise BadDataError(f"the spacing is {value:g} mm", way_out="it must be positive, in mm")
-    if value < _LEAST_SPACING_MM:
-        raise BadDataError(f"the spacing is {value:g} mm", way_out="looks like metres, give mm")
+    if not _LEAST_SPACING_MM <= value < 1000:
+        way_out = "looks like metres, give mm" if 0 < value < 1000 else "it must be positive, in mm"
+        raise BadDataError(f"the spacing is {value:g} mm", way_out=way_out)
     return value, notes
 
 

@@ -13,6 +13,7 @@ from typing import IO, Any, Final
 
 import numpy as np
 
+from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files import reading
 from tactile_bayes.files.atomic import write_bytes
@@ -126,7 +127,7 @@ class CheckpointFile:
                 raise BadDataError(f"is no checkpoint of schema {SCHEMA}", way_out="name another file")
             if str(found["sha256"]) != _digest(found):
                 raise BadDataError("is damaged: its checksum does not match", way_out="remove it")
-            if str(found["key"]) != self._bound(key):
+            if str(found["key"]) != f"{key}:{self.context}":
                 what = "is a checkpoint of another map, calibration or setting"
                 way_out = "give the same map and options (only max_steps may differ), or name another file"
                 raise BadDataError(what, way_out=way_out)
@@ -134,14 +135,11 @@ class CheckpointFile:
 
     def save(self, key: str, state: ChainState) -> None:
         """Write the state atomically."""
-        arrays: dict[str, Any] = {"schema": np.array(SCHEMA), "key": np.array(self._bound(key))}
+        arrays: dict[str, Any] = {"schema": np.array(SCHEMA), "key": np.array(f"{key}:{self.context}")}
         arrays |= {name: getattr(state, name) for name in SHAPES}
         buffer = io.BytesIO()
         np.savez(buffer, sha256=np.array(_digest(arrays)), **arrays)
         write_bytes(self.path, buffer.getvalue(), force=True)
-
-    def _bound(self, key: str) -> str:
-        return f"{key}:{self.context}"
 
 
 def _digest(arrays: Mapping[str, np.ndarray[Any, Any]]) -> str:
@@ -161,17 +159,16 @@ _DRAWS: Final = ("log_amplitude", "log_width", "q", "r")
 
 def write_shape(path: Path, shape: ShapeDraws, *, force: bool = False) -> None:
     """Write the draws atomically; fields that are None are left out."""
-    values: dict[str, Any] = {name: getattr(shape, name) for name in shape.__struct_fields__}
+    values = {name: value for name in names_of(shape) if (value := getattr(shape, name)) is not None}
     out = io.BytesIO()
-    np.savez_compressed(out, **{name: value for name, value in values.items() if value is not None})
+    np.savez_compressed(out, **values)
     write_bytes(path, out.getvalue(), force=force)
 
 
 def read_shape(path: Path) -> ShapeDraws:
     """Read what `write_shape` wrote."""
     with in_file(path):
-        optional = [name for name in ShapeDraws.__struct_fields__ if name not in _DRAWS]
-        arrays = load_npz(path, required=_DRAWS, optional=optional)
+        arrays = load_npz(path, required=_DRAWS, optional=names_of(ShapeDraws))
         if len({arrays[name].shape for name in _DRAWS}) > 1:
             raise BadDataError("holds draws of several lengths", way_out="estimate the map again")
         values: dict[str, Any] = dict(arrays)
