@@ -100,9 +100,9 @@ def is_header_of_poses(line: Line) -> bool:
 
 
 def seen(
-    time: FloatArray, numbers: FloatArray, why: Sequence[str], *, layout: str, stated: Mapping[str, Any] | None = None
+    time: FloatArray, numbers: FloatArray, why: Sequence[str], *told: str, layout: str, stated: Mapping[str, Any] = {}
 ) -> Source:
-    """Poses of the rows in which the tool is seen; the others are counted by their reasons.
+    """Poses of the rows in which the tool is seen; the others are counted by their reasons, after what is `told`.
 
     `numbers` are (m, k) places and then rotations in the layout, or (m, 16) matrices; `why` says why a row has no pose,
     by its status, and is empty where it has one.
@@ -112,13 +112,13 @@ def seen(
     counted = ", ".join(f"{number} {reason}" for reason, number in Counter(filter(None, reasons)).most_common())
     if not keep.any():
         raise BadDataError(f"has no pose in which the tool is seen ({counted})", way_out="give another file")
-    notes = [f"{(~keep).sum()} of {len(keep)} poses left out as gaps: {counted}"] if counted else []
+    notes = (*told, f"{(~keep).sum()} of {len(keep)} poses left out as gaps: {counted}") if counted else told
     arrays = {"pose_time_s": time[keep]}
     if layout == "matrix":
         arrays["pose_matrix"] = numbers[keep]
     else:
         arrays |= {"position_mm": numbers[keep, :3], "quaternion_wxyz": numbers[keep, 3:]}
-    return Source(arrays, Stated(**{"pose_layout": layout, **(stated or {})}), tuple(notes))
+    return Source(arrays, Stated(**{"pose_layout": layout, **stated}), notes)
 
 
 def _without(row: FloatArray, layout: str) -> str:
@@ -181,9 +181,8 @@ def _named(lines: Sequence[Line], header: Line, given: Stated) -> Source:
     elif layout == "euler" and given.length_unit is None:
         raise BadDataError("does not say the unit of x, y and z", way_out="give --length-unit cm, inch or mm")
     why = _unseen(status, given) if "status" in columns else status
-    found = seen(time, numbers, why, layout=layout, stated=stated)
     named = f"poses by the names of line {header.number}: {', '.join(header.fields[columns[one]] for one in names)}"
-    return replace(found, notes=(named, *found.notes))
+    return seen(time, numbers, why, named, layout=layout, stated=stated)
 
 
 def _named_matrix(fields: Sequence[str]) -> tuple[str, ...]:
@@ -305,11 +304,10 @@ def _bare(lines: Sequence[Line], given: Stated) -> Source:
         if len(stations) <= _MOST_STATIONS < len(values):
             keep &= column == float(chosen(stations, given, what="its rows (stations)"))
     time, unit, told = _bare_times(before[keep], given, f"has {width} numbers a row")
-    found = seen(time, numbers[keep], [""] * len(time), layout=layout, stated=unit)
     notes = [f"poses as {layout} from column {width - size + 1} on, times {told}"]
     if lost := sum(line.number > rows[0].number for line in lines) + 1 - len(values):
         notes.append(f"{lost} lines of other than {width} numbers left out as gaps")
-    return replace(found, notes=(*notes, *found.notes))
+    return seen(time, numbers[keep], [""] * len(time), *notes, layout=layout, stated=unit)
 
 
 def _bare_times(before: FloatArray, given: Stated, what: str) -> tuple[FloatArray, dict[str, Any], str]:
