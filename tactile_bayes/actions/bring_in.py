@@ -139,11 +139,10 @@ def _import_scan(source: Path, output: Path, wanted: Wanted) -> list[str]:
         files = wanted.beside.items()
         beside = [of_poses(path, wanted.arrays) if name == "poses" else _BESIDE[name](path) for name, path in files]
         scan, notes = import_arrays(source, wanted.arrays, beside)
-    inputs = hash_inputs(source=source, session=wanted.session_file, **wanted.beside)
     settings = {"as": "scan", "lost": list(lost), "correct": list(wanted.corrections), **wanted.arrays.given}
     scan = corrected(with_session(scan, wanted.session_file), wanted.corrections)
-    provenance = Provenance("import", settings, inputs=inputs)
-    write_scan(output, scan, provenance=provenance, truth=truth, force=wanted.force)
+    inputs = hash_inputs(source=source, session=wanted.session_file, **wanted.beside)
+    write_scan(output, scan, provenance=Provenance("import", settings, inputs), truth=truth, force=wanted.force)
     return [*describe_scan(scan), *notes, *(f"lost: {line}" for line in lost), *_arrangement_lines(scan)]
 
 

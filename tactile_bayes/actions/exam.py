@@ -46,8 +46,7 @@ def check_action(
             click.echo(f"  {line}")
         wrong += check.refused
         if output is not None:
-            doubted = any(one.kind not in _OF_RECORDING for one in check.doubts)
-            if check.too_short or check.findings or doubted:
+            if check.too_short or check.findings or any(one.kind not in _OF_RECORDING for one in check.doubts):
                 what = "the scan does not show that its head is right"
                 raise BadDataError(what, way_out="scan a phantom with a lump")
             day = datetime.now(tz=UTC).date().isoformat()

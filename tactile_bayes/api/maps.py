@@ -179,8 +179,7 @@ def build_map(
             f"scan {later + 1} is the recording of scan {earlier + 1}, whose frames would count twice; give it once"
         )
     asked = {name: plain(value) for name, value in options.items()}
-    made = build(loaded, max_pose_gap_ms=max_pose_gap_ms, progress=progress, **asked)
-    return Map(made, scans=tuple(facts))
+    return Map(build(loaded, max_pose_gap_ms=max_pose_gap_ms, progress=progress, **asked), scans=tuple(facts))
 
 
 @door

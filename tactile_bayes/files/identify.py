@@ -10,19 +10,21 @@ from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files import scan_mcap
 from tactile_bayes.files.documents import load_json, load_schema, parse_json
 from tactile_bayes.files.map_nc import read_map_and_header
-from tactile_bayes.files.mcap_records import McapRecords
 from tactile_bayes.files.netcdf import Group, open_netcdf
 from tactile_bayes.files.reading import HDF5_MAGIC, MCAP_MAGIC, first_bytes, is_json
 from tactile_bayes.files.size_json import read_repeatability, read_size_calibration
 from tactile_bayes.files.tables import header_of, read_table
 from tactile_bayes.findings import finding_lines, findings_in
-from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.select import Span, missing_records, with_times
 from tactile_bayes.scans import HeadGeometry
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.pooling import Calibration
 
 _UNITS = {"sigma": "mm", "d": "mm", "amplitude": "1 is the background"}
+_ACCOUNT = (
+    *("frames_lost", "head_dropped", "poses_repeated", "poses_flagged", "flagged_why", "poses_missing", "missing_why"),
+    *("other_tools", "overrun_bytes", "ended_by", "fault"),
+)
 _TABLES = ("trial", "excision", "exams", "population", "size_table", "phantom_maps")
 
 
@@ -213,6 +215,9 @@ def _scan(path: Path) -> dict[str, Any]:
         findings = with_times(scan_mcap.file_findings(records), Span.of(time_s), Span.of(pose_s))
         provenance = scan_mcap.provenance_of(records)
     span_s = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
+    account = records.metadata.get("recording", {})  # of the recorder, where it wrote the file
+    told = {name: account[name] for name in _ACCOUNT if account.get(name)}
+    logs = [number for number, channel in records.channels.items() if channel.topic == "/log"]
     return {
         "schema": scan_mcap.SCAN_SCHEMA,
         "kind": "scan",
@@ -223,21 +228,12 @@ def _scan(path: Path) -> dict[str, Any]:
         "poses": len(pose_s),
         "duration_s": span_s,
         "frame_rate_hz": (len(time_s) - 1) / span_s if span_s > 0 else None,
-        **_recording(records, time_s),
+        "frames_missing": missing_records(time_s),
+        "notes": sum(len(records.by_channel.get(number, ())) for number in logs),
+        **({"recording": told} if told else {}),
         "landmarks": all(touches[name] for name in scan_mcap.LANDMARK_NAMES),
         "nipple": touches[scan_mcap.NIPPLE] > 0,
         "units": {"counts": "raw, 0 to saturation", "pressure": "kPa", "position": "mm", "time": "s"},
         "session": dict(records.metadata.get("session", {})),
         "provenance": provenance,
     }
-
-
-def _recording(records: McapRecords, time_s: FloatArray) -> dict[str, Any]:
-    """Losses: gaps between the frames' times, and the recorder's account if the file has one."""
-    losses = ("frames_lost", "head_dropped", "poses_repeated", "poses_flagged", "flagged_why", "poses_missing")
-    names = (*losses, "missing_why", "other_tools", "overrun_bytes", "ended_by", "fault")
-    account = records.metadata.get("recording", {})
-    told = {name: account[name] for name in names if account.get(name)}
-    logs = [number for number, channel in records.channels.items() if channel.topic == "/log"]
-    notes = sum(len(records.by_channel.get(number, ())) for number in logs)
-    return {"frames_missing": missing_records(time_s), "notes": notes} | ({"recording": told} if told else {})

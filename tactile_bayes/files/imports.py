@@ -59,15 +59,11 @@ def import_arrays(path: Path, given: ArrayMap, beside: Sequence[Source] = ()) ->
         own = replace(_read(path, given, beside), path=str(path))
     try:
         return combined([own, *beside], given)
-    except BadDataError as error:
-        raise error.at(_source_of(error, [own, *beside])) from None
-
-
-def _source_of(error: BadDataError, sources: Sequence[Source]) -> str:
-    """Path of the file whose array an error begins with; the frames' file for all others."""
-    name = {"counts": "frames"}.get(error.what.split()[0], error.what.split()[0])
-    same = {name, "pose_matrix"} if name in ("position_mm", "quaternion_wxyz") else {name}
-    return next((one.path for one in reversed(sources) if one.path and same & set(one.arrays)), sources[0].path)
+    except BadDataError as error:  # its first word is an array at fault, of whose file it is
+        name = {"counts": "frames"}.get(error.what.split()[0], error.what.split()[0])
+        same = {name, "pose_matrix"} if name in ("position_mm", "quaternion_wxyz") else {name}
+        of_it = (one.path for one in reversed(beside) if one.path and same & set(one.arrays))
+        raise error.at(next(of_it, path)) from None
 
 
 def _over(given: Stated, said: Stated) -> Stated:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
 from typing import Any, Final
@@ -207,11 +207,10 @@ def _check_masses(table: Table, exams: Sequence[Exam]) -> None:
                 raise table.error(row, column, f"{told}, of the same mass", way_out=way_out)
 
 
-def write_manifest(path: Path, rows: Iterable[Mapping[str, object]], *, force: bool = False) -> None:
+def write_manifest(path: Path, rows: Sequence[Mapping[str, object]], *, force: bool = False) -> None:
     """Write a table of exams; keys of the rows are columns, those that no row has are left out."""
-    held = list(rows)
-    filled = [name for name in columns_of("exams") if any(row.get(name) is not None for row in held)]
-    write_text(path, table_text(held, filled or columns_of("exams")), force=force)
+    filled = [name for name in columns_of("exams") if any(row.get(name) is not None for row in rows)]
+    write_text(path, table_text(rows, filled or columns_of("exams")), force=force)
 
 
 def read_rows(path: Path) -> RawTable:

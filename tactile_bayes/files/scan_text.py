@@ -155,8 +155,10 @@ def _named(lines: Sequence[Line], header: Line, given: Stated) -> Source:
         for i, kind in enumerate(kinds):
             if kind == "qw" and kinds[max(i - 3, 0) : i] == list(_PLACE):  # of a quaternion, not of a place
                 kinds[i - 3 : i] = ["qx", "qy", "qz"]
-    turned = _named_matrix(header.fields)
-    kinds = [name if name in turned else kind for name, kind in zip(map(str.lower, header.fields), kinds, strict=True)]
+    lower = [name.lower() for name in header.fields]
+    rotations = (tuple(f"r{i}{j}" for i in range(k, k + 3) for j in range(k, k + 3)) for k in (0, 1))  # row by row
+    turned = next((names for names in rotations if set(names) <= set(lower)), ())
+    kinds = [name if name in turned else kind for name, kind in zip(lower, kinds, strict=True)]
     layout = "matrix" if turned else "wxyz" if {"qw", "qx", "qy"} & set(kinds) else "euler"
     names = (*_PLACE, *(turned or _ROTATIONS[layout]))
     if not set(names) <= set(kinds):
@@ -183,13 +185,6 @@ def _named(lines: Sequence[Line], header: Line, given: Stated) -> Source:
     why = _unseen(status, given) if "status" in columns else status
     named = f"poses by the names of line {header.number}: {', '.join(header.fields[columns[one]] for one in names)}"
     return seen(time, numbers, why, named, layout=layout, stated=stated)
-
-
-def _named_matrix(fields: Sequence[str]) -> tuple[str, ...]:
-    """Names of the nine numbers of a rotation matrix, row by row, from R00 or R11 on; empty without them."""
-    held = {name.lower() for name in fields}
-    each = (tuple(f"r{i}{j}" for i in range(first, first + 3) for j in range(first, first + 3)) for first in (0, 1))
-    return next((names for names in each if held.issuperset(names)), ())
 
 
 def _of_one_tool(

@@ -82,8 +82,7 @@ def _poses(keys: dict[str, str], given: Stated) -> Source:
     if not np.isfinite(time).all():
         raise BadDataError("has frames without a time", way_out="give the times, Seq_Frame0000_Timestamp")
     matrices = _numbers(_each(keys, f"{tool}Transform", number), 16)
-    told = f"poses by {tool}Transform"
-    return seen(time, matrices, why, told, layout="matrix", stated={"pose_time_unit": "s"})
+    return seen(time, matrices, why, f"poses by {tool}Transform", layout="matrix", stated={"pose_time_unit": "s"})
 
 
 def _frames(keys: dict[str, str], data: bytes) -> Arrays:
