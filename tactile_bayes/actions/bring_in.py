@@ -162,13 +162,12 @@ def _import_map(source: Path, output: Path, wanted: Wanted) -> list[str]:
         provenance = Provenance("import", {"as": "map", **asked, "notes": notes}, inputs=hash_inputs(source=source))
         write_map(output, tactile_map, provenance=provenance, force=wanted.force)
     ny, nx = tactile_map.mean.shape
-    covered = int(tactile_map.covered.sum())
     low, high = np.nanmin(tactile_map.mean), np.nanmax(tactile_map.mean)
     unit = tactile_map.recipe.value_unit
     unit = "" if unit == "1" else f" {unit or '(unit unknown: give --units)'}"
     level = "unknown" if tactile_map.background is None else f"{tactile_map.background:g}"
     return [
-        f"{ny} x {nx} cells of {tactile_map.recipe.cell_mm:g} mm, {covered} with data",
+        f"{ny} x {nx} cells of {tactile_map.recipe.cell_mm:g} mm, {int(tactile_map.covered.sum())} with data",
         f"values {low:.4g} to {high:.4g}{unit}, background level {level} (normalise {tactile_map.recipe.normalise})",
         *notes,
         *finding_lines(tactile_map.findings),

@@ -93,8 +93,7 @@ def _numbers_within(rows: Sequence[list[str]], no_value: Sequence[str]) -> tuple
         faulty = next((row for row in rows if any(map(is_number, row))), None)
         if faulty is None:
             held = next((field for row in rows for field in row if field), "")
-            what = f"holds {held[:30]!r} and no number" if held else "is empty"
-            raise BadDataError(what, way_out=_WAY_OUT)
+            raise BadDataError(f"holds {held[:30]!r} and no number" if held else "is empty", way_out=_WAY_OUT)
         return rows.index(faulty), len(rows)
     first, last = plain[0], plain[-1] + 1
     while last < len(rows) and any(map(is_number, rows[last])):  # a faulty row is told, not left out

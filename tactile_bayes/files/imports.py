@@ -422,8 +422,7 @@ def _check_numbers(arrays: Arrays) -> None:
         if not finite.all():
             index = tuple(int(i) for i in np.unravel_index(int(finite.argmin()), finite.shape))
             where = f" (first at {index})" if index else ""
-            number = finite.size - int(finite.sum())
-            what = f"{name} holds {number} values that are not finite{where}"
+            what = f"{name} holds {finite.size - int(finite.sum())} values that are not finite{where}"
             raise BadDataError(what, way_out="repair or leave them out")
 
 

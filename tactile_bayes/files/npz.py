@@ -122,8 +122,7 @@ class CheckpointFile:
                 found = load_npz(self.path, required=["schema", "key", "sha256", *SHAPES], optional=())
             except BadDataError as error:
                 raise BadDataError(f"is no checkpoint: {error.what}", way_out="name another file") from None
-            shaped = all(found[name].ndim == n for name, n in SHAPES.items())
-            if str(found["schema"]) != SCHEMA or not shaped:
+            if str(found["schema"]) != SCHEMA or any(found[name].ndim != n for name, n in SHAPES.items()):
                 raise BadDataError(f"is no checkpoint of schema {SCHEMA}", way_out="name another file")
             if str(found["sha256"]) != _digest(found):
                 raise BadDataError("is damaged: its checksum does not match", way_out="remove it")

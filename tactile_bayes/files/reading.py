@@ -343,5 +343,4 @@ def _why(error: Exception) -> str:
         return "there is no such file"
     if isinstance(error, PermissionError):
         return "access denied"
-    text = " ".join(str(error).split())
-    return re.sub(r"\?\S+", "?...", text)[:200] or type(error).__name__
+    return re.sub(r"\?\S+", "?...", " ".join(str(error).split()))[:200] or type(error).__name__

@@ -200,8 +200,7 @@ def _of_one_tool(
     columns = {kind: _nearest(kinds, kind, at, pose=kind in names, ahead=ahead) for kind in set(kinds) if kind}
     held = list(rows)
     if len(sets) == 1 and "tool" in columns:
-        tools = dict.fromkeys(_field(line, columns["tool"]) for line in rows)
-        tool = chosen(list(tools), given, what="its rows")
+        tool = chosen(list(dict.fromkeys(_field(line, columns["tool"]) for line in rows)), given, what="its rows")
         held = [line for line in rows if _field(line, columns["tool"]) == tool]
     return columns, held
 

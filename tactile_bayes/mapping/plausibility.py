@@ -329,8 +329,7 @@ def _of_cells(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
         )
         yield text, "check whether the readings fall where pressure rises, and leave out what lies off the tissue"
     count = tactile_map.count[covered]
-    held = tactile_map.mean[covered][count >= FEW_READINGS * float(tactile_map.counts_known)]
-    yield from _of_values(held)
+    yield from _of_values(tactile_map.mean[covered][count >= FEW_READINGS * float(tactile_map.counts_known)])
 
 
 def _extremes(tactile_map: TactileMap) -> tuple[float, float]:
