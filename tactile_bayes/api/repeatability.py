@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from scipy.special import ndtri
 
 from tactile_bayes.api.arguments import PathLike, door, output_path, required_path
 from tactile_bayes.declarations import Record
@@ -20,7 +21,7 @@ from tactile_bayes.files.npz import read_shape
 from tactile_bayes.files.provenance import Provenance, recordings, scans_of
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.files.tables import read_raw
-from tactile_bayes.inference.draws import Quantity, normal_quantile
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.learn.site import FEWEST_MASSES, PRIOR_LOG_SD, PRIOR_MEDIAN, RepeatedExams, learn_repeatability
@@ -197,7 +198,7 @@ def _half_widths(repeats: Sequence[_Repeat], sd: float) -> size_json.HalfWidth:
     before, after = [], []
     for repeat in repeats:
         size, spread = repeat.size, repeat.spread
-        score = float(normal_quantile(np.array(0.5 + 0.5 * size.probability)))
+        score = float(ndtri(0.5 + 0.5 * size.probability))
         variance = (math.log(size.high / size.low) / (2.0 * score)) ** 2
         before.append(variance)
         after.append(max(variance - spread**2, 0.0) + sd**2)

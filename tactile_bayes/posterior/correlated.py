@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import ndtri
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import MOST_PAIRED, ParameterDraws, Solved, normal_quantile, paired_points
+from tactile_bayes.inference.draws import MOST_PAIRED, ParameterDraws, Solved, paired_points
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior import neighbours
 from tactile_bayes.posterior.bump import covariance_from_log_widths, drawn_widths, overlap, trusted
@@ -308,4 +309,4 @@ def _displaced(fit: FieldFit, draws: ParameterDraws, places: FloatArray, rng: np
         return np.zeros_like(draws.flat)
     width = fit.scene.column(draws.flat, "u") + fit.scene.column(draws.flat, "v")
     points = paired_points(width, draws.replicates, len(kept), rng)
-    return np.asarray(normal_quantile(points) @ (vectors[:, kept] * np.sqrt(values[kept])).T)
+    return np.asarray(ndtri(points) @ (vectors[:, kept] * np.sqrt(values[kept])).T)

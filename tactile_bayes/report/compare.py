@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
+from scipy.special import ndtri
 
 from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, field
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import Chance, Entries, EstimateReport, Interval, Judgement, Number1, Report
 from tactile_bayes.findings import Finding, capital, finding_lines, finding_summary
 from tactile_bayes.findings import verdict as verdict_of
-from tactile_bayes.inference.draws import Quantity, normal_quantile
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.options import Above0, Comparing, Least0
 from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.presets import RESEARCH_USE
@@ -324,7 +325,7 @@ def growth_rates(growth: Sequence[float], probability: float) -> tuple[Rate, Dou
 def _trend(joint: JointSizes, days: Sequence[float], probability: float) -> TrendReport:
     """Straight line of ln d over all visits."""
     line = straight_line(*joint.moments, days)
-    half = float(normal_quantile(np.array(0.5 + probability / 2))) * line.sd
+    half = float(ndtri(0.5 + probability / 2)) * line.sd
     rates = growth_rates([VOLUME * (line.per_day + one) for one in (0.0, -half, half)], probability)
     return TrendReport(len(days), days[-1] - days[0], *rates, line.departure)
 

@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 from typing import Final, Literal
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, ndtri
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import UsageError
@@ -294,7 +294,7 @@ def joint_sizes(
     if law is None:
         law = SHARED_WITHOUT_DEPTH if fitted[0].fat_mm is None else SHARED_BODY
     correlation = law.correlation(np.array([float(np.nanmean(one.mean)) for one in averaged]))
-    covariance = _covariance(averaged, fitted, correlation, draws.normal_quantile(points[:, 1]))
+    covariance = _covariance(averaged, fitted, correlation, ndtri(points[:, 1]))
     mean = np.stack([one.mean for one in averaged]) + np.hypot(half[:, 0], half[:, 1])
     if amplitudes is not None:
         left, noise = amplitudes.at_one_depth(averaged, fitted)

@@ -12,6 +12,7 @@ from few_draws import few_draws  # noqa: F401 - all tests of this file use it
 from in_process import run_here
 from posterior_maps import bump_map
 from published_schemas import check_document
+from scipy.special import ndtri
 from settings_files import settings
 
 import tactile_bayes as tb
@@ -21,7 +22,6 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.geometry import rigid
-from tactile_bayes.inference.draws import normal_quantile
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import CompareReport, compare_summary, growths, signed, verdict
 from tactile_bayes.size.visits import Change
@@ -300,7 +300,7 @@ def test_help_tells_the_options_groups() -> None:
 
 def change_of(in_sds: float, sd: float = 0.1) -> Change:
     """A normal change of ln d, some of its SDs from none."""
-    score = normal_quantile((np.arange(4000) + 0.5) / 4000)
+    score = ndtri((np.arange(4000) + 0.5) / 4000)
     mean = np.full(4000, in_sds * sd)
     return Change(mean + sd * score, mean, np.full(4000, sd), np.repeat(np.arange(8), 500))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.special import ndtri
 from scipy.stats import genpareto, qmc
 
 from tactile_bayes.errors import NotConvergedError
@@ -12,7 +11,6 @@ from tactile_bayes.inference.draws import (
     BITS,
     MOST_DIMENSIONS,
     ParameterDraws,
-    normal_quantile,
     shifted_sobol,
     sobol_integers,
     weighted_quantiles_of,
@@ -56,11 +54,6 @@ def test_a_digital_shift_keeps_the_points_even() -> None:
         for column in replicate.T:  # one point in each of 256 equal intervals
             assert len(np.unique((column * 256).astype(int))) == 256
     assert not np.allclose(points[0], points[1])
-
-
-def test_the_normal_quantile_is_the_librarys() -> None:
-    p = np.concatenate([np.logspace(-12, -1, 300), np.linspace(0.1, 0.9, 301), 1 - np.logspace(-12, -1, 300)])
-    np.testing.assert_allclose(normal_quantile(p), ndtri(p), rtol=2e-9, atol=2e-9)
 
 
 def test_a_normal_is_sampled_to_the_accuracy_asked_for() -> None:
