@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -304,7 +304,7 @@ def _sized(
         for maps in visits
     ]
     fitted = visit_calibrations(shapes, calibration)
-    far = _by_visit(shapes, [one.extrapolation_faults for one in fitted])
+    far = _by_visit(shapes, fitted, far=True)
     if far:
         return Compared("no_estimate", f"too {UNLIKE_LEARNED}: {'; '.join(far)}", "", apart)
     priors = size_priors(settings)
@@ -317,7 +317,7 @@ def _sized(
     sizes = joint(None)
     if np.isnan(sizes.log_size).mean() > MOST_INVALID:
         return Compared("no_estimate", "too many draws have no positive size", "", apart)
-    outside = _by_visit(shapes, [one.outside for one in fitted])
+    outside = _by_visit(shapes, fitted)
     fat = calibration.depth
     depths = None if fat is None else fat.apart([one.profile for maps in shapes for one in maps])
     findings = [
@@ -334,14 +334,14 @@ def _sized(
 
 
 def _by_visit(
-    shapes: Sequence[Sequence[ShapeDraws]], texts: Sequence[Callable[[float, float], list[str]]]
+    shapes: Sequence[Sequence[ShapeDraws]], fitted: Sequence[BodyCalibration], *, far: bool = False
 ) -> list[str]:
-    """What is to be said of the middles of the maps, once for each visit."""
+    """In what the middles of the maps lie outside the calibration of their visit, or `far` outside, each once."""
     found = [
         f"visit {number}: {text}"
-        for number, (maps, texts_of) in enumerate(zip(shapes, texts, strict=True), start=1)
+        for number, (maps, at) in enumerate(zip(shapes, fitted, strict=True), start=1)
         for one in maps
-        for text in texts_of(*one.middle)
+        for text in at.outside(*one.middle, far=far)
     ]
     return list(dict.fromkeys(found))
 

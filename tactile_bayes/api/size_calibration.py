@@ -272,17 +272,11 @@ def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> eq6.SizeT
     change_x, change_y = (
         None if one is None else eq6.width_changes(one, depth_ratio=depth, group=group) for one in (sigma_x, sigma_y)
     )
-    return eq6.SizeTable(d_mm, amplitude, sigma_x, sigma_y, change_x, change_y, _study_cases(columns), depth)
-
-
-def _study_cases(columns: dict[str, list[Any]]) -> eq6.StudyCases | None:
-    """Study case of each row; None where a row lacks the lump's stiffness."""
-    if None in columns["stiffness_ratio"]:
-        return None
-    depth, ratio = (np.asarray(columns[name], dtype=np.float64) for name in ("depth_ratio", "stiffness_ratio"))
-    told = {name: columns[name] for name in ("thickness_mm", "head_radius_mm") if None not in columns[name]}
-    others = {name: np.asarray(values, dtype=np.float64) for name, values in told.items()}
-    return eq6.StudyCases(tuple(columns["seat"]), depth, ratio, others)
+    names = ("stiffness_ratio", "thickness_mm", "head_radius_mm")
+    others = {name: np.asarray(columns[name], dtype=np.float64) for name in names if None not in columns[name]}
+    ratio = others.pop("stiffness_ratio", None)  # a study states that of every lump
+    cases = None if ratio is None else eq6.StudyCases(tuple(columns["seat"]), depth, ratio, others)
+    return eq6.SizeTable(d_mm, amplitude, sigma_x, sigma_y, change_x, change_y, cases, depth)
 
 
 # --- A calibration corrected by a site's phantoms, from a table of their bumps or of their map files.
@@ -320,9 +314,10 @@ def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Pr
             _check_head(rows, calibration)
             names = [f"line {line}" for line in rows.line_numbers]
         maps, left_out, by_recipe = [], [], Settings(size_calibration=base, seed=asked.seed)
-        for i, phantom in enumerate(_names(rows, names)):
-            bump = None if by_files else _bump(rows, i)
-            if why := _unfit(rows, i):
+        lines = [dict(zip(rows.columns, cells, strict=True)) for cells in zip(*rows.columns.values(), strict=True)]
+        for i, (phantom, row) in enumerate(zip(_names(rows, lines, names), lines, strict=True)):
+            bump = None if by_files else _bump(rows, i, row)
+            if why := _unfit(row):
                 left_out.append(f"{phantom}: {why}")
                 continue
             if bump is None:
@@ -333,7 +328,7 @@ def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Pr
                 if bump is None:
                     left_out.append(f"{names[i]}: {outcome.estimate.reason}")
                     continue
-            maps.append(PhantomMap(phantom, rows.columns["d_mm"][i], bump, _known(rows, i)))
+            maps.append(PhantomMap(phantom, row["d_mm"], bump, _known(rows, i, row)))
         name = base if base in SHIPPED else path.name
         corrected = correct_calibration(calibration, maps, base=name, left_out=left_out)
     document: Any = load_json(path)
@@ -341,9 +336,8 @@ def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Pr
     return Learned(corrected, settings, inputs, base=document)
 
 
-def _bump(rows: Table, i: int) -> ShapeDraws:
+def _bump(rows: Table, i: int, row: Mapping[str, Any]) -> ShapeDraws:
     """The bump of a row with its amplitude and widths."""
-    row = {name: values[i] for name, values in rows.columns.items()}
     if row["sigma_y_mm"] is None:
         raise rows.error(i, "sigma_y_mm", "is blank", way_out="give both widths of the map")
     a, x, y = (np.array([row[one]], dtype=np.float64) for one in ("amplitude", "sigma_x_mm", "sigma_y_mm"))
@@ -351,24 +345,21 @@ def _bump(rows: Table, i: int) -> ShapeDraws:
     return ShapeDraws.of(BumpDraws(a, x, y, np.zeros(1)), profile=None if None in told else told)
 
 
-def _names(rows: Table, otherwise: list[str]) -> list[str]:
+def _names(rows: Table, lines: Sequence[Mapping[str, Any]], otherwise: Sequence[str]) -> list[str]:
     """Name of the phantom of each row; rows of one phantom must state the same properties."""
-    told = rows.columns["phantom"]
-    names = [other if name is None else name for name, other in zip(told, otherwise, strict=True)]
-    first: dict[str, int] = {}
-    for i, name in enumerate(names):
-        j = first.setdefault(name, i)
+    names = [other if row["phantom"] is None else row["phantom"] for row, other in zip(lines, otherwise, strict=True)]
+    first: dict[str, Mapping[str, Any]] = {}
+    for i, (name, row) in enumerate(zip(names, lines, strict=True)):
+        other = first.setdefault(name, row)
         for column in ("d_mm", "depth_ratio", "stiffness_ratio", "seat"):
-            here, there = rows.columns[column][i], rows.columns[column][j]
-            if here != there:
-                what = f"is {here}, but {there} in another row of {name}"
+            if row[column] != other[column]:
+                what = f"is {row[column]}, but {other[column]} in another row of {name}"
                 raise rows.error(i, column, what, way_out="give each lump a name of its own")
     return names
 
 
-def _known(rows: Table, i: int) -> dict[str, float]:
+def _known(rows: Table, i: int, row: Mapping[str, Any]) -> dict[str, float]:
     """The properties of a row's phantom, by the names of `HiddenTerms`."""
-    row = {name: values[i] for name, values in rows.columns.items()}
     found: dict[str, float] = {}
     if row["depth_ratio"] is not None:
         found["depth_mm"] = row["depth_ratio"] * row["d_mm"]
@@ -382,11 +373,11 @@ def _known(rows: Table, i: int) -> dict[str, float]:
     return found
 
 
-def _unfit(rows: Table, i: int) -> str:
+def _unfit(row: Mapping[str, Any]) -> str:
     """Why a lump takes no part: not shown, or too soft for a calibration over bodies with hard ones."""
-    if "detectable" in rows.columns and rows.columns["detectable"][i] is False:
+    if row.get("detectable") is False:
         return "its row says that it is not detectable"
-    ratio = rows.columns["stiffness_ratio"][i]
+    ratio = row["stiffness_ratio"]
     if ratio is None or ratio >= LEAST_HARD_RATIO:
         return ""
     return f"its stiffness_ratio is {ratio:g}, and the calibration's lumps have {LEAST_HARD_RATIO:g} and more"

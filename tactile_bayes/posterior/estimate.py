@@ -227,7 +227,7 @@ def draw_with_size(work: Work, seen: Assessment) -> MapDraws:
     if calibration is None:
         return replace(made, fault=fault)
     calibration = calibration.at_depth_or_fallback(*posterior.medians)
-    if fault is None and (far := calibration.extrapolation_faults(*posterior.medians)):
+    if fault is None and (far := calibration.outside(*posterior.medians, far=True)):
         fault = terms.extrapolated(far)
     size = (
         draw_sizes(posterior, calibration=calibration, priors=options.size_priors, rng=work.rng) if not fault else None

@@ -259,17 +259,25 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         x = self.features(np.log(amplitude), np.log(sigma_mm))
         return np.asarray(np.einsum("...i,ij,...j->...", x, self.information_inverse, x) / self.most_leverage)
 
-    def outside(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> list[str]:
-        """In what a map lies outside the table, in words; empty when it lies inside."""
-        texts = self._outside(amplitude, mean_width_mm(sigma_x_mm, sigma_y_mm))
-        return [*texts, f"{self.fat_note}, so that depth is not used"] if self.fat_note.endswith(UNLIKE) else texts
+    def outside(
+        self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None, *, far: bool = False
+    ) -> list[str]:
+        """In what a map lies outside the table, or so `far` outside that there is no size, in words.
 
-    def extrapolation_faults(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None) -> list[str]:
-        """In what a map lies so far outside the table that there is no size, in words."""
-        return self._outside(amplitude, mean_width_mm(sigma_x_mm, sigma_y_mm), far=True)
+        That is its amplitude or width, where one is outside its range, or else the pair, unlike those of the table.
+        """
+        sigma_mm = mean_width_mm(sigma_x_mm, sigma_y_mm)
+        texts = terms.outside_domain(self.domain, amplitude, sigma_mm, far=far)
+        most = FARTHEST_LEVERAGE if far else terms.MOST_LEVERAGE
+        if not texts and (leverage := self.leverage(amplitude, sigma_mm)) > most:
+            pair = f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm, a pair unlike those of the table"
+            texts = [f"{pair} (leverage {leverage:.1f} times the limit)"]
+        if not far and self.fat_note.endswith(UNLIKE):
+            texts.append(f"{self.fat_note}, so that depth is not used")
+        return texts
 
     def within_reach(self, amplitude: FloatArray, sigma_x_mm: FloatArray, sigma_y_mm: FloatArray) -> BoolArray:
-        """(n,) True for maps without `extrapolation_faults`."""
+        """(n,) True for maps that do not lie so far outside."""
         sigma_mm = np.sqrt(sigma_x_mm * sigma_y_mm)
         inside = terms.within_reach(self.domain, amplitude, sigma_mm)
         inside[inside] = self.leverage(amplitude[inside], sigma_mm[inside]) <= FARTHEST_LEVERAGE
@@ -319,16 +327,6 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         if self.residual is None:
             return sizes
         return sizes + self.residual.at(np.stack(np.broadcast_arrays(*values), axis=-1))
-
-    def _outside(self, amplitude: float, sigma_mm: float, *, far: bool = False) -> list[str]:
-        """The map's amplitude and width where one is outside its range, or the pair unlike those of the table."""
-        if texts := terms.outside_domain(self.domain, amplitude, sigma_mm, far=far):
-            return texts
-        leverage = self.leverage(amplitude, sigma_mm)
-        if leverage <= (FARTHEST_LEVERAGE if far else terms.MOST_LEVERAGE):
-            return []
-        pair = f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm, a pair unlike those of the table"
-        return [f"{pair} (leverage {leverage:.1f} times the limit)"]
 
 
 def mean_width_mm(sigma_x_mm: float, sigma_y_mm: float | None) -> float:

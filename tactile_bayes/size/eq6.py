@@ -154,34 +154,24 @@ class SizeCalibration(Record, eq=False):
 
     fat_mm: ClassVar[None] = None  #: Depth of fat of the calibration: none for Eq 6.
 
-    def at_fat(self, profiles: Sequence[tuple[float, ...] | None]) -> SizeCalibration:
-        """Return the calibration unchanged: Eq 6 does not depend on the depth of fat."""
-        del profiles
+    def at_fat(self, *_map: object) -> SizeCalibration:
+        """This calibration: Eq 6 is the same for all maps, whatever their depth of fat."""
         return self
 
-    def at_depth_or_fallback(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> SizeCalibration:
-        """Return the calibration unchanged: it is the same for all maps."""
-        del amplitude, sigma_x_mm, sigma_y_mm
-        return self
+    at_depth_or_fallback = at_fat
 
-    def outside(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> list[str]:
-        """In what a map lies or may lie outside the tables of the two axes, in words; empty when it lies inside."""
-        return [*self.cautions, *self._by_axes(amplitude, sigma_x_mm, sigma_y_mm)]
-
-    def extrapolation_faults(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float) -> list[str]:
-        """Quantities of a map so far outside the tables that no size is given, in words."""
-        return self._by_axes(amplitude, sigma_x_mm, sigma_y_mm, far=True)
-
-    def within_reach(self, amplitude: FloatArray, sigma_x_mm: FloatArray, sigma_y_mm: FloatArray) -> BoolArray:
-        """(n,) True for maps without `extrapolation_faults`."""
-        by_x = terms.within_reach(self.x.domain, amplitude, sigma_x_mm)
-        return np.asarray(by_x & terms.within_reach(self.y.domain, amplitude, sigma_y_mm))
-
-    def _by_axes(self, amplitude: float, x_mm: float, y_mm: float, *, far: bool = False) -> list[str]:
-        axes = (("x", self.x.domain, x_mm), ("y", self.y.domain, y_mm))
-        return [
+    def outside(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float, *, far: bool = False) -> list[str]:
+        """In what a map lies or may lie outside the axes' tables, or so `far` that there is no size, in words."""
+        axes = (("x", self.x.domain, sigma_x_mm), ("y", self.y.domain, sigma_y_mm))
+        texts = [
             f"{name}: {text}" for name, own, mm in axes for text in terms.outside_domain(own, amplitude, mm, far=far)
         ]
+        return texts if far else [*self.cautions, *texts]
+
+    def within_reach(self, amplitude: FloatArray, sigma_x_mm: FloatArray, sigma_y_mm: FloatArray) -> BoolArray:
+        """(n,) True for maps that do not lie so far outside."""
+        by_x = terms.within_reach(self.x.domain, amplitude, sigma_x_mm)
+        return np.asarray(by_x & terms.within_reach(self.y.domain, amplitude, sigma_y_mm))
 
     def beyond_lumps(self, largest_mm: float) -> list[str]:
         """In what a size lies beyond the tables' lumps, in words; empty when it lies within."""

@@ -317,7 +317,7 @@ def pool_maps(
     depth, at_depth = calibration.depth, calibration.for_maps(used)
     fat_apart_mm = None if depth is None else depth.apart([one.profile for one in used])
     named = sorted(zip(places, [one.middle for one in used], strict=True))
-    far = [f"map {i + 1}: {text}" for i, middle in named for text in at_depth.extrapolation_faults(*middle)]
+    far = [f"map {i + 1}: {text}" for i, middle in named for text in at_depth.outside(*middle, far=True)]
     if far:
         return PooledEstimate("no_estimate", extrapolated(far).reason)
     sizes = log_sizes(at_depth, used)

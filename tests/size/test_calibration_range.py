@@ -49,7 +49,7 @@ def test_a_depth_that_no_body_goes_with_is_not_used(shipped: BodyCalibration) ->
     assert np.exp(log_size(used, *BUMP)) == pytest.approx(15.0, rel=0.1)
     (words,) = used.outside(*BUMP)
     assert "mm of fat is unlike the bodies of the table, so that depth is not used" in words
-    assert used.extrapolation_faults(*BUMP) == []
+    assert used.outside(*BUMP, far=True) == []
 
 
 def test_a_depth_that_goes_with_the_map_stays(shipped: BodyCalibration) -> None:
@@ -65,7 +65,7 @@ def test_a_depth_that_goes_with_the_map_stays(shipped: BodyCalibration) -> None:
      (0.7, 15.0, "sigma 15 mm", ""), (0.7, 18.0, "sigma 18 mm", "sigma 18 mm"), (0.01, 5.0, "0.01", "0.01")],
 )  # fmt: skip
 def test_how_far_decides(shipped: BodyCalibration, amplitude: float, sigma_mm: float, outside: str, far: str) -> None:
-    found = shipped.outside(amplitude, sigma_mm), shipped.extrapolation_faults(amplitude, sigma_mm)
+    found = shipped.outside(amplitude, sigma_mm), shipped.outside(amplitude, sigma_mm, far=True)
     for texts, words in zip(found, (outside, far), strict=True):
         assert words in "; ".join(texts)
         assert bool(texts) == bool(words)
@@ -79,7 +79,7 @@ def test_many_maps_at_once_are_within_reach_as_one_by_one(name: str) -> None:
     rng = np.random.default_rng(3)
     amplitude, x, y = rng.normal(0.0, 2.0, 400), np.exp(rng.normal(1.7, 0.6, 400)), np.exp(rng.normal(1.7, 0.6, 400))
     told = [
-        a > 0 and not calibration.extrapolation_faults(a, one, other)
+        a > 0 and not calibration.outside(a, one, other, far=True)
         for a, one, other in zip(amplitude.tolist(), x.tolist(), y.tolist(), strict=True)
     ]
     assert calibration.within_reach(amplitude, x, y).tolist() == told

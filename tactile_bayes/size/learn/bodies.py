@@ -82,7 +82,7 @@ class TableRows(Record, eq=False):
         if table.profile is not None and table.log_fat is not None:
             told = np.isfinite(table.profile.sum(axis=1))
             if len(np.unique(table.body[told])) >= LEAST_BODIES:
-                maps, depth = table.rows(told), learn_depth(table.profile[told], table.log_fat[told])
+                maps, depth = regression.rows_of(table, told), learn_depth(table.profile[told], table.log_fat[told])
                 log_depth = depth.log_depth(table.profile[told])
         rows = np.column_stack([maps.log_amplitude, maps.log_width, log_depth])
         centre = [round(float(column.mean()), 3) for column in rows.T]
@@ -144,22 +144,20 @@ def learn_depth(profile: FloatArray, log_fat: FloatArray) -> FatDepth:
     )
 
 
-def _exams(
-    rows: TableRows, eq6: Eq6Fit, size: FloatArray, slope: FloatArray
-) -> tuple[regression.ExamSpread, FloatArray]:
-    """Spread between exams, and (b,) variance of each body's ln d by its exams and the coefficients of Eq 6."""
+def _exams(rows: TableRows, eq6: Eq6Fit, size: FloatArray, slope: FloatArray) -> tuple[tuple[float, float], FloatArray]:
+    """Its `exam_spread`, and (b,) variance of each body's ln d by its exams and the coefficients of Eq 6."""
     u = rows.values[:, 0]
     data = regression.BodyRegression.linear(rows.maps, eq6.data.terms, u=u, constant=eq6.data.constant, slope=slope)
     exam = data.exam_spread(size)
     coefficients = np.sum(data.mean_terms @ eq6.covariance * data.mean_terms, axis=1)
-    return exam, (exam.sd**2 + data.mean(data.map_variance)) / data.exams + coefficients
+    return exam, (np.exp(exam[0]) ** 2 + data.mean(data.map_variance)) / data.exams + coefficients
 
 
 def _calibration(
     rows: TableRows,
     eq6: Eq6Fit,
     fitted: regression.FittedResidual | None,
-    exam: regression.ExamSpread,
+    exam: tuple[float, float],
     *,
     left: FloatArray,
     noise: FloatArray,
@@ -178,7 +176,7 @@ def _calibration(
         "maps": float(len(maps)),
         "bodies": float(len(data.exams)),
         "body_sd": float(np.median(body_sd)),
-        "exam_sd": exam.sd,
+        "exam_sd": float(np.exp(exam[0])),
         "left_out_sd": float(left.std()),
         "left_out_mae_percent": float(100 * np.mean(np.abs(off))),
         "left_out_bias_percent": float(100 * np.mean(off)),
@@ -188,7 +186,7 @@ def _calibration(
         centre=rows.centre,
         eq6=Eq6Law(rows.eq6_powers, eq6.mean, eq6.covariance, _log_amplitude_one_deep(maps)),
         residual=None if fitted is None else fitted.residual,
-        spread=Spread(rows.spread_powers, spread, of_spread, exam.log_sd, exam.variance, 0.0, ""),
+        spread=Spread(rows.spread_powers, spread, of_spread, *exam, 0.0, ""),
         round_lumps=regression.learn_round(maps, monomials(list(rows.values.T), rows.spread_powers)),
         feature_powers=rows.feature_powers,
         information_inverse=inverse,
@@ -274,7 +272,8 @@ class Sized(Record):
 def sized(calibration: BodyCalibration, table: regression.PopulationTable, *, known: Sequence[str] = ()) -> Sized:
     """The bodies of a table, each by all its exams; of the properties in `known` the true value is told."""
     bodies = np.unique(table.body)
-    errors = np.array([size_error(calibration, table.rows(table.body == one), known=known) for one in bodies])
+    exams = (regression.rows_of(table, table.body == one) for one in bodies)
+    errors = np.array([size_error(calibration, one, known=known) for one in exams])
     return Sized(*errors.T)
 
 

@@ -145,7 +145,11 @@ def axis_at_mode(data: AxisRows) -> AxisCalibration:
 
 def _mode(data: AxisRows) -> tuple[AxisRows, FloatArray, FloatArray]:
     """Rows used, with mode and covariance; without width changes where they are too few to estimate e."""
-    scale, start = np.array(_SCALE), _start(data)
+    a0, s0 = data.centre
+    ratio = np.log(data.d_mm) - np.log(data.sigma_mm / s0)
+    f = -float(np.polyfit(np.log(data.amplitude / a0), ratio, 1)[0]) if np.ptp(data.amplitude) > 0 else 0.0
+    start = np.array([np.log(np.median(data.d_mm)), 0.0, np.clip(f, -1.0, 1.0), np.log(0.25), 0.0, -0.2, np.log(0.3)])
+    scale = np.array(_SCALE)
     if data.width_change is None or np.isfinite(data.width_change).sum() < 4:
         data = AxisRows(data.d_mm, data.amplitude, data.sigma_mm, None)
         scale, start = scale[:5], start[:5]
@@ -171,14 +175,6 @@ def agreement(axis: AxisCalibration, data: AxisRows) -> dict[str, float]:
         "r2": float(1.0 - np.sum(error**2) / np.sum((np.log(data.d_mm) - np.log(data.d_mm).mean()) ** 2)),
         "mae_percent": float(100 * np.mean(np.abs(predicted / data.d_mm - 1.0))),
     }
-
-
-def _start(data: AxisRows) -> FloatArray:
-    """Start of the search for the mode: ln M, b, f, ln s, g, ln e, ln t."""
-    a0, s0 = data.centre
-    ratio = np.log(data.d_mm) - np.log(data.sigma_mm / s0)
-    f = -float(np.polyfit(np.log(data.amplitude / a0), ratio, 1)[0]) if np.ptp(data.amplitude) > 0 else 0.0
-    return np.array([np.log(np.median(data.d_mm)), 0.0, np.clip(f, -1.0, 1.0), np.log(0.25), 0.0, -0.2, np.log(0.3)])
 
 
 def _log_density(theta: FloatArray, data: AxisRows) -> FloatArray:

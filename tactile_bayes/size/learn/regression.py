@@ -55,10 +55,6 @@ class PopulationTable(Record, eq=False):
     def __len__(self) -> int:
         return len(self.d_mm)
 
-    def rows(self, keep: BoolArray) -> PopulationTable:
-        """Copy with the rows where `keep` is true."""
-        return rows_of(self, keep)
-
 
 def rows_of(columns: T, keep: BoolArray) -> T:
     """A copy of a table, whose fields are columns or tables or None, with the rows where `keep` is true."""
@@ -72,18 +68,6 @@ def rows_of(columns: T, keep: BoolArray) -> T:
     if isinstance(whole, dict):
         return cast("T", {name: rows_of(one, keep) for name, one in whole.items()})
     return cast("T", replace(whole, **{name: rows_of(getattr(whole, name), keep) for name in whole.__struct_fields__}))
-
-
-class ExamSpread(Record):
-    """How far exams of one body differ in their sizes: mean and variance of ln t, t beyond the maps' own noise."""
-
-    log_sd: float
-    variance: float
-
-    @property
-    def sd(self) -> float:
-        """T by the mean of its logarithm."""
-        return float(np.exp(self.log_sd))
 
 
 class BodyRegression(Record, eq=False):
@@ -120,11 +104,11 @@ class BodyRegression(Record, eq=False):
         """(k,) ordinary least-squares coefficients from the bodies' means."""
         return np.asarray(np.linalg.lstsq(self.mean_terms, self.mean_log_d, rcond=None)[0])
 
-    def exam_spread(self, size: FloatArray) -> ExamSpread:
-        """Spread of sizes between exams of a body beyond their maps' own noise, by t on a grid.
+    def exam_spread(self, size: FloatArray) -> tuple[float, float]:
+        """Mean and variance of ln t, the spread of sizes between exams of a body beyond their maps' own noise.
 
         `size` is (n,) ln d by each map. Squares of a body's exams about their mean are :math:`(t^2 + m) \\chi^2`, m the
-        mean variance of its maps. Without bodies examined twice, the prior.
+        mean variance of its maps; t is on a grid. Without bodies examined twice, the prior.
         """
         square = np.bincount(self.group, (size - self.mean(size)[self.group]) ** 2)
         freedom, noise = self.exams - 1.0, self.mean(self.map_variance)
@@ -135,11 +119,11 @@ class BodyRegression(Record, eq=False):
         log_p -= 0.5 * ((log_t - centre) / width) ** 2
         p = np.exp(log_p - log_p.max())
         mean = float(p @ log_t / p.sum())
-        return ExamSpread(mean, float(p @ (log_t - mean) ** 2 / p.sum()))
+        return mean, float(p @ (log_t - mean) ** 2 / p.sum())
 
     def log_density(self, theta: FloatArray) -> FloatArray:
         """(m,) log posterior of (m, k + 2) coefficients, ln(sd between bodies) and its slope."""
-        exam = self.exam_spread(self.terms @ self.least_squares() + self.constant).sd ** 2
+        exam = np.exp(self.exam_spread(self.terms @ self.least_squares() + self.constant)[0]) ** 2
         residual = self.mean_log_d - theta[:, :-2] @ self.mean_terms.T
         variance = np.exp(2 * (theta[:, -2:-1] + theta[:, -1:] * self.mean_u))
         variance = variance + (exam + self.mean(self.map_variance)) / self.exams
@@ -302,7 +286,8 @@ class FittedResidual(Record, eq=False):
 def fit_residual(bodies: BodiesLeft) -> FittedResidual:
     """Kernel and spread with half of the points, then with all, by the better of two starts."""
     count = max(min(POINTS, len(bodies.left) // BODIES_PER_POINT), 1)
-    starts = [_start(bodies, length) for length in _START_LENGTHS]
+    k, slopes = bodies.x.shape[1], np.zeros(bodies.features.shape[1] - 1)
+    starts = [np.array([*[np.log(length)] * k, _SCALE[0], _BODY_SD[0], *slopes]) for length in _START_LENGTHS]
     for points_now in (max(count // 2, 1), count):
         # drawn at random they lie as the bodies do, most where most sizes are asked for; pivots of the kernel's
         # incomplete Cholesky factor lie at the table's ends first, and left bodies out with larger errors (0122)
@@ -374,8 +359,3 @@ def _best(bodies: BodiesLeft, start: FloatArray, points: FloatArray) -> tuple[Fl
 def _spread_prior(log_spread: FloatArray) -> float:
     at_centre = ((log_spread[0] - _BODY_SD[0]) / _BODY_SD[1]) ** 2
     return float(-0.5 * (at_centre + np.sum((log_spread[1:] / _SLOPE_SD) ** 2)))
-
-
-def _start(bodies: BodiesLeft, length: float) -> FloatArray:
-    lengths, slopes = np.full(bodies.x.shape[1], np.log(length)), np.zeros(bodies.features.shape[1] - 1)
-    return np.concatenate([lengths, [_SCALE[0], _BODY_SD[0]], slopes])

@@ -162,10 +162,7 @@ def correct_calibration(
             "sd_before": float(np.sqrt(np.mean(data.residual**2))),
             "sd_after": float(np.sqrt(np.mean(left**2))),
         },
-        cautions=(
-            *no_depth(calibration, [groups[name][0].known for name in rows]),
-            *cautions_of(list(rows), data, posterior),
-        ),
+        cautions=_cautions(calibration, {name: groups[name][0].known for name in rows}, data, posterior),
         left_out=tuple(out),
     )
     return replace(calibration, site=site)
@@ -221,9 +218,17 @@ def _known(
     return explained_sd * float(hidden.expected_body(stated, features)), own, common
 
 
-def cautions_of(names: Sequence[str], data: Residuals, posterior: ShiftPosterior) -> tuple[str, ...]:
-    """Oddities of a correction by the phantoms of these names, in words."""
+def _cautions(
+    calibration: BodyCalibration, known: Mapping[str, Mapping[str, float]], data: Residuals, posterior: ShiftPosterior
+) -> tuple[str, ...]:
+    """Oddities of a correction by the phantoms of these names, of which these properties are known, in words."""
     lines = []
+    without = sum("depth_mm" not in one for one in known.values())
+    if without and calibration.hidden is not None and "depth_mm" in calibration.hidden.names:
+        lines.append(
+            f"{without} of {len(known)} phantoms have no depth_ratio: where they lie deeper or shallower than lumps of "
+            "the calibration, this passes for the site's; state depth_ratio, seat and stiffness_ratio"
+        )
     for value, sd, what in zip(posterior.mean[:2], PRIOR.sd, ("shift", "slope with ln sigma"), strict=True):
         if abs(value) > FAR * sd:
             lines.append(
@@ -240,7 +245,7 @@ def cautions_of(names: Sequence[str], data: Residuals, posterior: ShiftPosterior
             f"the phantoms scatter {posterior.spread:.1f} times as much as the calibration expects: "
             "check their sizes, depths, seats and stiffness"
         )
-    for i, name in enumerate(names):  # those that lie far from what the others predict
+    for i, name in enumerate(known):  # those that lie far from what the others predict
         rest = Residuals(*(np.delete(getattr(data, column), i) for column in names_of(Residuals)))
         others, x = shift_posterior(rest), data.design[i]
         variance = x @ others.covariance @ x + others.spread_square * data.spread_variance[i] + data.map_variance[i]
@@ -248,18 +253,6 @@ def cautions_of(names: Sequence[str], data: Residuals, posterior: ShiftPosterior
         if abs(score) > APART:
             lines.append(f"{name} lies {abs(score):.1f} SDs from what the other phantoms predict: look at its map")
     return tuple(lines)
-
-
-def no_depth(calibration: BodyCalibration, known: Sequence[Mapping[str, float]]) -> tuple[str, ...]:
-    """The caution where the depth of phantoms is not known, though a size depends on it most."""
-    names = () if calibration.hidden is None else calibration.hidden.names
-    without = sum("depth_mm" not in one for one in known)
-    if "depth_mm" not in names or not without:
-        return ()
-    return (
-        f"{without} of {len(known)} phantoms have no depth_ratio: where they lie deeper or shallower than lumps of the "
-        "calibration, this passes for the site's; state depth_ratio, seat and stiffness_ratio",
-    )
 
 
 FEWEST_MASSES: Final = 3
