@@ -165,7 +165,7 @@ def open_executor(*, workers: int = 1, cluster: str | None = None) -> AbstractCo
 
 
 @contextlib.contextmanager
-def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Executor]:
+def cluster_executor(address: str) -> Iterator[Executor]:
     """Executor over the workers of a running dask scheduler, for example ``tcp://10.0.0.5:8786``.
 
     The workers must have this version of the program installed: another one could give other results.
@@ -181,7 +181,7 @@ def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Execu
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     with contextlib.ExitStack() as stack:
         try:
-            client = stack.enter_context(Client(address, timeout=timeout_s, set_as_default=False))
+            client = stack.enter_context(Client(address, timeout=10.0, set_as_default=False))
         except (OSError, ValueError) as error:
             raise UsageError(
                 f"no dask scheduler answers at {address} ({one_line(error)}); start one with `dask scheduler` and "
@@ -293,7 +293,7 @@ def run_batch(
         if (name := key(item)) in work:
             raise BadDataError(f"two items of the batch are called {name!r}", way_out="give each its own name")
         work[name] = item
-    kept = {} if store is None else store.values
+    kept = {} if store is None else store
     outcomes: dict[str, Outcome[Result]] = {name: Outcome(name, value=kept[name]) for name in work if name in kept}
 
     def keep(outcome: Outcome[Result]) -> None:

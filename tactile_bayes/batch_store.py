@@ -26,27 +26,12 @@ STORE_SCHEMA: Final = "tactile-bayes.batch/2"
 _FLUSHED_EVERY_S: Final = 5.0  #: Lines reach the disk at least this often: what a loss of power may cost.
 
 
-class StoredValues(UserDict[str, Any]):
-    """Results by the names of their items, each read from the store's file when it is asked for.
+class BatchStore(UserDict[str, Any]):
+    """Results by the names of their items, each read from the file when it is asked for; open it with `open_store`.
 
-    `data` is where their lines begin; the latest line of a name counts. A result that is deleted is missing in this
-    run, and its line stays in the file.
-    """
-
-    def __init__(self, descriptor: int, decode: Callable[[Any], Any]) -> None:
-        super().__init__()
-        self._descriptor, self._decode = descriptor, decode
-
-    def __getitem__(self, name: str) -> Any:
-        with open(self._descriptor, "rb", closefd=False) as file:  # what is written goes to the end all the same
-            file.seek(self.data[name])
-            return self._decode(_unsealed(file.readline()[:-1].decode())["value"])
-
-
-class BatchStore:
-    """Results on disk; open it with `open_store`. A line half written when the program was killed is dropped.
-
-    `descriptor` is of the open, locked file, `values` holds results by the names of their items.
+    `descriptor` is of the open, locked file, `data` where the items' lines begin; the latest line of a name counts. A
+    result that is deleted is missing in this run, and its line stays in the file. A line half written when the program
+    was killed is dropped.
     """
 
     def __init__(
@@ -58,20 +43,23 @@ class BatchStore:
         decode: Callable[[Any], Any],
         read_only: bool = False,
     ) -> None:
-        self._descriptor, self._read_only = descriptor, read_only
+        super().__init__()
         self.path = path
-        self._encode = encode
-        self._decode = decode
+        self._descriptor, self._encode, self._decode, self._read_only = descriptor, encode, decode, read_only
         self._end = 0
         self._flush_at = time.monotonic() + _FLUSHED_EVERY_S
-        self.values = StoredValues(descriptor, decode)
+
+    def __getitem__(self, name: str) -> Any:
+        with open(self._descriptor, "rb", closefd=False) as file:  # what is written goes to the end all the same
+            file.seek(self.data[name])
+            return self._decode(_unsealed(file.readline()[:-1].decode())["value"])
 
     def add(self, name: str, value: object) -> Any:
         """Append one result and return it as it will be read back."""
         line = json.dumps({"key": name, "value": self._encode(value)}, ensure_ascii=False)
         began = self._end
         self._append(_sealed(line))
-        self.values.data[name] = began
+        self.data[name] = began
         return self._decode(json.loads(line)["value"])
 
     def load(self, header: Mapping[str, Any]) -> None:
@@ -85,7 +73,7 @@ class BatchStore:
                 if not line.endswith(b"\n"):
                     break
                 name = _name_in(line[:-1].decode("utf-8", errors="replace"), number=number, path=self.path)
-                self.values.data[name] = self._end
+                self.data[name] = self._end
                 self._end += len(line)
         if not self._read_only:
             os.ftruncate(self._descriptor, self._end)

@@ -269,7 +269,7 @@ def test_after_the_loss_of_a_cluster_nothing_more_is_handed_out(tmp_path):
     executor = Lost()
     with open_store(tmp_path / "store", settings={}) as store:
         outcomes = run_batch(draw, range(50), key=str, executor=executor, store=store)
-        assert set(store.values) == {"0", "1"}
+        assert set(store) == {"0", "1"}
     assert len(executor.handed) < 10
     assert [outcome.ok for outcome in outcomes] == [True] * 2 + [False] * 48
     assert {outcome.error for outcome in outcomes[2:]} == {batch.CLUSTER_LOST}
@@ -293,7 +293,7 @@ def test_ctrl_c_keeps_what_is_done_and_goes_on_up(tmp_path):
     with open_store(tmp_path / "store", settings={}) as store, pytest.raises(KeyboardInterrupt):
         run_batch(interrupt_at_two, range(5), key=str, store=store)
     with open_store(tmp_path / "store", settings={}) as store:
-        assert store.values == {"0": 0, "1": 1}
+        assert store == {"0": 0, "1": 1}
         outcomes = run_batch(lambda item: ran.append(item) or item, range(5), key=str, store=store)
     assert ran == [2, 3, 4]
     assert [outcome.value for outcome in outcomes] == [0, 1, 2, 3, 4]
@@ -348,7 +348,7 @@ def test_a_batch_resumes_from_a_store_cut_anywhere(tmp_path, lost):
     path.write_bytes(content[:-lost])
     ran = []
     with open_store(path, settings={"seed": 1}) as store:
-        have = set(store.values)
+        have = set(store)
         outcomes = run_batch(lambda seed: ran.append(str(seed)) or draw(seed), range(4), key=str, store=store)
     assert outcomes == whole
     assert set(ran) == {"0", "1", "2", "3"} - have
@@ -382,30 +382,30 @@ def test_any_value_comes_back_from_the_store(tmp_path_factory, values):
     with open_store(path, settings={}) as store:
         run_batch(values.__getitem__, values, key=lambda name: name, store=store)
     with open_store(path, settings={}) as store:
-        assert store.values == values
+        assert store == values
 
 
 def test_a_store_holds_places_of_lines_and_reads_what_they_say(tmp_path):
     path, long = tmp_path / "store", "x" * 20_000  # longer than one read
     with open_store(path, settings={}) as store:
         run_batch({"a": long, "b": 1}.__getitem__, ["a", "b"], key=str, store=store)
-        del store.values["a"]
-        assert (list(store.values), store.values.get("a")) == (["b"], None)
+        del store["a"]
+        assert (list(store), store.get("a")) == (["b"], None)
         store.add("a", "again")
-        assert store.values["a"] == "again"
+        assert store["a"] == "again"
     data = path.read_bytes()
     assert data.count(b'"key": "a"') == 2
     with open_store(path, settings={}) as store:
-        assert (store.values["a"], store.values["b"]) == ("again", 1)  # the latest line of a name counts
+        assert (store["a"], store["b"]) == ("again", 1)  # the latest line of a name counts
         path.write_bytes(data.replace(b'"value": 1', b'"value": 7'))
         with pytest.raises(ValueError, match="checksum"):
-            store.values["b"]
+            store["b"]
 
 
 def test_failed_items_are_tried_again(tmp_path):
     with open_store(tmp_path / "store", settings={}) as store:
         run_batch(refuse_odd, range(4), key=str, store=store)
-        assert set(store.values) == {"0", "2"}
+        assert set(store) == {"0", "2"}
         outcomes = run_batch(draw, range(4), key=str, store=store)
     assert [outcome.ok for outcome in outcomes] == [True] * 4
     assert outcomes[0].value == 0

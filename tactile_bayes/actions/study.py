@@ -321,7 +321,7 @@ def sbc_action(
             open_unfinished(output, sbc.MapRanks, settings=sbc.settings(size=DEFAULT, **how)) as store,
             progress_bar("maps") as progress,
         ):
-            made = max(asked.maps - (0 if store is None else len(store.values)), 0)  # by this run
+            made = max(asked.maps - (0 if store is None else len(store)), 0)  # by this run
             work = partial(ranks_of_map, **how)
             outcomes = run_batch(work, range(asked.maps), key=str, executor=executor, store=store, progress=progress)
     except BatchInterrupted as stop:

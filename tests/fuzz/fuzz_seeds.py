@@ -384,7 +384,7 @@ def _read_store(path: Path) -> object:
     copy = path.with_suffix(".copy")
     shutil.copyfile(path, copy)  # opening a store may shorten it
     with open_store(copy, settings={"seed": 1}) as store:
-        return dict(store.values)
+        return dict(store)
 
 
 FORMATS = {
