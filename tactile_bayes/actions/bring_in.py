@@ -9,11 +9,10 @@ import click
 import numpy as np
 
 from tactile_bayes.actions.show import describe_scan
-from tactile_bayes.commands.options import refuse_same
 from tactile_bayes.declarations import Record, as_dict, names_of, replace
 from tactile_bayes.errors import EXIT_DONE, BadDataError, TactileBayesError, UsageError, one_line
 from tactile_bayes.files.arrays_layout import ArrayMap, GridOptions, Stated
-from tactile_bayes.files.atomic import check_suffix, refuse_existing
+from tactile_bayes.files.atomic import check_suffix, refuse_existing, refuse_same
 from tactile_bayes.files.documents import with_session
 from tactile_bayes.files.grids import import_grid
 from tactile_bayes.files.imports import import_arrays, of_calibration, of_head, of_landmarks, of_poses

@@ -13,13 +13,13 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import open_executor
 from tactile_bayes.campaigns import report
 from tactile_bayes.campaigns.inputs import open_campaign, tidy
-from tactile_bayes.campaigns.run import Bar, Campaign, CampaignState
+from tactile_bayes.campaigns.run import FEW, Bar, Campaign, CampaignState
 from tactile_bayes.campaigns.steps import CampaignSettings
 from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import UsageError
-from tactile_bayes.files.atomic import same_file
-from tactile_bayes.files.manifest_csv import Exam, read_manifest
-from tactile_bayes.files.reading import check_address
+from tactile_bayes.files.atomic import refuse_same
+from tactile_bayes.files.manifest_csv import JOURNAL, Exam, read_manifest
+from tactile_bayes.files.reading import check_address, put
 from tactile_bayes.files.size_json import NONE, size_calibration_path
 from tactile_bayes.options import CampaignOptions
 from tactile_bayes.presets import RESEARCH_USE
@@ -44,8 +44,8 @@ class CampaignResult(Told, eq=False):
     def failed(self) -> tuple[str, ...]:
         """A line for each of the first exams or masses that failed, and one that counts the others."""
         faults = self.campaign.found.faults
-        lines = [f"{name}: {fault.step}: {fault.reason}" for name, fault in list(faults.items())[: report.MOST_NAMED]]
-        more = [f"{len(faults) - report.MOST_NAMED} more, see failures.csv"] if len(faults) > report.MOST_NAMED else []
+        lines = [f"{name}: {fault.step}: {fault.reason}" for name, fault in list(faults.items())[:FEW]]
+        more = [f"{len(faults) - FEW} more, see failures.csv"] if len(faults) > FEW else []
         return (*lines, *more)
 
     def _planned(self) -> Iterator[str]:
@@ -53,10 +53,10 @@ class CampaignResult(Told, eq=False):
         for step, todo in found.todo.items():
             named = f" ({', '.join(found.names[step])})" if _few(found, step) and found.kept[step] else ""
             yield f"{step}: {todo} to do{named}, {found.kept[step]} done"
-        for name, fault in list(found.faults.items())[: report.MOST_NAMED]:
+        for name, fault in list(found.faults.items())[:FEW]:
             yield f"{name}: {fault.step} failed: {fault.reason}"
-        if len(found.faults) > report.MOST_NAMED:
-            yield f"{len(found.faults) - report.MOST_NAMED} more failed"
+        if len(found.faults) > FEW:
+            yield f"{len(found.faults) - FEW} more failed"
         yield "Nothing was run."
 
     def _done(self, written: report.Written) -> Iterator[str]:
@@ -138,9 +138,7 @@ def run_campaign(
         *read,
         *map(size_calibration_path, map(str, names)),
     ]
-    for path in (output / name for name in report.WRITTEN):
-        if any(one is not None and same_file(path, one) for one in used):
-            raise UsageError(f"{path} is an input of this command; choose another name for the output")
+    refuse_same((output / name for name in report.WRITTEN), used)
     report.check_inputs(table, settings)
     with (
         open_campaign(output, dry=settings.dry_run) as store,
@@ -153,8 +151,9 @@ def run_campaign(
             return CampaignResult(run, output, None)
         left = tidy(place, table, run.found.results, unread=run.unread)
         written = report.write_outputs(run, unlisted=left)
-        if settings.copy_to:
-            report.copy_outputs(place, settings.copy_to)
+        for name in (*report.WRITTEN, JOURNAL):  # the journal last: with it the copy is whole
+            if settings.copy_to and (place / name).exists():
+                put(place / name, f"{settings.copy_to}/{name}")
     return CampaignResult(run, output, written)
 
 

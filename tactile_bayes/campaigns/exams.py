@@ -47,7 +47,7 @@ class Said(Record):
     sources: frozenset[str] = frozenset()  #: SHA-256 of the files that it was made from.
 
 
-def said_by(path: Path, name: str) -> Said:
+def _said_by(path: Path, name: str) -> Said:
     """What a scan, arrays of a scan or a map say of the exam: facts on which all scans of the file agree."""
     if name.lower().endswith(ARRAYS):
         return Said()
@@ -62,12 +62,6 @@ def said_by(path: Path, name: str) -> Said:
     facts = {column: min(values) for column, values in told.items() if len(values) == 1 and values != {""}}
     inputs = [one for one in made if isinstance(one, dict)] if isinstance(made, list | tuple) else []
     return Said(facts, frozenset(str(one["sha256"]) for one in inputs if "sha256" in one))
-
-
-def check_name(name: str) -> None:
-    """Refuse the name of a file that a table of exams does not take."""
-    if name[0] in "=+@-" or name != name.strip() or not name.isprintable() or len(name) > 1000:
-        raise BadDataError("the table takes no such file name: rename it")
 
 
 # --- What a file's name says of its exam, by a pattern such as ``{patient}_{visit}_{exam}.npz``.
@@ -135,7 +129,7 @@ class NamePattern:
 
 def _told(path: Path, name: str, pattern: NamePattern | None) -> Said:
     """What a file and its name say; where they contradict each other that is an error."""
-    said = said_by(path, name)
+    said = _said_by(path, name)
     told = {} if pattern is None else pattern.facts(name)
     for column, value in told.items():
         inside = said.facts.get(column, value)
@@ -253,7 +247,8 @@ def find_exams(
     stored = files_below(check_address(folder), *SCANS) if isinstance(folder, str) else ()
     for name in (*paths, *(one for one in stored if one not in known)):
         try:
-            check_name(name)
+            if name[0] in "=+@-" or name != name.strip() or not name.isprintable() or len(name) > 1000:
+                raise BadDataError("the table takes no such file name: rename it")
             with nullcontext(paths[name]) if name in paths else fetched(name) as path:
                 said[name] = _told(path, name, None if name in known else pattern)
         except BadDataError as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import shutil
 import time
 from collections import UserDict, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -16,8 +17,7 @@ from typing import Any, Final
 from tactile_bayes.batch import CLUSTER_LOST, run_batch
 from tactile_bayes.batch_store import BatchStore, open_store
 from tactile_bayes.campaigns.exams import Breasts
-from tactile_bayes.campaigns.steps import FILES, STAGED, UNWRITTEN, Result, clear_staged, put_in_place, stamp
-from tactile_bayes.declarations import Record
+from tactile_bayes.campaigns.steps import FILES, STAGED, UNWRITTEN, WAITING, Result, put_in_place, stamp
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.files.atomic import sha256, unwritable
 from tactile_bayes.files.manifest_csv import EXAMS, GROWTH, JOURNAL, MASSES, Exam
@@ -131,10 +131,10 @@ def _names_in(folder: Path) -> list[str]:
 
 def _clear(place: Path, *, known: Collection[str], made: Collection[str]) -> None:
     """Remove the files of a folder that a step makes and this run did not, and the folder when none is left."""
-    names = _names_in(place)
-    clear_staged(place, names)
-    for name in names:
-        if name in known and name not in made:
+    for name in _names_in(place):
+        if name.startswith(WAITING):  # of a step whose command was ended
+            shutil.rmtree(place / name, ignore_errors=True)
+        elif name in known and name not in made:
             (place / name).unlink(missing_ok=True)
     if not made:
         _remove_if_empty(place)
@@ -153,13 +153,6 @@ def _remove_if_empty(folder: Path) -> None:
 
 READ: Final = "read"  #: Step of the journal that holds a file's digest.
 _SETTLED_S: Final = 10.0  #: A file that was last changed so long ago has times that tell this content from a later one.
-
-
-class Sources(Record):
-    """What the files of the exams are."""
-
-    digests: dict[Path, str]  #: SHA-256 by path.
-    faults: dict[Path, str]  #: Why a file cannot be read, by path.
 
 
 def _key_of(exam: Exam) -> tuple[str, bool]:
@@ -194,16 +187,16 @@ def read_sources(
     keep: bool = True,
     executor: Executor | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Sources:
-    """Digest of every exam's file, from the journal where the file is as it was then.
+) -> tuple[dict[Path, str], dict[Path, str]]:
+    """SHA-256 of every exam's file by its path, from the journal where the file is as it was then, and faults of files.
 
     New digests go into the journal (`keep`), or else files in object stores that are not known are passed over. A lost
     cluster is a `TactileBayesError`.
     """
     files = {exam.path: (exam, *_key_of(exam)) for exam in {exam.path: exam for exam in exams}.values()}
-    values: Mapping[str, Any] = {} if store is None else store.values
+    values: Mapping[str, Any] = {} if store is None else store
     known = {path: values[key]["sha256"] for path, (_, key, settled) in files.items() if settled and key in values}
-    found = Sources(known, {})
+    digests, faults = known, dict[Path, str]()
     for settles, kept in ((True, store if keep else None), (False, None)):
         waiting = [
             (key, path, exam.address)
@@ -213,12 +206,12 @@ def read_sources(
         outcomes = run_batch(_read, waiting, key=itemgetter(0), executor=executor, store=kept, progress=progress)
         for (_, path, address), outcome in zip(waiting, outcomes, strict=True):
             if outcome.value is not None:
-                found.digests[path] = outcome.value["sha256"]
+                digests[path] = outcome.value["sha256"]
             elif outcome.error == CLUSTER_LOST:
                 raise TactileBayesError(f"{CLUSTER_LOST}; what is done is kept")
             else:
-                found.faults[path] = outcome.error.removeprefix(f"{address or path}: ")
-    return found
+                faults[path] = outcome.error.removeprefix(f"{address or path}: ")
+    return digests, faults
 
 
 class Alike:

@@ -12,7 +12,7 @@ from typing import Any, Final
 from tactile_bayes import __version__
 from tactile_bayes.api.trials import analyse, load_trial, read_excision
 from tactile_bayes.campaigns.exams import MassPlace, grown_masses, unnamed, visit_dates, visits_of
-from tactile_bayes.campaigns.run import Campaign
+from tactile_bayes.campaigns.run import FEW, Campaign
 from tactile_bayes.campaigns.steps import CampaignSettings
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError
@@ -20,7 +20,7 @@ from tactile_bayes.files import manifest_csv as layout
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import read_protocol, read_record
 from tactile_bayes.files.manifest_csv import Exam
-from tactile_bayes.files.reading import IMAGE_BYTES, put, read_bytes
+from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
 from tactile_bayes.files.reports import EstimateReport, PooledReport, centre_of
 from tactile_bayes.files.tables import Table
 from tactile_bayes.findings import Finding, by_weight, capital, finding_lines, verdict
@@ -86,9 +86,7 @@ class Row(Record, eq=False):
         )
 
 
-def _status(report: EstimateReport | PooledReport | None) -> str:
-    if report is None:
-        return "not_done"
+def _status(report: EstimateReport | PooledReport) -> str:
     if report.max_size_mm is not None:
         return "detected"
     silent = isinstance(report, EstimateReport) and report.reason_code == CANNOT_SHOW
@@ -131,8 +129,8 @@ def _row(campaign: Campaign, exam: Exam) -> Row:
     facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "synthetic": mapped.get("synthetic")}
     if fault is not None and fault.step not in ("figures", "page"):
         reason = f"{fault.step} failed: {fault.reason}"
-        return Row(exam, _status(None), reason, reason, failed=True, **facts)
-    by_site = layout.SIZED in (campaign.found.of("size", exam.name) or {"files": ()})["files"]
+        return Row(exam, "not_done", reason, reason, failed=True, **facts)
+    by_site = layout.SIZED in campaign.found.files("size", exam.name)
     place = campaign.folder / layout.EXAMS / exam.name / (layout.SIZED if by_site else layout.ESTIMATE)
     return Row.of(exam, read_record(place, EstimateReport), **facts)
 
@@ -148,8 +146,6 @@ def done_line(row: Row) -> dict[str, object]:
     x_mm, y_mm = row.centre_mm or (None, None)
     return {
         **_names(row.exam),
-        "side": row.exam.side,
-        "reader": row.exam.reader,
         "folder": f"{layout.EXAMS}/{row.exam.name}",
         "scan_sha256": " ".join(scan["sha256"] for scan in row.scans if "sha256" in scan) or None,
         "status": row.status,
@@ -166,7 +162,8 @@ def done_line(row: Row) -> dict[str, object]:
 
 
 def _names(exam: Exam) -> dict[str, object]:
-    return {name: getattr(exam, name) for name in ("patient", "visit", "mass", "replicate", "file")}
+    """What the tables repeat of an exam, by their columns."""
+    return {name: getattr(exam, name) for name in ("patient", "visit", "mass", "replicate", "side", "reader", "file")}
 
 
 def _figures(quantity: Quantity | None, names: Mapping[str, str]) -> dict[str, object]:
@@ -222,7 +219,7 @@ def _together(campaign: Campaign, rows: Sequence[Row], report: PooledReport | No
         return _reading(exam, POOLED_MODALITY, status, report.max_size_mm, report.reason, synthetic)
     fault = campaign.found.faults.get(exam.of_mass)
     reason = "every exam failed" if fault is None else f"{fault.step} failed: {fault.reason}"
-    return _reading(exam, POOLED_MODALITY, _status(None), None, reason, synthetic)
+    return _reading(exam, POOLED_MODALITY, "not_done", None, reason, synthetic)
 
 
 def _reading(
@@ -235,13 +232,11 @@ def _reading(
     reader: str | None = None,
 ) -> dict[str, object]:
     return {
-        "patient": exam.patient,
-        "mass": exam.mass,
+        **_names(exam),
         "modality": modality,
         "status": status,
         **_figures(size, _SIZES),
         "reader": reader,
-        "visit": exam.visit,
         "date": exam.day,
         "reason": (reason or None) if status != "detected" else None,
         "synthetic": synthetic,
@@ -354,20 +349,10 @@ def _with(rows: Sequence[Row], kind: str, name: str) -> list[str]:
     return list(dict.fromkeys(getattr(row.exam, name) for row in rows if any(one.kind == kind for one in row.findings)))
 
 
-MOST_NAMED: Final = 5  #: So many exams or masses are named in a line.
-
-
 def names_line(words: str, names: Sequence[str]) -> list[str]:
     """The first names in a line that counts the others; none without any."""
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return [f"{words}: {', '.join(names[:MOST_NAMED])}{more}"] if names else []
-
-
-def copy_outputs(folder: Path, address: str) -> None:
-    """Copy what lies beside the exams into the object store, and last the journal: with it the copy is whole."""
-    for name in (*WRITTEN, layout.JOURNAL):
-        if (folder / name).exists():
-            put(folder / name, f"{address}/{name}")
+    more = f" and {len(names) - FEW} more" if len(names) > FEW else ""
+    return [f"{words}: {', '.join(names[:FEW])}{more}"] if names else []
 
 
 def check_inputs(exams: Sequence[Exam], settings: CampaignSettings) -> None:
@@ -492,7 +477,7 @@ def _exam(campaign: Campaign, row: Row, *, inline: bool) -> ExamEntry:
     made = {
         name
         for step in ("map", "estimate", "figures", "size", "page")
-        for name in (campaign.found.of(step, exam.name) or {"files": ()})["files"]
+        for name in campaign.found.files(step, exam.name)
         if not row.failed
     }
     picture: bytes | str | None = f"{folder}/{layout.THUMBNAIL}" if layout.THUMBNAIL in made else None

@@ -40,7 +40,7 @@ from tactile_bayes.report.growth_page import Course
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.pooling import Repeatability
 
-FEW: Final = 5  #: So many exams are named in a line.
+FEW: Final = 5  #: So many exams or masses are named in a line.
 
 
 class Fault(Record):
@@ -64,6 +64,11 @@ class CampaignState(Record, eq=False):
     def of(self, step: str, name: str) -> steps.Result | None:
         """Result of a step of an exam or mass; None where there is none."""
         return self.results[step].get(name)
+
+    def files(self, step: str, name: str) -> Mapping[str, str]:
+        """Digests of the files that a step made of an exam or mass, by their names; empty where it made none."""
+        made: Mapping[str, str] = (self.of(step, name) or {"files": {}})["files"]
+        return made
 
 
 Bar = Callable[[str], AbstractContextManager[Progress]]
@@ -91,7 +96,7 @@ class Campaign:
         bar: Bar | None = None,
     ) -> None:
         self.exams, self.folder, self.settings = exams, folder, settings
-        values = {} if store is None else store.values
+        values = {} if store is None else store
         self.found = CampaignState({step: StepResults(values) for step in steps.FILES})
         self.not_pooled = ""  # why no mass is; empty where masses are
         self.not_compared = ""  # the same of visits; empty too where no mass has several
@@ -136,7 +141,8 @@ class Campaign:
                 self._needed.subtract(self._steps(0, spared))
                 self._pool(sound)
             if grown:
-                self._compare(sound)
+                growing = grown_masses(self._estimated(sound))
+                self._of_masses("compare", GROWTH, growing, self._compare_task, masses=len(grown_masses(sound)))
         return self.found
 
     def _steps(self, exams: int, masses: int, *, learns: bool = False, compared: int = 0) -> dict[str, int]:
@@ -156,7 +162,7 @@ class Campaign:
         Of so many exams or masses those without a task have no inputs: in a plan they will need the step, in a run they
         failed before it. Results of earlier runs are kept where their files are still what they were, else forgotten.
         """
-        kept, values = list[steps.Task](), {} if self._store is None else self._store.values
+        kept, values = list[steps.Task](), {} if self._store is None else self._store
         for task in tasks:
             if task.key in values and unchanged(task.folder, values[task.key]):
                 kept.append(task)
@@ -199,13 +205,12 @@ class Campaign:
     def _read_sources(self) -> None:
         """Digests of all files: two exams of one file are found before any is mapped."""
         with self._bar("files read") as tell:
-            sources = read_sources(
+            self._digests, faults = read_sources(
                 self.exams, store=self._store, keep=not self._dry, executor=self._executor, progress=tell
             )
-        self._digests = sources.digests
         for exam in self.exams:
-            if exam.path in sources.faults:
-                self.found.faults[exam.name] = Fault(READ, sources.faults[exam.path])
+            if exam.path in faults:
+                self.found.faults[exam.name] = Fault(READ, faults[exam.path])
                 self.unread.add(exam.name)
         bytes_of = {exam: [self._digests[exam.path]] for exam in self.exams if exam.path in self._digests}
         for name, reason in Alike(self._breasts, "bytes").faults(bytes_of).items():
@@ -436,11 +441,6 @@ class Campaign:
         files = [[exam.name, *(self._file(step, exam, file) for step, file in _POOLED_FROM)] for exam in exams]
         return settings, {"exams": files, **self._settings_key(settings, normalise)}
 
-    def _compare(self, sound: Sequence[Exam]) -> None:
-        """Compare the visits of every mass that has several with an estimate."""
-        masses = len(grown_masses(sound))
-        self._of_masses("compare", GROWTH, grown_masses(self._estimated(sound)), self._compare_task, masses=masses)
-
     def _compare_task(self, name: str, visits: Visits) -> steps.Task:
         settings, key = self._of_one_mass([exam for exams in visits.values() for exam in exams])
         days, figures = days_of(visits), self.settings.figures
@@ -456,8 +456,7 @@ class Campaign:
         return steps.Task("compare", name, self.folder / GROWTH / name, digest, make)
 
     def _file(self, step: str, exam: Exam, file: str) -> str | None:
-        result = self.found.of(step, exam.name)
-        return None if result is None else result["files"].get(file)
+        return self.found.files(step, exam.name).get(file)
 
 
 SITE: Final = "site"  #: Name of the one step that is of no exam or mass.

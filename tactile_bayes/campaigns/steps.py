@@ -7,7 +7,7 @@ import json
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -91,7 +91,7 @@ class CampaignSettings(CampaignOptions, kw_only=True):
 
 STAGED: Final = "staged"
 """Key of a result whose files wait beside their place: the folder they are in, and the names that have no file."""
-_PREFIX: Final = ".new-"
+WAITING: Final = ".new-"  #: With it begin the names of such folders.
 _DIGITS: Final = 16
 
 Writes = dict[str, Callable[[Path], object]]
@@ -111,13 +111,6 @@ def put_in_place(result: Mapping[str, Any]) -> dict[str, Any]:
     stamps = {name: stamp(folder / name) for name in result["files"]}
     placed = {"files": result["files"], "stamps": stamps}
     return {**placed, **{name: value for name, value in result.items() if name not in (*placed, STAGED)}}
-
-
-def clear_staged(folder: Path, names: Collection[str]) -> None:
-    """Remove what steps of ended commands left beside their place; `names` are those in the folder."""
-    for name in names:
-        if name.startswith(_PREFIX):
-            shutil.rmtree(folder / name, ignore_errors=True)
 
 
 # --- Steps of a campaign: map, estimate, figures and size of an exam, repeatability, pooled size and growth of a mass.
@@ -166,7 +159,7 @@ def _write_staged(task: Task, writes: Writes) -> Result:
 
     Equal files have equal folders. Those of earlier runs are removed when the others are put in place.
     """
-    staged = task.folder / f"{_PREFIX}{task.step}-{task.digest[:_DIGITS]}"
+    staged = task.folder / f"{WAITING}{task.step}-{task.digest[:_DIGITS]}"
     try:
         if writes:
             staged.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import wraps
 from importlib import import_module
 from pathlib import Path
@@ -15,8 +15,8 @@ import click
 
 from tactile_bayes.api.settings import Settings, read_settings
 from tactile_bayes.declarations import Record, default_of, extra_of, kinds, meaning_of, range_of, value_kind
-from tactile_bayes.errors import BY_OPTIONS, UsageError, number_words
-from tactile_bayes.files.atomic import Format, check_suffix, refuse_existing, same_file
+from tactile_bayes.errors import BY_OPTIONS, number_words
+from tactile_bayes.files.atomic import Format, check_suffix, refuse_existing, refuse_same
 from tactile_bayes.presets import HEADS
 from tactile_bayes.report import figure_file
 
@@ -69,7 +69,7 @@ def also_read(*paths: Path | None) -> None:
     """Refuse the call if one of its outputs is one of these further inputs."""
     context = click.get_current_context(silent=True)
     seen: list[tuple[Path, bool]] = [] if context is None else context.meta.get(_SEEN, [])
-    refuse_same([path for path, written in seen if written], [path for path in paths if path is not None])
+    refuse_same([path for path, written in seen if written], paths)
 
 
 def typed_options() -> set[str]:
@@ -77,16 +77,6 @@ def typed_options() -> set[str]:
     context = click.get_current_context()
     typed = click.core.ParameterSource.COMMANDLINE
     return {name for name in context.params if context.get_parameter_source(name) is typed}
-
-
-def refuse_same(
-    outputs: Iterable[Path | None], inputs: Iterable[Path], *, what: str = "an input of this command"
-) -> None:
-    """Refuse an output that is the same file as an input, under any name; `what` the file is besides."""
-    read = list(inputs)
-    for path in outputs:
-        if path is not None and any(same_file(path, one) for one in read):
-            raise UsageError(f"{path} is {what}; choose another name for the output")
 
 
 def command(

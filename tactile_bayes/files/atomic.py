@@ -51,6 +51,16 @@ def same_file(one: Path, other: Path) -> bool:
     return _identity(one) == _identity(other)
 
 
+def refuse_same(
+    outputs: Iterable[Path | None], inputs: Iterable[Path | None], *, what: str = "an input of this command"
+) -> None:
+    """Refuse an output that is the same file as an input, under any name; `what` the file is besides."""
+    read = [path for path in inputs if path is not None]
+    for path in outputs:
+        if path is not None and any(same_file(path, one) for one in read):
+            raise UsageError(f"{path} is {what}; choose another name for the output")
+
+
 def given_twice(paths: Iterable[Path]) -> Path | None:
     """The first path that leads to the file of one before it; None where each is another file."""
     seen = set[tuple[int, int] | str]()

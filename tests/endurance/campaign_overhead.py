@@ -27,7 +27,7 @@ from campaign_scale import PORT, Cluster, Watch, entries
 from tactile_bayes.batch import open_executor, run_batch
 from tactile_bayes.campaigns import report as campaign_report
 from tactile_bayes.campaigns import run as campaigns
-from tactile_bayes.campaigns.inputs import Sources, open_campaign
+from tactile_bayes.campaigns.inputs import open_campaign
 from tactile_bayes.campaigns.steps import CampaignSettings, Task
 from tactile_bayes.files.documents import read_record
 from tactile_bayes.files.manifest_csv import ESTIMATE, EXAMS, JOURNAL, Exam
@@ -52,8 +52,8 @@ def client(out: Path, exams: int) -> None:
     def step(task: Task) -> dict[str, Any]:
         return dict(sample[task.step])
 
-    def sources(listed: list[Exam], **_options: Any) -> Sources:
-        return Sources({exam.path: f"{number:064x}" for number, exam in enumerate(listed)}, {})
+    def sources(listed: list[Exam], **_options: Any) -> tuple[dict[Path, str], dict[Path, str]]:
+        return {exam.path: f"{number:064x}" for number, exam in enumerate(listed)}, {}
 
     with measured("table of exams", exams):
         table = [_exam(number) for number in range(exams)]
