@@ -104,8 +104,18 @@ class LocalWorkers(Executor):
 
 
 def _work(line: Connection) -> None:
-    """Run items from a pipe until its other end is closed."""
-    prepare_worker()
+    """Run items from a pipe until its other end is closed, or the parent ends, even if that was killed; no Ctrl-C."""
+    import multiprocessing
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def end_with_parent() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
     while True:
         try:
             fn, args, kwargs = line.recv()
@@ -120,22 +130,6 @@ def _work(line: Connection) -> None:
             return
         except Exception as error:  # it cannot be pickled
             line.send((False, TypeError(one_line(error))))
-
-
-def prepare_worker() -> None:
-    """Set up a worker process: ignore Ctrl-C, and end when the parent process does, even if that was killed."""
-    import multiprocessing
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-
-    def end_with_parent() -> None:
-        if parent is not None:
-            parent.join()
-        os._exit(1)
-
-    if parent is not None:
-        threading.Thread(target=end_with_parent, daemon=True).start()
 
 
 class InlineExecutor(Executor):

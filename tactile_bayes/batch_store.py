@@ -72,7 +72,12 @@ class BatchStore(UserDict[str, Any]):
             for number, line in enumerate(file, start=2):
                 if not line.endswith(b"\n"):
                     break
-                name = _name_in(line[:-1].decode("utf-8", errors="replace"), number=number, path=self.path)
+                try:
+                    record = _unsealed(line[:-1].decode("utf-8", errors="replace"))
+                    name, _ = str(record["key"]), record["value"]
+                except (ValueError, KeyError, TypeError, RecursionError):
+                    way_out = "remove that line: its item will be run again"
+                    raise BadDataError(f"line {number} is damaged", way_out=way_out, path=str(self.path)) from None
                 self.data[name] = self._end
                 self._end += len(line)
         if not self._read_only:
@@ -201,15 +206,3 @@ def _check_header(line: str, wanted: Mapping[str, Any], *, path: Path) -> None:
             f"{path} holds results of other settings ({', '.join(differ)}: {name} was {settings.get(name)!r}, "
             f"is {new.get(name)!r}); choose another name, or remove it to begin again"
         )
-
-
-def _name_in(line: str, *, number: int, path: Path) -> str:
-    """Name of the item whose result a line holds."""
-    try:
-        record = _unsealed(line)
-        name, _ = record["key"], record["value"]
-        return str(name)
-    except (ValueError, KeyError, TypeError, RecursionError):
-        raise BadDataError(
-            f"line {number} is damaged", way_out="remove that line: its item will be run again", path=str(path)
-        ) from None

@@ -47,23 +47,6 @@ class Said(Record):
     sources: frozenset[str] = frozenset()  #: SHA-256 of the files that it was made from.
 
 
-def _said_by(path: Path, name: str) -> Said:
-    """What a scan, arrays of a scan or a map say of the exam: facts on which all scans of the file agree."""
-    if name.lower().endswith(ARRAYS):
-        return Said()
-    if name.lower().endswith(MAP):
-        _, scans = read_map_and_scans(path)
-        sessions: Sequence[Mapping[str, Any]] = scans
-        made: Any = scans
-    else:
-        records = scan_records(path, keep=())
-        sessions, made = [records.metadata.get("session", {})], provenance_of(records).get("inputs")
-    told = {column: {session.get(key) or "" for session in sessions} for column, key in SAME_IN_SCANS.items()}
-    facts = {column: min(values) for column, values in told.items() if len(values) == 1 and values != {""}}
-    inputs = [one for one in made if isinstance(one, dict)] if isinstance(made, list | tuple) else []
-    return Said(facts, frozenset(str(one["sha256"]) for one in inputs if "sha256" in one))
-
-
 # --- What a file's name says of its exam, by a pattern such as ``{patient}_{visit}_{exam}.npz``.
 
 _NAMED: Final = ("patient", "visit", "mass", "exam", "side", "reader", "date")
@@ -128,14 +111,27 @@ class NamePattern:
 
 
 def _told(path: Path, name: str, pattern: NamePattern | None) -> Said:
-    """What a file and its name say; where they contradict each other that is an error."""
-    said = _said_by(path, name)
-    told = {} if pattern is None else pattern.facts(name)
-    for column, value in told.items():
-        inside = said.facts.get(column, value)
+    """What a scan or a map says, as far as all scans of the file agree, and its name; arrays of a scan say nothing.
+
+    Where file and name contradict each other that is an error.
+    """
+    sessions: Sequence[Mapping[str, Any]] = ()
+    made: Any = ()
+    if name.lower().endswith(MAP):
+        _, made = read_map_and_scans(path)
+        sessions = made
+    elif not name.lower().endswith(ARRAYS):
+        records = scan_records(path, keep=())
+        sessions, made = [records.metadata.get("session", {})], provenance_of(records).get("inputs")
+    told = {column: {session.get(key) or "" for session in sessions} for column, key in SAME_IN_SCANS.items()}
+    facts = {column: min(values) for column, values in told.items() if len(values) == 1 and values != {""}}
+    named = {} if pattern is None else pattern.facts(name)
+    for column, value in named.items():
+        inside = facts.get(column, value)
         if inside.casefold() != value.casefold():
             raise BadDataError(f"its name says {column} {value}, the file says {inside}")
-    return replace(said, facts={**told, **said.facts})
+    inputs = [one for one in made if isinstance(one, dict)] if isinstance(made, list | tuple) else []
+    return Said({**named, **facts}, frozenset(str(one["sha256"]) for one in inputs if "sha256" in one))
 
 
 # --- Files of a folder that may be exams, and which of them are the same exam twice.
@@ -456,11 +452,3 @@ def visit_dates(visits: Mapping[str, Sequence[Exam]]) -> dict[str, date | None]:
         visit: max((exam.day for exam in exams if exam.day is not None), default=day_of(visit))
         for visit, exams in visits.items()
     }
-
-
-def days_of(visits: Mapping[str, Sequence[Exam]]) -> tuple[float, ...] | None:
-    """Days of the visits from the first; None where one of them has no date."""
-    days = list(visit_dates(visits).values())
-    first = days[0]
-    known = [float((day - first).days) for day in days if day is not None and first is not None]
-    return tuple(known) if len(known) == len(days) else None

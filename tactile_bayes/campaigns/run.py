@@ -27,7 +27,7 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_batch
 from tactile_bayes.batch_store import BatchStore
 from tactile_bayes.campaigns import steps
-from tactile_bayes.campaigns.exams import Breasts, Match, NamedPlace, Visits, days_of, grown_masses, visit_dates
+from tactile_bayes.campaigns.exams import Breasts, Match, NamedPlace, Visits, grown_masses, visit_dates
 from tactile_bayes.campaigns.inputs import READ, Alike, StepResults, read_sources, unchanged
 from tactile_bayes.declarations import Record, field, names_of, replace
 from tactile_bayes.errors import TactileBayesError
@@ -443,8 +443,10 @@ class Campaign:
 
     def _compare_task(self, name: str, visits: Visits) -> steps.Task:
         settings, key = self._of_one_mass([exam for exams in visits.values() for exam in exams])
-        days, figures = days_of(visits), self.settings.figures
-        dates = tuple("" if day is None else day.isoformat() for day in visit_dates(visits).values())
+        found, figures = list(visit_dates(visits).values()), self.settings.figures
+        known = [day for day in found if day is not None]
+        days = tuple(float((day - known[0]).days) for day in known) if len(known) == len(found) else None
+        dates = tuple("" if day is None else day.isoformat() for day in found)
         first = next(iter(visits.values()))[0]
         course = Course("", "", first.patient, first.side or "", first.mass, tuple(visits), dates if any(dates) else ())
         counts = [len(exams) for exams in visits.values()]
