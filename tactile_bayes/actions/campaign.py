@@ -56,9 +56,7 @@ def _say_found(found: Found, output: Path, before: Sequence[Mapping[str, str]] |
     patients = {row["patient"].casefold() for row in rows} - {""}
     added = "" if before is None else f" ({len(found.rows)} added, {len(before)} kept)"
     click.echo(f"{output}: {len(rows)} exams of {len(patients)} patients{added}")
-    for line in found.spelled:
-        click.echo(line)
-    for line in names_line("listed, and not there any more", found.gone):
+    for line in (*found.spelled, *names_line("listed, and not there any more", found.gone)):
         click.echo(line)
     if found.others:
         kinds = ", ".join(sorted(found.others))

@@ -109,10 +109,9 @@ class TableRows(Record, eq=False):
 
     def map_slopes(self, theta: FloatArray) -> FloatArray:
         """(2, n) derivatives of the same by ln a and p, by central differences."""
-        h = _STEP
-        by_u = self.log_size(theta, du=h) - self.log_size(theta, du=-h)
-        by_v = self.log_size(theta, dv=h) - self.log_size(theta, dv=-h)
-        return np.stack([by_u, by_v]) / (2 * h)
+        by_u = self.log_size(theta, du=_STEP) - self.log_size(theta, du=-_STEP)
+        by_v = self.log_size(theta, dv=_STEP) - self.log_size(theta, dv=-_STEP)
+        return np.stack([by_u, by_v]) / (2 * _STEP)
 
     def tangent(self, theta: FloatArray) -> regression.BodyRegression:
         """The regression of ln d on the tangent of Eq 6 at these coefficients."""
@@ -146,8 +145,7 @@ def learn_depth(profile: FloatArray, log_fat: FloatArray) -> FatDepth:
 
 def _exams(rows: TableRows, eq6: Eq6Fit, size: FloatArray, slope: FloatArray) -> tuple[tuple[float, float], FloatArray]:
     """Its `exam_spread`, and (b,) variance of each body's ln d by its exams and the coefficients of Eq 6."""
-    u = rows.values[:, 0]
-    data = regression.BodyRegression.linear(rows.maps, eq6.data.terms, u=u, constant=eq6.data.constant, slope=slope)
+    data = replace(eq6.data, map_variance=regression.map_variance(rows.maps, slope))
     exam = data.exam_spread(size)
     coefficients = np.sum(data.mean_terms @ eq6.covariance * data.mean_terms, axis=1)
     return exam, (np.exp(exam[0]) ** 2 + data.mean(data.map_variance)) / data.exams + coefficients

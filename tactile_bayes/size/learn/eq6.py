@@ -241,8 +241,7 @@ def learn_two_stage(table: SizeTable, *, recipe: Recipe, rng: np.random.Generato
 
 def axis_in_two_stages(data: AxisRows) -> AxisCalibration:
     """Eq 6 fitted in two stages to the rows themselves: a single draw, as `axis_at_mode` of the joint posterior."""
-    ones = np.ones((1, len(data.d_mm)))
-    return data.calibration(_two_stages(data, ones))
+    return data.calibration(_two_stages(data, np.ones((1, len(data.d_mm)))))
 
 
 def other_fit(calibration: SizeCalibration, table: SizeTable) -> OtherFit | None:
@@ -263,8 +262,7 @@ def other_fit(calibration: SizeCalibration, table: SizeTable) -> OtherFit | None
 
 def _learn_in_two_stages(data: AxisRows, rng: np.random.Generator) -> AxisCalibration:
     fitted = axis_in_two_stages(data)
-    counts = _resampled(data, rng)
-    draws = _two_stages(data, counts)
+    draws = _two_stages(data, _resampled(data, rng))
     _stretch(draws, diameters=len(np.unique(data.d_mm)))
     # the estimate is the fit to the table itself, not the mean over its resamples
     scaled = [2, 4]
