@@ -159,7 +159,7 @@ def open_executor(*, workers: int = 1, cluster: str | None = None) -> AbstractCo
 
 
 @contextlib.contextmanager
-def cluster_executor(address: str) -> Iterator[Executor]:
+def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Executor]:
     """Executor over the workers of a running dask scheduler, for example ``tcp://10.0.0.5:8786``.
 
     The workers must have this version of the program installed: another one could give other results.
@@ -175,7 +175,7 @@ def cluster_executor(address: str) -> Iterator[Executor]:
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     with contextlib.ExitStack() as stack:
         try:
-            client = stack.enter_context(Client(address, timeout=10.0, set_as_default=False))
+            client = stack.enter_context(Client(address, timeout=timeout_s, set_as_default=False))
         except (OSError, ValueError) as error:
             raise UsageError(
                 f"no dask scheduler answers at {address} ({one_line(error)}); start one with `dask scheduler` and "

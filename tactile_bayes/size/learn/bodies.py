@@ -82,7 +82,7 @@ class TableRows(Record, eq=False):
         if table.profile is not None and table.log_fat is not None:
             told = np.isfinite(table.profile.sum(axis=1))
             if len(np.unique(table.body[told])) >= LEAST_BODIES:
-                maps, depth = regression.rows_of(table, told), learn_depth(table.profile[told], table.log_fat[told])
+                maps, depth = table.rows(told), learn_depth(table.profile[told], table.log_fat[told])
                 log_depth = depth.log_depth(table.profile[told])
         rows = np.column_stack([maps.log_amplitude, maps.log_width, log_depth])
         centre = [round(float(column.mean()), 3) for column in rows.T]
@@ -270,8 +270,7 @@ class Sized(Record):
 def sized(calibration: BodyCalibration, table: regression.PopulationTable, *, known: Sequence[str] = ()) -> Sized:
     """The bodies of a table, each by all its exams; of the properties in `known` the true value is told."""
     bodies = np.unique(table.body)
-    exams = (regression.rows_of(table, table.body == one) for one in bodies)
-    errors = np.array([size_error(calibration, one, known=known) for one in exams])
+    errors = np.array([size_error(calibration, table.rows(table.body == one), known=known) for one in bodies])
     return Sized(*errors.T)
 
 
