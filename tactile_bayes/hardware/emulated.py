@@ -16,21 +16,13 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.head import Packet, PacketParser
 from tactile_bayes.hardware.readings import (
-    MM_PER_INCH,
     HelloReading,
     MissingReading,
     PoseReading,
     ToolReading,
     pose_from_relative,
 )
-from tactile_bayes.hardware.serial_trackers import (
-    FASTRAK,
-    FASTRAK_DECIMALS,
-    LIBERTY,
-    LIBERTY_HEADER_BYTES,
-    record_bytes,
-)
-from tactile_bayes.hardware.trackers import encode_transform
+from tactile_bayes.hardware.serial_trackers import encoded
 from tactile_bayes.options import FaultOptions
 from tactile_bayes.scans import Scan, TrackerPoses
 
@@ -46,10 +38,6 @@ _SETTING: Final = re.compile(rb"[A-Za-z][0-9*,][^\r]*\r")
 class Faults(FaultOptions):
     """Faults of an emulated device, and what they do to its records."""
 
-    def stalls(self, time_s: float) -> bool:
-        """True when the device sends nothing at a time of the scan."""
-        return _within(self.stall, time_s)
-
     def disturb(self, record: bytes, rng: np.random.Generator) -> bytes:
         """Apply the faults to a record: unchanged, one bit changed, or dropped."""
         if self.drop and rng.random() < self.drop:
@@ -62,7 +50,7 @@ class Faults(FaultOptions):
         return bytes(changed)
 
 
-def _within(span: tuple[float, float] | None, time_s: float) -> bool:
+def within(span: tuple[float, float] | None, time_s: float) -> bool:
     """True at the times of a fault, given by its begin and its length."""
     return span is not None and span[0] <= time_s < span[0] + span[1]
 
@@ -170,13 +158,13 @@ def played_tools(poses: TrackerPoses, faults: Faults, index: int, *, names: tupl
         y += faults.breathe_mm / 2 * math.sin(2 * math.pi * time_s / _BREATH_S)
         bases = [PoseReading((x, y, z), _REFERENCE_TURN, pose.device_ns, tool=names[1])]
         pose = pose_from_relative(pose, bases[0])._replace(tool=names[0])
-    if _within(faults.hide, time_s):
+    if within(faults.hide, time_s):
         return [*bases, MissingReading("out of sight", pose.tool)]
     return [*bases, pose]
 
 
 class EmulatedTracker(Device):
-    """An emulated tracker of one of `PROTOCOLS`, with a tracker's faults."""
+    """An emulated tracker of one of `serial_trackers.PROTOCOLS`, with a tracker's faults."""
 
     def __init__(self, poses: TrackerPoses, *, protocol: str, faults: Faults | None = None) -> None:
         self.times_s = poses.time_s
@@ -211,35 +199,6 @@ class EmulatedTracker(Device):
 
     def record(self, index: int) -> bytes:
         return b"".join(encoded(self._protocol, one, index) for one in self._tools(index))
-
-
-PROTOCOLS: Final = ("fastrak", "fastrak-ascii", "liberty", "liberty-ascii", "bird", "open", "igtlink")
-
-
-def encoded(protocol: str, pose: ToolReading, number: int) -> bytes:
-    """A reading in one of `PROTOCOLS`; nothing of a tool that is not seen, where the protocol has no word for that."""
-    if protocol == "open":
-        return head.encode_pose(pose, sequence=number)
-    if protocol == "igtlink":
-        return encode_transform(pose)
-    if not isinstance(pose, PoseReading):
-        return b""
-    station = int(pose.tool or 1)
-    numbers = (*(value / MM_PER_INCH for value in pose.position_mm), *pose.quaternion_wxyz)
-    time_ms = (pose.device_ns or 0) // 1_000_000 % 2**32
-    match protocol:
-        case "fastrak":
-            return b"0%d " % station + FASTRAK.pack(*numbers) + b" "
-        case "fastrak-ascii":
-            columns = (f"{value:7.{places}f}" for value, places in zip(numbers, FASTRAK_DECIMALS, strict=True))
-            return f"0{station} {''.join(columns)}\r\n".encode()
-        case "liberty":
-            header = (b"LY", station, ord("C"), ord(" "), 0, LIBERTY.size - LIBERTY_HEADER_BYTES + 1)
-            return LIBERTY.pack(*header, *numbers, time_ms, 0) + b" "
-        case "liberty-ascii":
-            return f"{station:02}  {' '.join(f'{value:.5f}' for value in numbers)} {time_ms} 0\r\n".encode()
-        case _:  # of a bird, whose address stands behind it in group mode
-            return record_bytes(numbers) + (bytes([station]) if pose.tool else b"")
 
 
 # --- Emulated NDI tracker: the commands of the combined API that a host needs to follow one tool.

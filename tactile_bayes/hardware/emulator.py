@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from tactile_bayes.errors import DeviceError
-from tactile_bayes.hardware.emulated import Device, Faults
+from tactile_bayes.hardware.emulated import Device, Faults, within
 
 # A device's own buffer: what does not fit is dropped record by record, as firmware does.
 BUFFER_BYTES: Final = 256 * 1024
@@ -277,7 +277,7 @@ class Emulator:
     def _send(self, record: bytes, moment_s: float) -> None:
         if not record:
             return
-        if self._faults.stalls(moment_s) or len(self._waiting) + len(record) > BUFFER_BYTES:
+        if within(self._faults.stall, moment_s) or len(self._waiting) + len(record) > BUFFER_BYTES:
             self.dropped += 1
             return
         disturbed = self._faults.disturb(record, self._rng)

@@ -296,9 +296,7 @@ class LiveMap:
         if sum(int(used.sum()) for _, _, used in self._fed) < REFIT_AT[self._refits]:
             return
         self._refits += 1
-        moments = HeadMoments()
-        for _, poses, used in self._fed:
-            moments += head_moments(self.head, poses.part(used))
+        moments = sum((head_moments(self.head, poses.part(used)) for _, poses, used in self._fed), HeadMoments())
         with suppress(BadDataError):  # still too nearly a line: the plane under the head will do until the next time
             self._map = self._map_on(moments.plane())
             for counts, poses, _ in self._fed:

@@ -201,11 +201,9 @@ def relative_pose(pose: PoseReading, base: PoseReading) -> PoseReading:
     size = math.hypot(*base.quaternion_wxyz)
     w, i, j, k = (part / size for part in _conjugate(base.quaternion_wxyz))
     x, y, z = (a - b for a, b in zip(pose.position_mm, base.position_mm, strict=True))
-    _, *place = _product(_product((w, i, j, k), (0.0, x, y, z)), (w, -i, -j, -k))
+    _, x, y, z = _product(_product((w, i, j, k), (0.0, x, y, z)), (w, -i, -j, -k))
     turn = _product((w, i, j, k), pose.quaternion_wxyz)
-    return pose._replace(
-        position_mm=(place[0], place[1], place[2]), quaternion_wxyz=turn, flags=(*pose.flags, *base.flags)
-    )
+    return pose._replace(position_mm=(x, y, z), quaternion_wxyz=turn, flags=(*pose.flags, *base.flags))
 
 
 def _conjugate(quaternion_wxyz: Quaternion) -> Quaternion:
@@ -350,10 +348,8 @@ class DeviceClock:
 
 def wrap_period(before_ns: int, after_ns: int, *, passed_ns: int) -> int | None:
     """Period of `WRAPS_NS` that explains a counter's restart by the time passed, if any."""
-    for period_ns in WRAPS_NS:
-        if before_ns < period_ns and abs(after_ns + period_ns - before_ns - passed_ns) < _SLIP_NS:
-            return period_ns
-    return None
+    passed = [ns for ns in WRAPS_NS if before_ns < ns and abs(after_ns + ns - before_ns - passed_ns) < _SLIP_NS]
+    return passed[0] if passed else None
 
 
 class PoseClock:

@@ -25,9 +25,10 @@ from tactile_bayes.hardware.readings import (
     PoseReading,
     Reading,
     RecordParser,
+    ToolReading,
     plausible,
 )
-from tactile_bayes.hardware.trackers import NAME_BYTES, IgtlinkParser, NdiPort, ask_for_tdata
+from tactile_bayes.hardware.trackers import NAME_BYTES, IgtlinkParser, NdiPort, ask_for_tdata, encode_transform
 
 # --- Parser for Ascension Flock of Birds and miniBIRD trackers, position and quaternion.
 #
@@ -185,6 +186,37 @@ def _pose(
     told += (f"distortion {distortion}" if distortion else "",)
     device_ns = None if time_ms is None else time_ms * 1_000_000
     return PoseReading((x, y, z), (w, i, j, k), device_ns, tuple(filter(None, told)), tool)
+
+
+# --- Records as the devices of these drivers send them.
+
+PROTOCOLS: Final = ("fastrak", "fastrak-ascii", "liberty", "liberty-ascii", "bird", "open", "igtlink")
+
+
+def encoded(protocol: str, pose: ToolReading, number: int) -> bytes:
+    """A reading in one of `PROTOCOLS`; nothing of a tool that is not seen, where the protocol has no word for that."""
+    if protocol == "open":
+        return head.encode_pose(pose, sequence=number)
+    if protocol == "igtlink":
+        return encode_transform(pose)
+    if not isinstance(pose, PoseReading):
+        return b""
+    station = int(pose.tool or 1)
+    numbers = (*(value / MM_PER_INCH for value in pose.position_mm), *pose.quaternion_wxyz)
+    time_ms = (pose.device_ns or 0) // 1_000_000 % 2**32
+    match protocol:
+        case "fastrak":
+            return b"0%d " % station + FASTRAK.pack(*numbers) + b" "
+        case "fastrak-ascii":
+            columns = (f"{value:7.{places}f}" for value, places in zip(numbers, FASTRAK_DECIMALS, strict=True))
+            return f"0{station} {''.join(columns)}\r\n".encode()
+        case "liberty":
+            header = (b"LY", station, ord("C"), ord(" "), 0, LIBERTY.size - LIBERTY_HEADER_BYTES + 1)
+            return LIBERTY.pack(*header, *numbers, time_ms, 0) + b" "
+        case "liberty-ascii":
+            return f"{station:02}  {' '.join(f'{value:.5f}' for value in numbers)} {time_ms} 0\r\n".encode()
+        case _:  # of a bird, whose address stands behind it in group mode
+            return record_bytes(numbers) + (bytes([station]) if pose.tool else b"")
 
 
 # --- Drivers of the devices: setup, start, stop and identification.

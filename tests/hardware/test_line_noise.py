@@ -11,9 +11,10 @@ from emulated_devices import short_scan
 from test_resync import NAMES, parser_of, stream_of
 
 from tactile_bayes.hardware import head
-from tactile_bayes.hardware.emulated import PROTOCOLS, EmulatedHead, EmulatedNdi, EmulatedTracker
+from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedNdi, EmulatedTracker
 from tactile_bayes.hardware.head import encode_packet
 from tactile_bayes.hardware.readings import HelloReading
+from tactile_bayes.hardware.serial_trackers import PROTOCOLS
 
 MEGABYTE = 1 << 20
 PIECE = 4000

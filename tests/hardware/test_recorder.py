@@ -22,11 +22,11 @@ from tactile_bayes.files import scan_mcap
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid
 from tactile_bayes.hardware import reading
-from tactile_bayes.hardware.emulated import PROTOCOLS, EmulatedTracker, Faults
+from tactile_bayes.hardware.emulated import EmulatedTracker, Faults, within
 from tactile_bayes.hardware.ports import Port, Stream, read_in_process, shown
 from tactile_bayes.hardware.readings import ArrivalClock, PoseClock, PoseReading
 from tactile_bayes.hardware.recorder import LandmarkTouch
-from tactile_bayes.hardware.serial_trackers import TRACKERS
+from tactile_bayes.hardware.serial_trackers import PROTOCOLS, TRACKERS
 
 
 def read_all(stream: Stream, size: int) -> bytes:
@@ -265,7 +265,7 @@ def test_faults_come_as_often_as_asked():
     assert 0.16 < sum(one not in (b"", b"record") for one in sent) / 4000 < 0.20
     assert all(len(one) in (0, 6) for one in sent)
     assert Faults().disturb(b"record", rng) == b"record"
-    assert [Faults(stall=(1.0, 0.5)).stalls(t) for t in (0.9, 1.0, 1.49, 1.5)] == [False, True, True, False]
+    assert [within((1.0, 0.5), t) for t in (0.9, 1.0, 1.49, 1.5)] == [False, True, True, False]
 
 
 @pytest.fixture

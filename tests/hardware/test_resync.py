@@ -14,9 +14,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tactile_bayes.hardware.emulated import PROTOCOLS, encoded
 from tactile_bayes.hardware.readings import Parser, PoseReading
-from tactile_bayes.hardware.serial_trackers import TRACKERS, BirdParser
+from tactile_bayes.hardware.serial_trackers import PROTOCOLS, TRACKERS, BirdParser, encoded
 
 BEFORE, AFTER = 2, 5
 STREAMS = 40
