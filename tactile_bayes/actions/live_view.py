@@ -30,7 +30,7 @@ from tactile_bayes.files.instrument import calibration_document, head_document
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.findings import finding_summary
 from tactile_bayes.geometry import FloatArray, apply, inverse
-from tactile_bayes.hardware.live import Feed, FeedReader, LiveMap, LiveState, colour_limits, grey_levels
+from tactile_bayes.hardware.live import Feed, LiveMap, LiveState, colour_limits, fed, grey_levels
 from tactile_bayes.hardware.serve import LiveServer, address_of
 from tactile_bayes.mapping.map import TactileMap, block_sums
 from tactile_bayes.mapping.places import Orientation, orientation_of
@@ -205,7 +205,6 @@ def run(pipe: int, setup: dict[str, Any]) -> None:
     """Follow a recording until it ends."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends the recording, and that ends the view
-    reader = FeedReader(pipe)
     live = LiveMap(from_plain(HeadGeometry, setup["head"]), from_plain(ElementCalibration, setup["calibration"]))
     estimator = Estimator(setup["size_calibration"])
     with contextlib.ExitStack() as stack:
@@ -219,17 +218,17 @@ def run(pipe: int, setup: dict[str, Any]) -> None:
         if setup["terminal"]:
             showing.append(stack.enter_context(terminal_view(keys=setup["keys"])))
         began = time.monotonic()
-        drawings = _look(reader, live, estimator, showing)
+        drawings = _look(pipe, live, estimator, showing)
         if not sys.stderr.isatty():
             seconds = time.monotonic() - began
             print(f"live view: {drawings} drawings and {estimator.done} estimates in {seconds:.1f} s", file=sys.stderr)
 
 
-def _look(reader: Any, live: LiveMap, estimator: Estimator, showing: list[Callable[[LiveState], None]]) -> int:
+def _look(pipe: int, live: LiveMap, estimator: Estimator, showing: list[Callable[[LiveState], None]]) -> int:
     """Draw until the recording ends; returns the number of drawings."""
     drawn, drawings, newest = 0.0, 0, None
-    while not reader.ended:
-        live.take(reader.read(TAKEN_EVERY_S))
+    for seen in fed(pipe, TAKEN_EVERY_S):
+        live.take(seen)
         estimator.look(newest)
         now = time.monotonic()
         if now - drawn < 1 / DRAWINGS_PER_S:

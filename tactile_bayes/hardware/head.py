@@ -318,8 +318,9 @@ def fit_array(steps: Sequence[BladderStep], *, saturation_count: int) -> ArrayFi
     valid = ~np.array([step.saturated for step in ordered])
     dead, hot = _odd_taxels(pressure, counts, valid)
     good = ~(dead | hot)
-    line = _polynomials(pressure, counts, valid & good, degree=1)
-    curve = _polynomials(pressure, counts, valid & good, degree=2) if len(steps) >= STEPS_FOR_CURVATURE else None
+    use = valid & good
+    line = _polynomials(pressure, counts, use, degree=1)
+    curve = _polynomials(pressure, counts, use, degree=2 if len(steps) >= STEPS_FOR_CURVATURE else 1)
     gain, offset = line[1], line[0]
     if (gain[good] < 0).any():
         row, column = (int(i) for i in np.argwhere(good & (gain < 0))[0])
@@ -328,11 +329,11 @@ def fit_array(steps: Sequence[BladderStep], *, saturation_count: int) -> ArrayFi
         )
     return ArrayFit(
         calibration=ElementCalibration(gain, offset, saturation_count=saturation_count),
-        curvature_kpa_per_count2=np.zeros(gain.shape) if curve is None else curve[2],
+        curvature_kpa_per_count2=curve[2],
         dead=_places(dead),
         hot=_places(hot),
-        nonuniformity=_nonuniformity(line, pressure, counts, valid & good),
-        curved_nonuniformity=_nonuniformity(line if curve is None else curve, pressure, counts, valid & good),
+        nonuniformity=_nonuniformity(line, pressure, counts, use),
+        curved_nonuniformity=_nonuniformity(curve, pressure, counts, use),
         pressure_kpa=pressure,
     )
 
@@ -355,8 +356,8 @@ def _odd_taxels(
 
 
 def _polynomials(pressure: FloatArray, counts: FloatArray, use: NDArray[np.bool_], *, degree: int) -> FloatArray:
-    """(degree + 1, rows, columns) coefficients of pressure in counts, lowest first; zero where nothing is used."""
-    result = np.zeros((degree + 1, *counts.shape[1:]))
+    """(3, rows, columns) coefficients of pressure in counts, lowest first; zero where nothing is used."""
+    result = np.zeros((3, *counts.shape[1:]))
     for row, column in np.argwhere(use.sum(axis=0) >= 2):
         chosen = use[:, row, column]
         order = min(degree, int(chosen.sum()) - 1)

@@ -103,26 +103,21 @@ class Feed(Observer):
         os.close(self._pipe)
 
 
-class FeedReader:
-    """The live view's end of the feed."""
+def fed(pipe: int, every_s: float) -> Iterator[list[Seen]]:
+    """What a `Feed` has sent, time after time until the recorder has gone.
 
-    def __init__(self, pipe: int) -> None:
-        self.pipe = pipe
-        self.ended = False
-        os.set_blocking(pipe, False)
-
-    def read(self, wait_s: float) -> list[Seen]:
-        """Read what comes within a time; sets `ended` when the recorder has gone.
-
-        It does not return with the first message: taken one by one, frames cost eight times as much.
-        """
-        time.sleep(wait_s)
+    Messages are not given one by one: frames taken so cost eight times as much.
+    """
+    os.set_blocking(pipe, False)
+    ended = False
+    while not ended:
+        time.sleep(every_s)
         data = b""
         with suppress(BlockingIOError):
-            while piece := os.read(self.pipe, PIPE_BYTES):
+            while piece := os.read(pipe, PIPE_BYTES):
                 data += piece
-            self.ended = True
-        return list(_messages(data))
+            ended = True
+        yield list(_messages(data))
 
 
 def _messages(data: bytes) -> Iterator[Seen]:

@@ -230,7 +230,6 @@ class Stream:
     overrun_bytes: int = 0  #: Bytes that the reader had to drop because the pipe was full.
     ready: bool = False  #: The reader has begun to read.
     ended: bool = False  #: The device has gone, or the reader has.
-    cpu_s: float = 0.0
     _rest: bytes = field(default=b"", repr=False)
 
     def fileno(self) -> int:
@@ -282,12 +281,9 @@ class Stream:
             self.process.kill()  # it ignores what a terminal or a service manager sends to all of a recording
 
     def close(self) -> None:
-        """Stop the reader, add up its CPU time, and close the pipe."""
+        """Stop the reader and close the pipe."""
         self.stop()
-        if self.process.returncode is None:
-            _, status, usage = os.wait4(self.process.pid, 0)
-            self.process.returncode = os.waitstatus_to_exitcode(status)
-            self.cpu_s = usage.ru_utime + usage.ru_stime
+        self.process.wait()
         os.close(self.pipe)
 
 

@@ -90,6 +90,8 @@ LIBERTY_HEADER_BYTES: Final = 8
 _TAGS: Final = (b"LY", b"PA", b"LU")
 _LONGEST_LINE: Final = 512
 _WORDS_LIBERTY: Final = 9
+_LIBERTY_TEXT: Final = re.compile(rb"([ 0]\d|1[0-6])([A-Za-z ])")  # station, error
+_NUMBER: Final = re.compile(rb"[+-]?\d+(\.\d*)?([eE][+-]?\d+)?")
 
 
 class FastrakParser(RecordParser):
@@ -161,17 +163,13 @@ class LibertyAsciiParser(Parser):
         return found
 
     def _line(self, line: bytes) -> PoseReading | None:
-        station, error, words = line[:2], line[2:3], line[3:].split()
-        if not re.fullmatch(rb"[ 0]\d|1[0-6]", station) or not (error.isalpha() or error == b" "):
+        found, words = _LIBERTY_TEXT.match(line), line[3:].split()
+        if found is None or len(words) != _WORDS_LIBERTY or not all(map(_NUMBER.fullmatch, words)):
             return None
-        if len(words) != _WORDS_LIBERTY or not all(
-            re.fullmatch(rb"[+-]?\d+(\.\d*)?([eE][+-]?\d+)?", word) for word in words
-        ):
-            return None
-        *values, time_ms, distortion = (float(word) for word in words)
+        *values, time_ms, distortion = map(float, words)
         if not math.isfinite(time_ms + distortion):
             return None
-        return _pose(values, str(int(station)), error, int(time_ms), int(distortion))
+        return _pose(values, str(int(found[1])), found[2], int(time_ms), int(distortion))
 
 
 def _pose(

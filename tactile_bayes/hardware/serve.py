@@ -22,8 +22,6 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import parse_qs, urlsplit
 
-import numpy as np
-
 from tactile_bayes.errors import UsageError
 from tactile_bayes.hardware.live import LiveState, colour_limits, grey_levels
 from tactile_bayes.mapping.places import orientation_of
@@ -229,9 +227,7 @@ def _map_document(state: LiveState) -> dict[str, Any] | None:
     view = orientation_of(tactile_map)
     levels = view.screen(grey_levels(tactile_map.mean))
     rows, columns = levels.shape
-    known = np.isfinite(levels)
-    whole = np.rint(np.where(known, levels, 0.0) * 255).astype(int)
-    cells = [value if shown else None for value, shown in zip(whole.ravel().tolist(), known.ravel(), strict=True)]
+    cells = [None if math.isnan(level) else round(255 * level) for level in levels.ravel().tolist()]
     limits = colour_limits(tactile_map.mean)
     return {
         "rows": rows,

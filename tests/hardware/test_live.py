@@ -23,12 +23,12 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.hardware.live import (
     Feed,
-    FeedReader,
     LiveMap,
     LiveState,
     SeenFrame,
     SeenLandmark,
     SeenPose,
+    fed,
     grey_levels,
 )
 from tactile_bayes.hardware.readings import PoseReading
@@ -47,7 +47,7 @@ def scan():
 @pytest.fixture
 def pipe():
     theirs, ours = os.pipe()
-    return FeedReader(theirs), Feed(ours)
+    return fed(theirs, 0.0), Feed(ours)
 
 
 def pose_of(scan, index: int) -> PoseReading:
@@ -81,15 +81,14 @@ def test_what_is_fed_is_seen(scan, pipe):
     feed.pose(pose_of(scan, 2), 16_666_667)
     feed.landmark("xiphoid", np.array([1.0, -2.5, 3.0]))
     feed.told(Report(frames=4, unseen="out of volume", other_tools="x" * 9999))
-    frame, pose, landmark, report = reader.read(0.0)
+    frame, pose, landmark, report = next(reader)
     assert landmark == SeenLandmark("xiphoid", (1.0, -2.5, 3.0))
     np.testing.assert_array_equal(frame.counts, scan.frames.counts[3])
     assert (frame.device_ns, pose.device_ns) == (15_000_000, 16_666_667)
     assert pose.position_mm == pose_of(scan, 2).position_mm
     assert (report["frames"], report["unseen"]) == (4, "out of volume")
     feed.close()
-    assert reader.read(0.0) == []
-    assert reader.ended
+    assert list(reader) == [[]]
 
 
 def test_a_view_that_does_not_look_costs_nothing_but_its_own_frames(scan, pipe):
@@ -97,14 +96,15 @@ def test_a_view_that_does_not_look_costs_nothing_but_its_own_frames(scan, pipe):
     for i in range(3000):
         feed.frame(scan.frames.counts[0], i)
     assert feed.missed > 0
-    seen = [one for _ in range(100) for one in reader.read(0.0)]
+    seen = [one for _ in range(100) for one in next(reader)]
     assert len(seen) == 3000 - feed.missed
     assert [one.device_ns for one in seen] == list(range(len(seen)))
 
 
-def test_a_view_that_has_gone_does_not_stop_the_recording(scan, pipe):
-    reader, feed = pipe
-    os.close(reader.pipe)
+def test_a_view_that_has_gone_does_not_stop_the_recording(scan):
+    theirs, ours = os.pipe()
+    feed = Feed(ours)
+    os.close(theirs)
     feed.frame(scan.frames.counts[0], 0)
     assert feed.missed == 1
 
