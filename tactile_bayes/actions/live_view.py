@@ -248,10 +248,7 @@ def can_redraw() -> bool:
 
 @contextlib.contextmanager
 def terminal_view(*, keys: bool = False) -> Iterator[Callable[[LiveState], None]]:
-    """Draw on a terminal; one line per second where it cannot be redrawn.
-
-    `keys` says whether the recording's keys can be pressed there.
-    """
+    """Draw on a terminal; one line per second where it cannot be redrawn."""
     out = sys.stderr
     if not can_redraw():
         last = 0.0

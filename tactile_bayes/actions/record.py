@@ -50,8 +50,8 @@ class Request(RecordOptions, kw_only=True):
     def facts(self) -> dict[str, str]:
         """Session facts as text: from the file, overridden by options."""
         facts = read_session(self.session_file) if self.session_file else {}
-        options = {name: getattr(self, name) for name in ("side", "posture", "lubricant", "examiner", "subject")}
-        facts |= {name: value for name, value in options.items() if value}
+        names = ("side", "posture", "lubricant", "examiner", "subject")
+        facts |= {name: value for name in names if (value := getattr(self, name))}
         check_session(facts, path=self.output)
         return facts
 

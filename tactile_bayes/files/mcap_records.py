@@ -39,31 +39,30 @@ class Unpacker:
         check_limit(self._unpacked, self._most, what="it unpacks to {} bytes or more")
 
     def unpack(self, chunk: Any) -> bytes:
-        """The records of a chunk; a damaged one raises exceptions of many kinds, which `damage` says in words."""
-        data = self._decompress(chunk.compression, bytes(chunk.data), chunk.uncompressed_size)
-        if len(data) != chunk.uncompressed_size:
-            raise ValueError(f"it holds {len(data)} bytes and declares {chunk.uncompressed_size}")
-        if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
-            raise ValueError("its checksum does not match")
-        return data
+        """The records of a chunk, never more than it declares and one byte.
 
-    def _decompress(self, packing: str, data: bytes, most: int) -> bytes:
-        """The unpacked bytes, at most one more than `most`, which the chunk declares."""
-        if packing == "":
-            return data
+        A damaged one raises exceptions of many kinds, which `damage` says in words.
+        """
+        packing, data, most = chunk.compression, bytes(chunk.data), chunk.uncompressed_size
         if packing == "zstd":
             declared = zstandard.frame_content_size(data)  # -1 where the frame does not say
             if declared not in (-1, most):
                 raise ValueError(f"its frame unpacks to {declared} bytes and it declares {most}")
             self.count(most)
             decompressor = zstandard.ZstdDecompressor(max_window_size=_MOST_WINDOW)
-            return decompressor.decompress(data, max_output_size=most) if most else b""
-        if packing == "lz4":
+            data = decompressor.decompress(data, max_output_size=most) if most else b""
+        elif packing == "lz4":
             import lz4.frame
 
             self.count(most)
-            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most + 1))
-        raise ValueError(f"it is compressed by {packing[:20]!r}, which this program does not know")
+            data = bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most + 1))
+        elif packing != "":
+            raise ValueError(f"it is compressed by {packing[:20]!r}, which this program does not know")
+        if len(data) != most:
+            raise ValueError(f"it holds {len(data)} bytes and declares {most}")
+        if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+            raise ValueError("its checksum does not match")
+        return data
 
 
 def damage(error: Exception) -> str:

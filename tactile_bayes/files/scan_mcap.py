@@ -51,8 +51,7 @@ T = TypeVar("T")
 
 
 class ScanWriter:
-    """Writer of one scan to a binary stream, which stays open: first its description, then messages in order of
-    arrival.
+    """Writer of one scan to a binary stream, which stays open: its description, then messages as they arrive.
 
     `truth` is what a simulated scan was made from, which `read_scan_report` returns beside the scan. `findings` speak
     against a scan that is a copy of another file's.
@@ -79,16 +78,17 @@ class ScanWriter:
             enable_data_crcs=True,
         )
         self._writer.start(profile="", library=f"tactile-bayes/{__version__}")
-        told: dict[str, Any] = {"provenance": provenance.as_dict()}
-        if truth is not None:
-            told["truth"] = truth
-        if findings:
-            told["findings"] = [one.as_dict() for one in findings]
+        told = {
+            "provenance": provenance.as_dict(),
+            "truth": truth,
+            "findings": [one.as_dict() for one in findings] or None,
+        }
         units = {"length_unit": "mm", "time_unit": "ns", "pressure": "raw counts"}
         self._writer.add_metadata("tactile-bayes", {"schema": SCAN_SCHEMA, **units})
         self._writer.add_metadata("session", dict(sorted(session.items())))
         for name, document in told.items():
-            self._writer.add_metadata(name, {"json": _compact(document)})
+            if document is not None:
+                self._writer.add_metadata(name, {"json": _compact(document)})
         parts = {"head.json": head_document(head), _CALIBRATION: calibration_document(element_calibration)}
         for name, document in parts.items():
             data = _compact(document).encode()

@@ -240,11 +240,7 @@ class EmulatedNdi(Device):
     _port = "plugged in"
 
     def __init__(
-        self,
-        poses: TrackerPoses,
-        *,
-        faults: Faults | None = None,
-        elapsed: Callable[[], float | None] | None = None,
+        self, poses: TrackerPoses, *, faults: Faults | None = None, elapsed: Callable[[], float | None] | None = None
     ) -> None:
         self.times_s = poses.time_s
         self._elapsed = elapsed

@@ -44,8 +44,7 @@ _NETWORK: Final = ("socket://", "rfc2217://")  #: Of a network's URL: host and p
 
 
 class Port:
-    """One open port by a pyserial URL: ``/dev/ttyUSB0``, ``socket://host:port``, ``rfc2217://host:port`` or
-    ``loop://``.
+    """A port by its URL: ``/dev/ttyUSB0``, ``socket://host:port``, ``rfc2217://host:port`` or pyserial's ``loop://``.
 
     `role`, ``head`` or ``tracker``, is for messages.
     """

@@ -142,33 +142,29 @@ def sbc_figure(maps: Sequence[sbc.MapRanks], path: Path, *, force: bool = False)
 
 # --- Tables 1 and 2 of the paper as text and as plain data: ours, the nearest head's and the printed figures.
 
-ByHead = Mapping[Head, Sequence[model_comparison.Agreement]]
+Rows = Sequence[model_comparison.Agreement]
+ByHead = Mapping[Head, Rows]
+_PRINTED = {"centred_frame": model_comparison.PRINTED_FRAMES, "map": model_comparison.PRINTED_MAPS}
 
 
 def tables_text(
-    found: Sequence[model_comparison.Agreement],
-    phantoms: Sequence[model_comparison.Agreement],
-    *,
-    head: Head,
-    nearest: Head | None = None,
-    beside: Sequence[model_comparison.Agreement] | None = None,
+    found: Rows, phantoms: Rows, *, head: Head, nearest: Head | None = None, beside: Rows | None = None
 ) -> str:
     """Both tables, the widths and amplitudes of the ten lumps, and the phantoms, under `head`.
 
     `nearest` is the head nearest to the printed tables, `beside` its ten lumps; None where there is none, or it is
     `head`.
     """
-    lines = [f"mean MSD: {_answer(found, beside)}", "", model_comparison.DEFINITION, "", f"head: {named(head)}"]
+    heads = [found] if beside is None else [found, beside]
+    lines = [f"mean MSD: {_answer(heads)}", "", model_comparison.DEFINITION, "", f"head: {named(head)}"]
     if nearest is not None and beside is not None:
         lines.append(f"after the slash the head nearest to the print: {named(nearest)}")
     lines += ["in brackets the printed figure", ""]
-    lines += _table(
-        "Table 1: frame centred on the lump, MSD %", "centred_frame", found, beside, model_comparison.PRINTED_FRAMES
-    )
-    lines += _table("The same of frames divided by their means, MSD %", "normalised_frame", found, beside)
-    lines += _table("All frames of the map, MSD % (printed average 4.3)", "all_frames", found, beside)
-    lines += _table("Table 2: map, MSD %", "map", found, beside, model_comparison.PRINTED_MAPS)
-    lines += _table("Map, strict MSD %", "map_strict", found, beside)
+    lines += _table("Table 1: frame centred on the lump, MSD %", "centred_frame", heads)
+    lines += _table("The same of frames divided by their means, MSD %", "normalised_frame", heads)
+    lines += _table("All frames of the map, MSD % (printed average 4.3)", "all_frames", heads)
+    lines += _table("Table 2: map, MSD %", "map", heads)
+    lines += _table("Map, strict MSD %", "map_strict", heads)
     lines += _others(found)
     lines += ["Eq 5 fitted to both maps (background 1); the elastic model first:"]
     lines += [f"{'lump':<22}{'a':>13}{'sigma, mm':>14}{'frame %':>11}{'map %':>9}{'strict %':>11}"]
@@ -204,24 +200,22 @@ def _span(shares: Sequence[float], to: str = " to ") -> str:
     return f"{sum(percent) / len(percent):.1f} ({low}{to}{high})"
 
 
-def _mean(found: Sequence[model_comparison.Agreement], name: str) -> float:
+def _mean(found: Rows, name: str) -> float:
     """In percent."""
     return float(sum(100 * getattr(one, name) for one in found) / len(found))
 
 
-def _answer(found: Sequence[model_comparison.Agreement], beside: Sequence[model_comparison.Agreement] | None) -> str:
+def _answer(heads: Sequence[Rows]) -> str:
     """How near both tables come to the print."""
     told = []
-    for words, name, printed in (
-        ("frames", "centred_frame", model_comparison.PRINTED_FRAMES),
-        ("maps", "map", model_comparison.PRINTED_MAPS),
-    ):
-        nearest = "" if beside is None else f"nearest head {_mean(beside, name):.1f}, "
-        told.append(f"{words} {_mean(found, name):.1f} % ({nearest}printed {np.mean([*printed.values()]):.1f})")
+    for words, name in (("frames", "centred_frame"), ("maps", "map")):
+        nearest = "".join(f"nearest head {_mean(beside, name):.1f}, " for beside in heads[1:])
+        printed = np.mean([*_PRINTED[name].values()])
+        told.append(f"{words} {_mean(heads[0], name):.1f} % ({nearest}printed {printed:.1f})")
     return ", ".join(told)
 
 
-def _others(found: Sequence[model_comparison.Agreement]) -> list[str]:
+def _others(found: Rows) -> list[str]:
     """Results of other definitions: means over the cases with the least and the largest."""
     lines = [
         "Other definitions, %: mean (least-largest); printed 4.0-4.3, 2.2-2.7",
@@ -233,17 +227,11 @@ def _others(found: Sequence[model_comparison.Agreement]) -> list[str]:
     return [*lines, ""]
 
 
-def _table(
-    title: str,
-    name: str,
-    found: Sequence[model_comparison.Agreement],
-    beside: Sequence[model_comparison.Agreement] | None,
-    printed: Mapping[float, Sequence[float]] | None = None,
-) -> list[str]:
+def _table(title: str, name: str, heads: Sequence[Rows]) -> list[str]:
     """One table with diameters across: this head / the nearest head (printed)."""
     lines = [title, f"{'h/d':>5}" + "".join(f"{f'd {d:g} mm':>15}" for d in model_comparison.TABLE_DIAMETERS_MM)]
-    heads = [found] if beside is None else [found, beside]
-    for depth in dict.fromkeys(one.scene.depth_ratio for one in found):
+    printed = _PRINTED.get(name)
+    for depth in dict.fromkeys(one.scene.depth_ratio for one in heads[0]):
         of_depth = ([getattr(one, name) for one in rows if one.scene.depth_ratio == depth] for rows in heads)
         cells = ["/".join(f"{100 * share:.1f}" for share in shares) for shares in zip(*of_depth, strict=True)]
         if printed is not None:
