@@ -41,6 +41,9 @@ from tactile_bayes.options import RecordOptions
 from tactile_bayes.presets import PRESSURE_RANGE_KPA, RESEARCH_USE
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks
 
+_NOMINAL_FULL_SCALE = 4095
+_PATHS = ("like", "head_geometry", "array_calibration", "landmarks")
+
 
 class Request(RecordOptions, kw_only=True):
     """Options of one recording, and what of them its file stores."""
@@ -75,10 +78,6 @@ class Request(RecordOptions, kw_only=True):
             "invert_rotation": self.invert_rotation,
             "calibrated": not self.uncalibrated,
         }
-
-
-_NOMINAL_FULL_SCALE = 4095
-_PATHS = ("like", "head_geometry", "array_calibration", "landmarks")
 
 
 def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration, Landmarks | None]:

@@ -12,6 +12,7 @@ from tactile_bayes.options import FaultOptions, RecordOptions
 from tactile_bayes.presets import TrackerProtocol
 
 _RECORDING = names_of(RecordOptions)[2:-1]  #: Between the output with the head's port and `FORCE`.
+PROTOCOLS = get_args(TrackerProtocol)
 
 
 @command("record", "record.record_action")
@@ -28,9 +29,6 @@ def record_command() -> None:
 
     Example: tactile-bayes record -o scan.mcap --head /dev/ttyACM0 --tracker /dev/ttyUSB0 --like last.mcap
     """
-
-
-PROTOCOLS = get_args(TrackerProtocol)
 
 
 @command("emulate", "devices.emulate_action")

@@ -33,6 +33,10 @@ from tactile_bayes.scans import Scan, TrackerPoses
 _NS: Final = 1_000_000_000
 # A command with arguments ends in CR; what is left are commands of one letter.
 _SETTING: Final = re.compile(rb"[A-Za-z][0-9*,][^\r]*\r")
+_BREATH_S: Final = 4.0
+# Where the second tool is, turned against the tracker so that its frame is another one.
+_REFERENCE_MM: Final = (250.0, -40.0, 30.0)
+_REFERENCE_TURN: Final = (0.8, 0.0, 0.6, 0.0)
 
 
 class Faults(FaultOptions):
@@ -133,12 +137,6 @@ class EmulatedHead(Device):
             return b""
         device_us = round(self.times_s[index] * 1e6)
         return head.encode_frame(self._scan.frames.counts[index], sequence=index, device_us=device_us)
-
-
-_BREATH_S: Final = 4.0
-# Where the second tool is, turned against the tracker so that its frame is another one.
-_REFERENCE_MM: Final = (250.0, -40.0, 30.0)
-_REFERENCE_TURN: Final = (0.8, 0.0, 0.6, 0.0)
 
 
 def played_tools(poses: TrackerPoses, faults: Faults, index: int, *, names: tuple[str, str]) -> list[ToolReading]:

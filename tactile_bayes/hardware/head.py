@@ -27,6 +27,8 @@ from tactile_bayes.scans import ElementCalibration
 VERSION: Final = 1
 HEADER: Final = struct.Struct("<BBIQ")
 CRC_BYTES: Final = 4
+# CRC-32 of any data followed by its own CRC-32, little-endian, is this number.
+_RESIDUE: Final = zlib.crc32(zlib.crc32(b"").to_bytes(CRC_BYTES, "little"))
 # Between two zero bytes; the longest packet a head may send. More without a zero is line noise, and is let go.
 MAX_PACKET_BYTES: Final = 16 * 1024
 _LONGEST: Final = MAX_PACKET_BYTES + MAX_PACKET_BYTES // 254 + 1
@@ -108,10 +110,6 @@ class PacketParser(readings.Parser):
             self.fault = f"it sent packets of version {version} of the framing, this program reads {VERSION}"
             return None
         return Packet(kind, sequence, device_us, body[HEADER.size : -CRC_BYTES])
-
-
-# CRC-32 of any data followed by its own CRC-32, little-endian, is this number.
-_RESIDUE: Final = zlib.crc32(zlib.crc32(b"").to_bytes(CRC_BYTES, "little"))
 
 
 # --- Packets of the scan head, and of a tracker in the same framing: encoding and decoding of payloads.

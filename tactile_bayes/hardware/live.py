@@ -307,10 +307,9 @@ class LiveMap:
         if found.plane_from_base is None or not all(name in self._landmarks for name in LANDMARKS):
             return found
         notch, xiphoid = (self._landmarks[name] for name in LANDMARKS)
-        try:
+        with suppress(BadDataError):  # two landmarks in one place give no axes
             return replace(found, patient_from_plane=patient_from_plane(notch, xiphoid, found.plane_from_base))
-        except BadDataError:
-            return found  # two landmarks in one place give no axes
+        return found
 
     def state(self, *, size: str = "", lump_base_mm: FloatArray | None = None) -> LiveState:
         """The present state for the view."""

@@ -67,22 +67,21 @@ class Report:
         return (self.last_ns - self.first_ns) / 1e9
 
 
-def _rates(report: Report, passed_s: float, rate_hz: float) -> Iterator[str]:
-    """Compare the head's clock with the host's, on which `passed_s` went by, and its frame rate with that promised."""
+def _cautions(report: Report, passed_s: float, rate_hz: float) -> Iterator[str]:
+    """Clocks and counters that jump, another pace than that of the host or the promised one, poses missing or alike.
+
+    On the host's clock `passed_s` went by.
+    """
+
+    def times(number: int) -> str:
+        return "once" if number == 1 else f"{number} times"
+
     told_s = report.duration_s
     if abs(told_s - passed_s) > max(_RATE_LEAST_S, _RATE_SHARE * passed_s):
         yield f"the head's clock ran {told_s:.1f} s while {passed_s:.1f} s passed on this computer"
     due, came = told_s * rate_hz, report.frames - 1 + report.frames_lost
     if due > 0 and abs(came - due) > max(_RATE_LEAST_S * rate_hz, _RATE_SHARE * due):
         yield f"the head promised {rate_hz:g} frames per second and measured {came / told_s:.1f}"
-
-
-def _oddities(report: Report) -> Iterator[str]:
-    """Jumps of clocks and counters, and poses that are missing, flagged or all alike."""
-
-    def times(number: int) -> str:
-        return "once" if number == 1 else f"{number} times"
-
     for role, steps in (("head", report.head_clock_steps), ("tracker", report.tracker_clock_steps)):
         if steps:
             yield f"the {role}'s clock stepped {times(steps)}; this computer's clock was used instead"
@@ -454,7 +453,7 @@ class Recorder:
         report.tracker_remark = self._tracker.parser.remark if self._tracker else ""
         passed_s = (self._heard_ns - self._begun_ns) / 1e9
         spans = self._frame_span, self._pose_span
-        report.cautions = [*overlap_cautions(*spans), *_rates(report, passed_s, self._rate_hz), *_oddities(report)]
+        report.cautions = [*overlap_cautions(*spans), *_cautions(report, passed_s, self._rate_hz)]
         report.cautions += self._jumps.cautions()
         if self._head.parser.fault:
             report.cautions.append(f"the head's line: {self._head.parser.fault}")

@@ -28,7 +28,7 @@ from tactile_bayes.hardware.readings import (
     ToolReading,
     plausible,
 )
-from tactile_bayes.hardware.trackers import NAME_BYTES, IgtlinkParser, NdiPort, ask_for_tdata, encode_transform
+from tactile_bayes.hardware.trackers import ASK_FOR_TDATA, NAME_BYTES, IgtlinkParser, NdiPort, encode_transform
 
 # --- Parser for Ascension Flock of Birds and miniBIRD trackers, position and quaternion.
 #
@@ -416,7 +416,7 @@ TRACKERS: Final[dict[str, TrackerDriver]] = {
         "an OpenIGTLink server (PLUS, 3D Slicer)",
         0,
         IgtlinkParser,
-        late=ask_for_tdata(),
+        late=ASK_FOR_TDATA,
         silent_s=30.0,
         hint="start its stream, with a tool in sight",
     ),

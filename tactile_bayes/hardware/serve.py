@@ -147,11 +147,9 @@ class LiveServer:
         closing = threading.Thread(target=self._server.shutdown, daemon=True)
         closing.start()
         closing.join(CLOSE_S)
-        with self._news:
-            pages = list(self._pages)
-        for page in pages:
+        for page in self._sockets():
             with contextlib.suppress(OSError):
-                page.socket.shutdown(socket.SHUT_RDWR)
+                page.shutdown(socket.SHUT_RDWR)
         closing.join(CLOSE_S)
 
     def _sockets(self) -> set[socket.socket]:

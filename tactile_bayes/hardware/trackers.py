@@ -99,6 +99,10 @@ _MOST_KINDS: Final = 5
 _RIGID_SLACK: Final = 0.02
 # TransformStatus of a tool in sight; 3D Slicer's UNKNOWN is of a transform of which nobody stated one.
 _IN_SIGHT: Final = ("OK", "UNKNOWN")
+_COLUMNS: Final = 12  # numbers of a matrix with its position
+_NO_WISHES: Final = bytes(36)  # least time between two in ms, and the name of a frame
+ASK_FOR_TDATA: Final = _HEADER.pack(1, b"STT_TDATA", b"", 0, 0, len(_NO_WISHES), crc64(_NO_WISHES)) + _NO_WISHES
+"""After it a server sends TDATA: as fast as it can, in its own frame."""
 
 
 class IgtlinkParser(Parser):
@@ -231,9 +235,6 @@ def _find_header(buffer: bytes, start: int) -> int:
     return found
 
 
-_COLUMNS: Final = 12  # numbers of a matrix with its position
-
-
 def _name(data: bytes) -> str:
     """Text of a padded name."""
     return printable(data.partition(b"\0")[0])
@@ -295,15 +296,6 @@ def encode_transform(pose: ToolReading) -> bytes:
     return _HEADER.pack(1, b"TRANSFORM", name, seconds, fraction, len(body), crc64(body)) + body
 
 
-def ask_for_tdata() -> bytes:
-    """Encode STT_TDATA, after which a server sends TDATA: as fast as it can, in its own frame."""
-    body = bytes(_ASK_BYTES)
-    return _HEADER.pack(1, b"STT_TDATA", b"", 0, 0, len(body), crc64(body)) + body
-
-
-_ASK_BYTES: Final = 36  # least time between two in ms, and the name of a frame
-
-
 # --- NDI Polaris, Vega and Aurora trackers, through the combined API library `ndicapi` (extra ``[ndi]``).
 #
 # These trackers answer questions and send nothing by themselves. A process of its own asks the tracker for every
@@ -336,7 +328,8 @@ class NdiTracker:
 
     def __init__(self, api: Any, url: str, *, roms: Sequence[Path] = ()) -> None:
         self._api, self._url = api, url
-        self._line = "address" if url.startswith("socket://") else "cable"
+        self._wired = not url.startswith("socket://")
+        self._line = "cable" if self._wired else "address"
         self._device = self._open()
         self._begin()
         self.name = self._command("VER:4").splitlines()[0].strip()[:48] or "NDI tracker"
@@ -349,26 +342,25 @@ class NdiTracker:
         self._failures = 0
 
     def _open(self) -> Any:
-        if self._url.startswith("socket://"):
+        if self._wired:
+            device = self._api.ndiOpen(self._url)
+        else:
             host, _, port = self._url.removeprefix("socket://").rpartition(":")
             device = self._api.ndiOpenNetwork(host or port, int(port) if host else NETWORK_PORT)
-        else:
-            device = self._api.ndiOpen(self._url)
         if device is None:
             raise DeviceError(f"cannot be opened; check its {self._line}, or whether another program has it")
         return device
 
     def _begin(self) -> None:
         """Send INIT, after a reset where the tracker still has an earlier session's line rate."""
-        wired = not self._url.startswith("socket://")
         try:
             self._command("INIT:")
         except DeviceError:
-            if not wired:
+            if not self._wired:
                 raise
             self._api.ndiRESET(self._device)
             self._command("INIT:")
-        if wired:
+        if self._wired:
             self._command("COMM:%d%03d%d", self._api.NDI_115200, self._api.NDI_8N1, self._api.NDI_NOHANDSHAKE)
 
     def _command(self, text: str, *values: object) -> str:
