@@ -370,10 +370,8 @@ def _run(recorder: Recorder, signals: list[str], head: HeadGeometry, request: Re
 
 # --- From scripts: the same recorder, started at once.
 
-_NAMED = ("output", "head_url", "duration_s", "tracker_url", "session_file")  #: Keywords of their own.
 
-
-@takes(RecordOptions, without=_NAMED)
+@takes(RecordOptions, without=("output", "head_url", "duration_s", "tracker_url", "session_file"))
 def record(
     output: PathLike,
     *,

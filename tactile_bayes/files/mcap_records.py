@@ -266,10 +266,8 @@ def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:
 def _end_data(records: McapRecords, body: bytes, checksum: int) -> None:
     """Compare the checksum over the whole data section, where there is one."""
     declared = _CHECKSUM.unpack_from(body)[0] if len(body) >= _CHECKSUM.size else 0
-    if declared not in (0, checksum):
-        if not records.damaged:  # a damaged chunk was told already; otherwise it is a description
-            records.lose("a record outside the chunks changed (the checksum of the whole does not match)")
-        records.damaged = True
+    if declared not in (0, checksum) and not records.damaged:  # a damaged chunk was told already: it is a description
+        records.lose("a record outside the chunks changed (the checksum of the whole does not match)")
     records.all_data = True
 
 

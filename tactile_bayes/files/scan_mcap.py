@@ -8,6 +8,7 @@ import os
 import threading
 from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any, Final, TypeVar
 
@@ -401,11 +402,7 @@ def create_exclusive(path: Path, *, force: bool) -> IO[bytes]:
 
 def refuse_recording(path: Path) -> None:
     """Raise `UsageError` when a file is being recorded right now."""
-    try:
-        stream = path.open("rb")
-    except OSError:
-        return  # whoever reads it says what is wrong with it
-    with stream:
+    with suppress(OSError), path.open("rb") as stream:  # whoever reads it says what is wrong with it
         _lock(stream, path)
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 CountArray = NDArray[np.uint16]
 Quaternion = tuple[float, float, float, float]
 MM_PER_INCH: Final = 25.4
+NO_ROTATION: Final = "no rotation"  #: Why there is no pose where a record's numbers are none of a place and a rotation.
 
 
 class FrameReading(NamedTuple):
@@ -36,9 +37,6 @@ class PoseReading(NamedTuple):
     flags: tuple[str, ...] = ()
     """The device's objections to this pose, for example ``"error W"`` or ``"distortion 12"``."""
     tool: str = ""  #: Which of the tracker's tools or stations; empty where it names none.
-
-
-NO_ROTATION: Final = "no rotation"  #: Why there is no pose where a record's numbers are none of a place and a rotation.
 
 
 class MissingReading(NamedTuple):
@@ -249,13 +247,9 @@ class ArrivalClock:
     """
 
     def __init__(self) -> None:
-        self._begun_ns: int | None = None
+        self.begun_ns: int | None = None
+        """Arrival of the record with which this stretch of estimates began; None before the first."""
         self._last = self._now = 0
-
-    @property
-    def known(self) -> bool:
-        """True when any record has arrived."""
-        return self._begun_ns is not None
 
     @property
     def offset_ns(self) -> int:
@@ -265,10 +259,10 @@ class ArrivalClock:
     def observe(self, device_ns: int, host_ns: int) -> None:
         """Add one record's times."""
         difference = host_ns - device_ns
-        if self._begun_ns is None:
-            self._begun_ns, self._last, self._now = host_ns, difference, difference
-        elif host_ns - self._begun_ns > _WINDOW_NS:
-            self._begun_ns, self._last, self._now = host_ns, self._now, difference
+        if self.begun_ns is None:
+            self.begun_ns, self._last, self._now = host_ns, difference, difference
+        elif host_ns - self.begun_ns > _WINDOW_NS:
+            self.begun_ns, self._last, self._now = host_ns, self._now, difference
         else:
             self._now = min(self._now, difference)
 
@@ -370,7 +364,7 @@ class PoseClock:
         """Time of a pose on the head's clock; None before the first frame, or when it would be negative."""
         if self._shared:
             return None if device_ns is None else self._in_order(self.tracker.read(device_ns, host_ns))
-        if not self.head.arrival.known:
+        if self.head.arrival.begun_ns is None:
             return None
         moment = Moment(host_ns)
         if device_ns is not None:
