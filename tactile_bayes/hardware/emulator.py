@@ -192,8 +192,7 @@ class Emulator:
         self._starts = device.starts
         self._round, self._next, self._finished_at = 0, 0, 0.0
         self._hold_at = time.monotonic() + _SETTLE_S
-        self.sent = self.dropped = self.faulty = 0
-        """Number of records sent, dropped and changed by faults since the last START."""
+        self.sent = self.dropped = self.faulty = 0  #: Records sent, dropped and changed by faults since a START.
         self.unplugged = False
 
     def run(self, *, once: bool = False) -> None:

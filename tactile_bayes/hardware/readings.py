@@ -247,8 +247,7 @@ class ArrivalClock:
     """
 
     def __init__(self) -> None:
-        self.begun_ns: int | None = None
-        """Arrival of the record with which this stretch of estimates began; None before the first."""
+        self.begun_ns: int | None = None  #: Arrival with which this stretch of estimates began; None before any.
         self._last = self._now = 0
 
     @property

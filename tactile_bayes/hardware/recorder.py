@@ -234,8 +234,7 @@ class Recorder:
         self._observer = observer or Observer()
         self._now_ns = clock_ns
         self._zero_ns = clock_ns()
-        self.touch: LandmarkTouch | None = None
-        """The landmark for which the next poses are averaged."""
+        self.touch: LandmarkTouch | None = None  #: The landmark for which the next poses are averaged.
         self._last_pose: readings.PoseReading | None = None
         self._pose_ns = -1
         self._drain_until_ns: int | None = None

@@ -236,8 +236,7 @@ class Answer:
     def __init__(self, parser: Callable[[], Parser]) -> None:
         self.parser, self.read = parser, parser()
         self.hello: HelloReading | None = None
-        self.tools: dict[str, str] = {}
-        """Why a tool has no pose just now, by its name; empty where it has one."""
+        self.tools: dict[str, str] = {}  #: Why a tool has no pose just now, by its name; empty where it has one.
         self.tool = ""
         self.reference: str | None = None
         """`tool`, `reference`: Names of the tools to follow, in full."""
