@@ -14,21 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.special import ndtr
 
-from tactile_bayes.declarations import UNSET
 from tactile_bayes.options import Aim
+from tactile_bayes.report import trial as trial_words
 from tactile_bayes.report.compare import Growth
 from tactile_bayes.report.figure_file import FORMATS, figure_file, finish, plain_matplotlib
 from tactile_bayes.report.pages import page
-from tactile_bayes.report.trial import (
-    SPELLED,
-    comparison_sentences,
-    found_share,
-    growing_line,
-    limit_rows,
-    number,
-    ratio_line,
-    shown,
-)
+from tactile_bayes.report.trial import number, shown
 from tactile_bayes.trial.calibration import BINS, Calibration, Prediction, prediction_of
 from tactile_bayes.trial.figures import Figures
 from tactile_bayes.trial.method_comparison import MethodComparison
@@ -198,37 +189,24 @@ def _draw_plan(axes: Axes, plan: PlanReport, aim: Aim) -> None:
 def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence[Growth] = ()) -> str:
     """Full HTML page of a trial's report, with the text report at its end for those who copy from it.
 
-    `growth` is of masses with several visits, beside the trial.
+    `growth` is of masses with several visits, beside the trial. The template puts figures into words by `report.trial`.
     """
-    modalities = report.modalities.items()
-    methods = [one.method_comparison for _, one in modalities]
+    methods = [one.method_comparison for one in report.modalities.values()]
     return page(
         "trial",
         title="Sizes against excision",
         report=report,
-        protocol="" if report.title is UNSET else report.title,
+        trial=trial,
+        say=trial_words,
         percent=f"{100 * report.interval_probability:g} %",
-        other_visits=trial.other_visits.lines(),
-        comparisons=comparison_sentences(report),
-        spelled=SPELLED,
         masses=_masses(trial),
-        ratios=[ratio_line(name, one) for name, one in report.mape_ratio_to_tactile.items()],
         sizes_svg=sizes_figure(report, trial),
         error_ratio=f"{methods[0].error_ratio if methods else 1.0:g}",
-        growing=growing_line(report),
         differences_svg=differences_figure(report, trial),
-        replicates=[(name, one) for name, one in modalities if one.replicates.within_mass_log_sd is not None],
         calibrations=list(_calibrations(report, trial)),
         growth=growth,
-        next_mass=None if report.next_mass is UNSET else report.next_mass,
-        checks={} if report.interval_check is UNSET else report.interval_check,
         text=text,
-        # what puts figures into words
         cells=_cells,
-        found_share=found_share,
-        limit_rows=limit_rows,
-        shown=shown,
-        number=number,
         of_variances=_of_variances,
         middles=_middles,
         dumps=json.dumps,

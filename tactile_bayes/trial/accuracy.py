@@ -187,10 +187,7 @@ def origin_line_figures(sizes: ModalitySizes, *, confidence: float) -> dict[str,
         result[f"slope_through_origin{suffix}"] = figure_with_misses(
             slope, subset, scale="linear", confidence=confidence, power=2, missed=lambda _: 0.0
         )
-        result[f"r2_centred{suffix}"] = figure(r2_centred, subset)
-        result[f"r2_uncentred{suffix}"] = figure(r2_uncentred, subset)
-        result[f"r2_pearson{suffix}"] = figure(r2_pearson, subset)
-        result[f"pearson_r{suffix}"] = figure(pearson_r, subset)
+        result |= {f"{name}{suffix}": figure(statistic, subset) for name, statistic in CORRELATIONS.items()}
     return result
 
 
@@ -237,19 +234,18 @@ def _pearson(sums: FloatArray) -> FloatArray:
 # Least-squares slope of sizes on ex-vivo sizes without an intercept: sum e y / sum e^2.
 slope = SumStatistic(_terms, _slope)
 
-# Share of the variance about the mean that the line through zero explains, 1 - SSE0 / SST; below 0 when the mean of
-# the sizes would do better. Kvalseth (1985), Am. Stat. 39, 279, recommends it.
-r2_centred = SumStatistic(_of_sizes, lambda sums: 1 - ratio(_sse(sums), _sst(sums)))
-
-# Share of the sum of squares about zero that the line explains, 1 - SSE0 / sum y^2: what R prints for
-# lm(y ~ 0 + x). It flatters: any line through a cloud far from zero explains most of it.
-r2_uncentred = SumStatistic(_terms, lambda sums: 1 - ratio(_sse(sums), sums[..., 2]), "no mass was detected")
-
-# Correlation coefficient; its sign says what the squares hide.
-pearson_r = SumStatistic(_of_pairs, _pearson)
-
-# Squared correlation coefficient; blind to scale and offset.
-r2_pearson = SumStatistic(_of_pairs, lambda sums: _pearson(sums) ** 2)
+CORRELATIONS = {
+    # share of the variance about the mean that the line through zero explains, 1 - SSE0 / SST; below 0 when the mean of
+    # the sizes would do better. Kvalseth (1985), Am. Stat. 39, 279, recommends it
+    "r2_centred": SumStatistic(_of_sizes, lambda sums: 1 - ratio(_sse(sums), _sst(sums))),
+    # share of the sum of squares about zero that the line explains, 1 - SSE0 / sum y^2: what R prints for
+    # lm(y ~ 0 + x). It flatters: any line through a cloud far from zero explains most of it
+    "r2_uncentred": SumStatistic(_terms, lambda sums: 1 - ratio(_sse(sums), sums[..., 2]), "no mass was detected"),
+    # squared correlation coefficient; blind to scale and offset
+    "r2_pearson": SumStatistic(_of_pairs, lambda sums: _pearson(sums) ** 2),
+    # correlation coefficient; its sign says what the squares hide
+    "pearson_r": SumStatistic(_of_pairs, _pearson),
+}
 
 
 # --- Ratio of one modality's error to another's.
@@ -274,19 +270,18 @@ def mape_ratios(sizes: Mapping[str, ModalitySizes], *, confidence: float) -> dic
     reference = sizes.get(REFERENCE)
     if reference is None:
         return {}
-    return {
-        name: _modality_ratio(one, reference, confidence=confidence) for name, one in sizes.items() if name != REFERENCE
-    }
-
-
-def _modality_ratio(sizes: ModalitySizes, reference: ModalitySizes, *, confidence: float) -> ModalityRatio:
-    looked_for = on_common_masses(sizes, reference)
-    found = on_common_masses(sizes.only_detected(), reference.only_detected())
-    figures = {
-        "ratio": mape_ratio(*looked_for, confidence=confidence),
-        "ratio_detected": mape_ratio(*found, confidence=confidence),
-    }
-    return ModalityRatio(masses=len(looked_for[0].size_mm), masses_detected=len(found[0].size_mm), **fields_of(figures))
+    ratios = {}
+    for name, one in sizes.items():
+        if name != REFERENCE:
+            looked_for = on_common_masses(one, reference)
+            found = on_common_masses(one.only_detected(), reference.only_detected())
+            figures = {
+                "ratio": mape_ratio(*looked_for, confidence=confidence),
+                "ratio_detected": mape_ratio(*found, confidence=confidence),
+            }
+            n, both = len(looked_for[0].size_mm), len(found[0].size_mm)
+            ratios[name] = ModalityRatio(masses=n, masses_detected=both, **fields_of(figures))
+    return ratios
 
 
 def on_common_masses(one: ModalitySizes, other: ModalitySizes) -> tuple[ModalitySizes, ModalitySizes]:

@@ -72,9 +72,6 @@ class PairAngles:
 
 def kendall_sign(x: FloatArray, y: FloatArray) -> int:
     """Sign of Kendall's tau: concordant less discordant pairs."""
-    if len(x) <= MOST_LISTED:
-        first, second = np.triu_indices(len(x), 1)
-        return int(np.sign(np.sum(np.sign(x[second] - x[first]) * np.sign(y[second] - y[first]))))
     discordant = _inversions(x, y, ties=False)
     tied = _pairs_of_equals(x[:, None]) + _pairs_of_equals(y[:, None])
     both = _pairs_of_equals(np.stack([x, y], axis=1))

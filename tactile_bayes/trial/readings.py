@@ -181,44 +181,34 @@ def gather(readings: Iterable[Reading], ex_vivo_mm: Mapping[MassKey, float]) -> 
     ordered = sorted(readings, key=lambda r: (r.modality != "tactile", r.modality, r.key, r.replicate))
     number = {patient: index for index, patient in enumerate(sorted({patient for patient, _ in ex_vivo_mm}))}
     masses = mass_numbers(ex_vivo_mm)
-    with np.errstate(over="ignore"):  # a figure of an overflown mean is refused where it is formed
-        return {
-            name: _gather_modality(name, list(group), ex_vivo_mm=ex_vivo_mm, number=number, masses=masses)
-            for name, group in groupby(ordered, key=lambda r: r.modality)
-        }
+    sizes = dict[str, ModalitySizes]()
+    for name, group in groupby(ordered, key=lambda r: r.modality):
+        rows = list(group)
+        seen, done = {r.key for r in rows}, [r for r in rows if r.status != "not_done"]
+        by_mass = {key: [r.size_mm for r in of_mass] for key, of_mass in groupby(done, key=lambda r: r.key)}
+        replicates = tuple(
+            np.array([size for size in found if size is not None], dtype=np.float64) for found in by_mass.values()
+        )
+        with np.errstate(over="ignore"):  # a figure of an overflown mean is refused where it is formed
+            # equal readings are their own mean, to the last bit: rounding would be an error beside excision
+            means = [np.clip(one.mean(), one.min(), one.max()) if len(one) else 0.0 for one in replicates]
+        sizes[name] = ModalitySizes(
+            name=name,
+            patient=np.array([number[patient] for patient, _ in by_mass], dtype=np.int64),
+            ex_vivo_mm=np.array([ex_vivo_mm[key] for key in by_mass], dtype=np.float64),
+            size_mm=np.array(means),
+            replicates_mm=replicates,
+            readings=len(done),
+            masses_not_done=len(seen) - len(by_mass),
+            masses_without_reading=len(ex_vivo_mm) - len(seen),
+            mass=np.array([masses[key] for key in by_mass], dtype=np.int64),
+        )
+    return sizes
 
 
 def mass_numbers(masses: Iterable[MassKey]) -> dict[MassKey, int]:
     """Each mass's number, in order of patient and mass."""
     return {key: index for index, key in enumerate(sorted(masses))}
-
-
-def _gather_modality(
-    name: str,
-    readings: Sequence[Reading],
-    *,
-    ex_vivo_mm: Mapping[MassKey, float],
-    number: Mapping[str, int],
-    masses: Mapping[MassKey, int],
-) -> ModalitySizes:
-    seen = {reading.key for reading in readings}
-    done = [reading for reading in readings if reading.status != "not_done"]
-    by_mass = {key: list(group) for key, group in groupby(done, key=lambda r: r.key)}
-    replicates = tuple(
-        np.array([r.size_mm for r in group if r.size_mm is not None], dtype=np.float64) for group in by_mass.values()
-    )
-    return ModalitySizes(
-        name=name,
-        patient=np.array([number[patient] for patient, _ in by_mass], dtype=np.int64),
-        ex_vivo_mm=np.array([ex_vivo_mm[key] for key in by_mass], dtype=np.float64),
-        # equal readings have their own value for a mean, to the last bit: rounding would be an error beside excision
-        size_mm=np.array([np.clip(one.mean(), one.min(), one.max()) if len(one) else 0.0 for one in replicates]),
-        replicates_mm=replicates,
-        readings=len(done),
-        masses_not_done=len(seen) - len(by_mass),
-        masses_without_reading=len(ex_vivo_mm) - len(seen),
-        mass=np.array([masses[key] for key in by_mass], dtype=np.int64),
-    )
 
 
 # --- Plausibility of a trial's units: impossible sizes, and modalities that differ from excision tenfold.

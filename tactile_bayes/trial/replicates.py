@@ -174,15 +174,8 @@ def spread_figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figu
     of the mean variance, which is not low for few replicates as a mean of standard deviations is.
     """
     replicated = sizes.only_replicated()
-    statistics = {
-        "within_mass_sd_mm": mean_sd_mm,
-        "within_mass_sd_rms_mm": rms_sd_mm,
-        "within_mass_cv_percent": mean_cv_percent,
-        "within_mass_cv_rms_percent": rms_cv_percent,
-    }
     return {
-        name: figure(statistic, replicated, scale="log", confidence=confidence)
-        for name, statistic in statistics.items()
+        name: figure(statistic, replicated, scale="log", confidence=confidence) for name, statistic in SPREAD.items()
     }
 
 
@@ -208,18 +201,17 @@ def _moments(
     return number.astype(np.float64), mean, np.add.reduceat((values - np.repeat(mean, number)) ** 2, start)
 
 
-# Mean over masses of the standard deviation of the replicates, in mm.
-mean_sd_mm = SumStatistic(_terms, lambda sums: ratio(sums[..., 0], sums[..., 5]))
-
-# Root of the mean variance over masses, weighted by degrees of freedom, in mm: the within-subject standard deviation
-# of a one-way analysis of variance (Bland & Altman 1996, BMJ 312, 1654).
-rms_sd_mm = SumStatistic(_terms, lambda sums: np.sqrt(ratio(sums[..., 2], sums[..., 4])))
-
-# Mean over masses of standard deviation over mean, in percent.
-mean_cv_percent = SumStatistic(_terms, lambda sums: 100 * ratio(sums[..., 1], sums[..., 5]))
-
-# Root mean square of standard deviation over mean, weighted by degrees of freedom, in percent.
-rms_cv_percent = SumStatistic(_terms, lambda sums: 100 * np.sqrt(ratio(sums[..., 3], sums[..., 4])))
+SPREAD = {
+    # mean over masses of the standard deviation of the replicates, in mm
+    "within_mass_sd_mm": SumStatistic(_terms, lambda sums: ratio(sums[..., 0], sums[..., 5])),
+    # root of the mean variance over masses, weighted by degrees of freedom, in mm: the within-subject standard
+    # deviation of a one-way analysis of variance (Bland & Altman 1996, BMJ 312, 1654)
+    "within_mass_sd_rms_mm": SumStatistic(_terms, lambda sums: np.sqrt(ratio(sums[..., 2], sums[..., 4]))),
+    # mean over masses of standard deviation over mean, in percent
+    "within_mass_cv_percent": SumStatistic(_terms, lambda sums: 100 * ratio(sums[..., 1], sums[..., 5])),
+    # root mean square of standard deviation over mean, weighted by degrees of freedom, in percent
+    "within_mass_cv_rms_percent": SumStatistic(_terms, lambda sums: 100 * np.sqrt(ratio(sums[..., 3], sums[..., 4]))),
+}
 
 
 # --- Repeatability as a ratio, and components of the scatter of sizes: masses, readers and maps.

@@ -47,16 +47,16 @@ def single(ex_vivo_mm: Sequence[float], size_mm: Sequence[float], *, name: str =
 def test_r_squared_of_cars_as_r_prints_it() -> None:
     cars = single(CARS_SPEED.tolist(), CARS_DIST.tolist())
     assert origin_line.slope(cars) == pytest.approx(2.909132, abs=5e-7)  # lm(dist ~ 0 + speed)
-    assert origin_line.r2_uncentred(cars) == pytest.approx(0.8962893, abs=5e-8)
-    assert origin_line.r2_centred(cars) == pytest.approx(0.6018997, abs=5e-8)
-    assert origin_line.r2_pearson(cars) == pytest.approx(0.6510794, abs=5e-8)  # lm(dist ~ speed)
+    assert origin_line.CORRELATIONS["r2_uncentred"](cars) == pytest.approx(0.8962893, abs=5e-8)
+    assert origin_line.CORRELATIONS["r2_centred"](cars) == pytest.approx(0.6018997, abs=5e-8)
+    assert origin_line.CORRELATIONS["r2_pearson"](cars) == pytest.approx(0.6510794, abs=5e-8)  # lm(dist ~ speed)
 
 
 def test_r_squared_below_zero_as_microsoft_prints_it() -> None:
     """Microsoft's article 829249 on LINEST: x = 1, 2, 3 and y = 11, 12, 13 gave -20.4286 before it was mended."""
     case = single([1, 2, 3], [11, 12, 13])
-    assert origin_line.r2_centred(case) == pytest.approx(-20.4286, abs=5e-5)
-    assert origin_line.r2_pearson(case) == pytest.approx(1.0)
+    assert origin_line.CORRELATIONS["r2_centred"](case) == pytest.approx(-20.4286, abs=5e-5)
+    assert origin_line.CORRELATIONS["r2_pearson"](case) == pytest.approx(1.0)
 
 
 def test_accuracy_by_hand() -> None:
@@ -76,18 +76,20 @@ def test_bias_cancels_twice_with_half() -> None:
 
 def test_spread_by_hand() -> None:
     case = sizes([10, 10, 10, 10], [9, 11], [8, 10, 12], [7], [])  # SD sqrt 2 about 10, SD 2 about 10
-    assert spread.mean_sd_mm(case.only_replicated()) == pytest.approx((math.sqrt(2) + 2) / 2)
-    assert spread.rms_sd_mm(case.only_replicated()) == pytest.approx(math.sqrt((2 * 1 + 4 * 2) / 3))
-    assert spread.mean_cv_percent(case.only_replicated()) == pytest.approx(10 * (math.sqrt(2) + 2) / 2)
-    assert spread.rms_cv_percent(case.only_replicated()) == pytest.approx(10 * math.sqrt(10 / 3))
+    assert spread.SPREAD["within_mass_sd_mm"](case.only_replicated()) == pytest.approx((math.sqrt(2) + 2) / 2)
+    assert spread.SPREAD["within_mass_sd_rms_mm"](case.only_replicated()) == pytest.approx(
+        math.sqrt((2 * 1 + 4 * 2) / 3)
+    )
+    assert spread.SPREAD["within_mass_cv_percent"](case.only_replicated()) == pytest.approx(10 * (math.sqrt(2) + 2) / 2)
+    assert spread.SPREAD["within_mass_cv_rms_percent"](case.only_replicated()) == pytest.approx(10 * math.sqrt(10 / 3))
 
 
 def test_spread_recovers_the_standard_deviation_that_made_it() -> None:
     """The root mean square is right at three replicates; the mean of SDs is low by c4(3) = 0.8862."""
     rng = np.random.default_rng(5)
     case = sizes([20] * 4000, *rng.normal(20, 2.6, (4000, 3)))
-    assert spread.rms_sd_mm(case) == pytest.approx(2.6, rel=0.02)
-    assert spread.mean_sd_mm(case) == pytest.approx(2.6 * 0.8862, rel=0.02)
+    assert spread.SPREAD["within_mass_sd_rms_mm"](case) == pytest.approx(2.6, rel=0.02)
+    assert spread.SPREAD["within_mass_sd_mm"](case) == pytest.approx(2.6 * 0.8862, rel=0.02)
 
 
 def paper_readings() -> tuple[list[Reading], dict[tuple[str, str], float]]:
@@ -125,8 +127,8 @@ def test_uncentred_r_squared_cannot_be_the_papers() -> None:
     for _ in range(200):
         e = np.exp(rng.normal(2.8, 0.35, 25))
         case = single(e, e * np.exp(rng.normal(-0.1, 0.42, 25)))
-        centred.append(origin_line.r2_centred(case))
-        uncentred.append(origin_line.r2_uncentred(case))
+        centred.append(origin_line.CORRELATIONS["r2_centred"](case))
+        uncentred.append(origin_line.CORRELATIONS["r2_uncentred"](case))
     assert min(centred) < 0.14 < 0.5 < min(uncentred)
 
 
@@ -220,6 +222,6 @@ def test_without_tactile_there_is_no_ratio() -> None:
 
 def test_statistics_of_nothing_are_undefined() -> None:
     nothing = single([], [])
-    for statistic in (accuracy.mape_percent, accuracy.mae_mm, origin_line.slope, spread.mean_sd_mm):
+    for statistic in (accuracy.mape_percent, accuracy.mae_mm, origin_line.slope, spread.SPREAD["within_mass_sd_mm"]):
         with pytest.raises(UndefinedError):
             statistic(nothing)

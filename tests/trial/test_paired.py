@@ -61,9 +61,8 @@ def trial(seed: int, n: int = 24, sd: float = 0.3, name: str = "tactile") -> Mod
 
 STATISTICS = {
     "mape": accuracy.mape_percent, "weighted": accuracy.weighted_mape_percent, "mae": accuracy.mae_mm,
-    "ratio": accuracy.geometric_ratio, "slope": origin_line.slope, "r2": origin_line.r2_centred,
-    "uncentred": origin_line.r2_uncentred, "pearson": origin_line.pearson_r, "sd": spread.mean_sd_mm,
-    "cv": spread.rms_cv_percent,
+    "ratio": accuracy.geometric_ratio, "slope": origin_line.slope,
+    **origin_line.CORRELATIONS, **spread.SPREAD,
 }  # fmt: skip
 
 
