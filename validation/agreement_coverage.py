@@ -12,9 +12,10 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from tactile_bayes.declarations import replace
+from tactile_bayes.options import IntervalMethod as Method
 from tactile_bayes.trial import accuracy, method_comparison
 from tactile_bayes.trial import accuracy as origin_line
-from tactile_bayes.trial.figures import Figure, Intervals, Method
+from tactile_bayes.trial.figures import Figure, Intervals
 from tactile_bayes.trial.lines import concordance, deming, least_squares
 from tactile_bayes.trial.method_comparison import compare_methods
 from tactile_bayes.trial.planning import ErrorModel, simulate

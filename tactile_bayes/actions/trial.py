@@ -7,11 +7,10 @@ from typing import Any
 
 import click
 
-from tactile_bayes.api.trials import analyse, load_trial, planned, read_pilot
+from tactile_bayes.api.trials import analyse, load_trial, planned, read_pilot, settings_by
 from tactile_bayes.commands.options import also_read, typed_options
 from tactile_bayes.errors import UsageError
-from tactile_bayes.files.documents import dump_json, read_protocol
-from tactile_bayes.options import TrialSettings
+from tactile_bayes.files.documents import dump_json
 from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.shell import progress_bar
 
@@ -34,7 +33,7 @@ def validate_action(
         raise UsageError("--pdf prints the page that --html names; give --html REPORT.html too")
     if html is not None:
         PageFiles(html, pdf, force).check()
-    title, chosen = _settings(settings, protocol)
+    title, chosen = settings_by(protocol, settings, typed=typed_options())
     inputs = load_trial(trial, excision, columns)
     also_read(*inputs.files.values())
     found = analyse(inputs, chosen, protocol=protocol, title=title)
@@ -48,19 +47,6 @@ def validate_action(
             for doubt in found.report.doubts:
                 click.echo(f"doubtful: {doubt}", err=True)
         click.echo(dump_json(found.document) if as_json else found.told(methods=methods), nl=False)
-
-
-def _settings(given: dict[str, Any], protocol: Path | None) -> tuple[str | None, TrialSettings]:
-    """Title and settings of the protocol, if there is one; refuses options that contradict it."""
-    if protocol is None:
-        return None, TrialSettings(**given)
-    title, fixed = read_protocol(protocol)
-    typed = typed_options()
-    for name, value in fixed.items():
-        if name in typed and given[name] != value:
-            option = f"--{name.replace('_', '-')} {given[name]}"
-            raise UsageError(f"{option} contradicts {protocol}, which fixes {name} = {value}; leave the option out")
-    return title, TrialSettings(**(given | fixed))
 
 
 def plan_action(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from functools import partial
 from operator import attrgetter
@@ -18,7 +18,7 @@ from tactile_bayes.declarations import EXACT, Record, as_dict, names_of, replace
 from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
-from tactile_bayes.files.documents import dump_json
+from tactile_bayes.files.documents import dump_json, read_protocol
 from tactile_bayes.files.estimate_json import fill_from_posteriors
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.tables import Sheet, Table, check_references, read_table
@@ -122,6 +122,18 @@ class TrialResult(Told, eq=False):
         return f"<TrialResult {counts.masses} masses of {counts.patients} patients: {names}>"
 
 
+def settings_by(
+    protocol: Path | None, given: Mapping[str, Any] = {}, *, typed: Collection[str] = ()
+) -> tuple[str | None, TrialSettings]:
+    """Title and settings of a protocol, if there is one, over those given; refuses typed ones that contradict it."""
+    title, fixed = (None, {}) if protocol is None else read_protocol(protocol)
+    for name, value in fixed.items():
+        if name in typed and given[name] != value:
+            option = f"--{name.replace('_', '-')} {given[name]}"
+            raise UsageError(f"{option} contradicts {protocol}, which fixes {name} = {value}; leave the option out")
+    return title, TrialSettings(**{**given, **fixed})
+
+
 def analyse(
     trial: Trial, settings: TrialSettings, *, protocol: Path | None = None, title: str | None = None
 ) -> TrialResult:
@@ -133,16 +145,13 @@ def analyse(
     report = summarise(
         trial, confidence=confidence, error_ratio=settings.error_ratio, seed=settings.seed, provenance=made.as_dict()
     )
-    if title is not None:
-        report = replace(report, title=title)
-    if settings.check_intervals:
-        trials = settings.check_intervals
-        checks = check_all(trial.sizes(), confidence=confidence, trials=trials, seed=settings.seed)
-        report = replace(report, interval_check=checks)
+    more: dict[str, Any] = {} if title is None else {"title": title}
+    if trials := settings.check_intervals:
+        more["interval_check"] = check_all(trial.sizes(), confidence=confidence, trials=trials, seed=settings.seed)
     if settings.bayes:
         rng = np.random.default_rng(settings.seed)
-        report = replace(report, next_mass=next_mass(trial, sample=draw, rng=rng, probability=INTERVAL))
-    return TrialResult(report, trial)
+        more["next_mass"] = next_mass(trial, sample=draw, rng=rng, probability=INTERVAL)
+    return TrialResult(replace(report, **more), trial)
 
 
 # --- Input of `validate` and `plan`: the tables of a trial, tidy or wide, and the estimates that they name.

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from tactile_bayes import __version__
-from tactile_bayes.api.trials import analyse, load_trial, read_excision
+from tactile_bayes.api.trials import analyse, load_trial, read_excision, settings_by
 from tactile_bayes.campaigns.exams import MassPlace, grown_masses, unnamed, visit_dates, visits_of
 from tactile_bayes.campaigns.run import FEW, Campaign
 from tactile_bayes.campaigns.steps import CampaignSettings
@@ -18,14 +18,13 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError
 from tactile_bayes.files import manifest_csv as layout
 from tactile_bayes.files.atomic import write_text
-from tactile_bayes.files.documents import read_protocol, read_record
+from tactile_bayes.files.documents import read_record
 from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
 from tactile_bayes.files.reports import EstimateReport, PooledReport, centre_of
 from tactile_bayes.files.tables import Table
 from tactile_bayes.findings import Finding, by_weight, capital, finding_lines, verdict
 from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.options import TrialSettings
 from tactile_bayes.report.campaign_page import ExamEntry, MassRow, VisitEntry, campaign_html, worst
 from tactile_bayes.report.compare import CompareReport, Growth, growth_line, growths
 from tactile_bayes.report.exam_words import reason_on_paper
@@ -373,7 +372,7 @@ def check_inputs(exams: Sequence[Exam], settings: CampaignSettings) -> None:
         _check_spelling(table, exams)
         dates = dict(zip(_masses_of(table), table.columns["date"], strict=True))
         at_excision([exam.as_reading for exam in exams], dates, fault=partial(_fault_of_exam, exams))
-    _trial_settings(settings.protocol)
+    settings_by(settings.protocol)
 
 
 def _excised(settings: CampaignSettings) -> Table | None:
@@ -403,17 +402,9 @@ def _fault_of_exam(exams: Sequence[Exam], row: int, column: str, what: str, /, *
     return BadDataError(f"table of exams, line {exams[row].line}, column {column}: {what}", way_out=way_out)
 
 
-def _trial_settings(protocol: Path | None) -> tuple[TrialSettings, str | None]:
-    """Settings that a protocol fixes, the others by default, and its title."""
-    if protocol is None:
-        return TrialSettings(), None
-    title, fixed = read_protocol(protocol)
-    return TrialSettings(**fixed), title
-
-
 def _write_report(folder: Path, asked: CampaignSettings, growth: Sequence[Growth]) -> tuple[str, str]:
     """Write what `validate` writes for the trial table; returns its text, or why there is none."""
-    settings, title = _trial_settings(asked.protocol)
+    title, settings = settings_by(asked.protocol)
     assert asked.excision is not None
     try:
         inputs = load_trial(folder / layout.TRIAL, asked.excision, asked.columns, tidy_trial=True)

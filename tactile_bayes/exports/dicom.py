@@ -399,9 +399,16 @@ def structured_report(
 
     `maps`: that the estimate was made from; `evidence`: the DICOM objects of the maps.
     """
-    sr = exam.required("highdicom").sr
+    sr, codes_of = exam.required("highdicom").sr, exam.required("pydicom").sr.codedict.codes
+    program = sr.DeviceObserverIdentifyingAttributes(
+        uid=exam.content_uid("device", MODEL, __version__),
+        name=MODEL,
+        manufacturer_name=MANUFACTURER,
+        model_name=f"{MODEL} {__version__}",
+    )
+    observer = sr.ObserverContext(observer_type=codes_of.DCM.Device, observer_identifying_attributes=program)
     report = sr.MeasurementReport(
-        observation_context=_observer(),
+        observation_context=sr.ObservationContext(observer_device_context=observer),
         procedure_reported=coded(exam.EXAM),
         imaging_measurements=[_group(estimate, one, maps, evidence) for one in estimate.masses],
         title=coded(exam.REPORT_TITLE),
@@ -425,19 +432,6 @@ def structured_report(
     add_study(dataset, study)
     declare_scheme(dataset)
     return dataset
-
-
-def _observer() -> Any:
-    """The program as the observer."""
-    sr, codes_of = exam.required("highdicom").sr, exam.required("pydicom").sr.codedict.codes
-    device = sr.DeviceObserverIdentifyingAttributes(
-        uid=exam.content_uid("device", MODEL, __version__),
-        name=MODEL,
-        manufacturer_name=MANUFACTURER,
-        model_name=f"{MODEL} {__version__}",
-    )
-    context = sr.ObserverContext(observer_type=codes_of.DCM.Device, observer_identifying_attributes=device)
-    return sr.ObservationContext(observer_device_context=context)
 
 
 def _group(

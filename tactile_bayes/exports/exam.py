@@ -259,32 +259,29 @@ def estimate_of(document: object, path: Path) -> EstimateFile:
 
 
 def masses_of(report: EstimateReport | PooledReport) -> tuple[SizedMass, ...]:
-    """The masses that an estimate lists, or the one that it is of."""
-    alike = report.figures.get("between_map_sd")
+    """The masses that an estimate lists, or the one that it is of, each with the sizes that lead."""
     listed = report.masses if isinstance(report, EstimateReport) else ()
-    return tuple(_mass(one, alike) for one in listed or (report,))
-
-
-def _mass(mass: EstimateReport | PooledReport | MassReport, alike: float | None) -> SizedMass:
-    """A mass with the sizes that lead, and in words the interval for exams that differ by `alike`."""
-    leads, size, code, narrow = mass.leading, mass.max_size_mm, "", ""
-    if size is None:
-        code = (not isinstance(mass, PooledReport) and mass.reason_code) or "no size"
-    elif leads is not mass:
-        label = exams_label(alike)
-        narrow = f"{capital(label)}: largest size {size_words(size)}"
-    placed = None if isinstance(mass, PooledReport) else mass
-    return SizedMass(
-        mass.number if isinstance(mass, MassReport) else 1,
-        leads.max_size_mm,
-        leads.min_size_mm,
-        code,
-        plain_line(mass.reason) if code else "",
-        None if placed is None else placed.detected_probability,
-        None if placed is None else centre_of(placed.centre_mm),
-        None if placed is None else centre_of(placed.centre_patient_mm),
-        narrow,
-    )
+    found = []
+    for mass in listed or (report,):
+        leads, size, code, narrow = mass.leading, mass.max_size_mm, "", ""
+        if size is None:
+            code = (not isinstance(mass, PooledReport) and mass.reason_code) or "no size"
+        elif leads is not mass:
+            narrow = f"{capital(exams_label(report.figures.get('between_map_sd')))}: largest size {size_words(size)}"
+        placed = None if isinstance(mass, PooledReport) else mass
+        one = SizedMass(
+            mass.number if isinstance(mass, MassReport) else 1,
+            leads.max_size_mm,
+            leads.min_size_mm,
+            code,
+            plain_line(mass.reason) if code else "",
+            None if placed is None else placed.detected_probability,
+            None if placed is None else centre_of(placed.centre_mm),
+            None if placed is None else centre_of(placed.centre_patient_mm),
+            narrow,
+        )
+        found.append(one)
+    return tuple(found)
 
 
 def size_words(size: Quantity) -> str:

@@ -159,8 +159,12 @@ def export(
     """
     maps = [one for one in files if isinstance(one, MapFile)]
     estimates = [one for several in files if not isinstance(several, MapFile) for one in several]
-    _refuse_twice(maps)
-    _refuse_twice(estimates)
+    seen = dict[str, Path]()
+    inputs: list[MapFile | EstimateFile] = [*maps, *estimates]
+    for one in inputs:
+        if one.digest in seen:
+            raise UsageError(f"{one.path} holds what {seen[one.digest]} holds; give each once")
+        seen[one.digest] = one.path
     check_pairs(maps, estimates)
     given: dict[str, Any] = {name: value for name, value in identity.given.items() if name in TAKES[to]}
     who = Identity(**given)
@@ -176,8 +180,7 @@ def export(
         _refuse_maps(maps, estimates, to)
         return {"": records_csv(estimates, who, id_from_scan=id_from_scan).encode()}, ()
     if id_from_scan and not who.patient_id:
-        facts = [*(one.facts for one in maps), *(one.facts for one in estimates)]
-        subjects = {one.get("subject", "") for one in facts}
+        subjects = {one.facts.get("subject", "") for one in inputs}
         if len(subjects) != 1 or "" in subjects:
             way_out = "give --patient-id instead of --patient-id-from-scan"
             raise UsageError(f"the scans name no subject, or several; {way_out}")
@@ -189,14 +192,6 @@ def export(
         return held, (*notes, *others)
     _refuse_maps(maps, estimates, to)
     return {"": bundle_json(_one_estimate(estimates, to), who).encode()}, tuple(notes)
-
-
-def _refuse_twice(files: Sequence[MapFile] | Sequence[EstimateFile]) -> None:
-    seen = dict[str, Path]()
-    for one in files:
-        if one.digest in seen:
-            raise UsageError(f"{one.path} holds what {seen[one.digest]} holds; give each once")
-        seen[one.digest] = one.path
 
 
 def _one_estimate(estimates: Sequence[EstimateFile], to: ExportFormat) -> EstimateFile:

@@ -101,7 +101,17 @@ def _modality_lines(name: str, report: ModalityReport) -> Iterator[str]:
         yield f"{name}: concordance {shown(methods.figure('concordance'), '.2f')}"
     for words, bias, low, high in limit_rows(report):
         yield f"{name}: limits of agreement {words}: bias {bias}, {low} to {high}"
-    yield from _replicate_lines(name, report)
+    repeated, parts = report.replicates, report.replicates.variance_components
+    if repeated.repeatability_high_percent is not None:
+        low = shown(repeated.figure("repeatability_low_percent"), ".0f")
+        high = shown(repeated.figure("repeatability_high_percent"), "+.0f")
+        yield f"{name}: two readings of one mass differ by {low} to {high} % at most in 95 % of pairs"
+        if parts is not None:
+            readers = "" if parts.reader is None else f", readers {100 * parts.reader**0.5:.0f}"
+            yield (
+                f"{name}: SD of ln size, %: masses {100 * parts.mass**0.5:.0f}{readers}, maps "
+                f"{100 * parts.map**0.5:.0f}; ICC {shown(repeated.figure('icc'), '.2f')}"
+            )
     if report.calibration is not None:
         found = report.calibration
         yield (
@@ -135,23 +145,6 @@ def growing_line(report: TrialReport) -> str | None:
         f"Errors grow with size ({', '.join(names)}): limits in mm are too wide for small masses, too narrow for large "
         "ones; use the ratio's."
     )
-
-
-def _replicate_lines(name: str, report: ModalityReport) -> Iterator[str]:
-    found = report.replicates
-    if found.repeatability_high_percent is None:
-        return
-    low = shown(found.figure("repeatability_low_percent"), ".0f")
-    high = shown(found.figure("repeatability_high_percent"), "+.0f")
-    yield f"{name}: two readings of one mass differ by {low} to {high} % at most in 95 % of pairs"
-    parts = found.variance_components
-    if parts is not None:
-        readers = "" if parts.reader is None else f", readers {100 * parts.reader**0.5:.0f}"
-        icc = shown(found.figure("icc"), ".2f")
-        yield (
-            f"{name}: SD of ln size, %: masses {100 * parts.mass**0.5:.0f}{readers}, maps "
-            f"{100 * parts.map**0.5:.0f}; ICC {icc}"
-        )
 
 
 def _pair_line(pair: PairedComparison) -> str:
@@ -318,8 +311,7 @@ def _notes(report: TrialReport) -> Iterator[str]:
         yield f"p: sign-flip test by patient on the masses that both looked for{pairs}."
         patients = max(pair.patients for pair in report.paired_comparisons if pair.p_value is not None)
         if (least := least_p(patients)) >= 0.05:  # no difference between modalities could give less
-            few = f"{patients} patient{'' if patients == 1 else 's'}"
-            yield f"With {few} p cannot be below {least:.2g}: the test says nothing here."
+            yield f"With {_plural(patients, 'patient')} p cannot be below {least:.2g}: the test says nothing here."
 
 
 def ratio_line(name: str, one: ModalityRatio) -> str:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from scipy.special import betaincinv, ndtr, ndtri, stdtrit
 
 from tactile_bayes.declarations import UNSET, Meta, Record, replace, says
+from tactile_bayes.options import IntervalMethod
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 
 # --- Jackknife intervals over patients, keeping a patient's masses together.
@@ -175,7 +176,6 @@ def clopper_pearson(k: float, n: float, *, confidence: float) -> tuple[float, fl
 
 # --- Bootstrap intervals over patients (BCa), keeping a patient's masses together.
 
-Method = Literal["corrected", "jackknife", "bca"]
 RESAMPLES = 2000
 SEED = 1999
 _LEAST_DEFINED = 0.99  #: Of the redrawn trials, at least this share must have the figure at all.
@@ -188,12 +188,12 @@ class Intervals(float):
     from this seed.
     """
 
-    method: Method
+    method: IntervalMethod
     resamples: int
     seed: int
 
     def __new__(
-        cls, confidence: float, *, method: Method = "jackknife", resamples: int = RESAMPLES, seed: int = SEED
+        cls, confidence: float, *, method: IntervalMethod = "jackknife", resamples: int = RESAMPLES, seed: int = SEED
     ) -> Intervals:
         """A float with three more attributes."""
         made = super().__new__(cls, confidence)
@@ -201,8 +201,8 @@ class Intervals(float):
         return made
 
 
-def method_of(confidence: float) -> Method:
-    """Method of the intervals of a probability."""
+def method_of(confidence: float) -> IntervalMethod:
+    """IntervalMethod of the intervals of a probability."""
     return confidence.method if isinstance(confidence, Intervals) else "jackknife"
 
 

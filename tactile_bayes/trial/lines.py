@@ -123,7 +123,6 @@ class PassingBablok(Record):
     slope: float
     intercept_interval: tuple[float, float]
     slope_interval: tuple[float, float]
-    n: int
 
 
 def passing_bablok(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) -> PassingBablok:
@@ -148,28 +147,17 @@ def passing_bablok(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) ->
     slope = _at(angles, angles.number + shift)
     if not abs(slope) < 1e15:
         raise UndefinedError("the middle slope is vertical")
-    ends = _slope_ends(angles, shift, rising=rising, confidence=confidence, n=len(x))
-    return PassingBablok(
-        intercept=float(np.median(y - slope * x)),
-        slope=slope,
-        intercept_interval=(float(np.median(y - ends[1] * x)), float(np.median(y - ends[0] * x)))
-        if all(abs(end) < 1e15 for end in ends)
-        else (-math.inf, math.inf),
-        slope_interval=ends,
-        n=len(x),
-    )
-
-
-def _slope_ends(angles: PairAngles, shift: int, *, rising: bool, confidence: float, n: int) -> tuple[float, float]:
-    sd = math.sqrt(n * (n - 1) * (2 * n + 5) / 18)
-    reach = math.floor(float(ndtri(0.5 + 0.5 * confidence)) * sd + 0.5)
+    # slope ends beyond the slopes themselves, or among those of -1 (+1 for a falling line), say nothing of the line
+    n, against = len(x), -math.pi / 4 if rising else math.pi / 4
+    reach = math.floor(float(ndtri(0.5 + 0.5 * confidence)) * math.sqrt(n * (n - 1) * (2 * n + 5) / 18) + 0.5)
     low, high = angles.number - reach + shift, angles.number + reach + shift
-    # ranks below the slopes of -1 (+1 for a falling line) say nothing of the line
-    against = -math.pi / 4 if rising else math.pi / 4
     least = 2 * (angles.below(against, inclusive=True) - angles.below(against, inclusive=False)) + 1
-    if (low + 1) // 2 < least or (high + 1) // 2 > angles.number - (high % 2 == 0):
-        return -math.inf, math.inf
-    return _at(angles, low), _at(angles, high)
+    slopes = intercepts = (-math.inf, math.inf)
+    if (low + 1) // 2 >= least and (high + 1) // 2 <= angles.number - (high % 2 == 0):
+        slopes = _at(angles, low), _at(angles, high)
+        if all(abs(end) < 1e15 for end in slopes):
+            intercepts = float(np.median(y - slopes[1] * x)), float(np.median(y - slopes[0] * x))
+    return PassingBablok(float(np.median(y - slope * x)), slope, intercepts, slopes)
 
 
 def _at(angles: PairAngles, twice: int) -> float:

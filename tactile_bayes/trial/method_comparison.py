@@ -116,23 +116,14 @@ def limits(differences: FloatArray, *, confidence: float = 0.95) -> Limits:
     :math:`s\sqrt{1/n + z^2/(2(n-1))}` for the approximate intervals. The exact ones are tolerance factors: Carkeet
     (2015), Optom. Vis. Sci. 92, e71.
     """
-    n = len(differences)
-    if n < 2:
-        raise UndefinedError(f"limits of agreement need at least 2 masses (found {n})")
-    bias, sd = float(differences.mean()), float(differences.std(ddof=1))
-    z, tail = _REACH, 0.5 + 0.5 * confidence
-    t = lines.student(n - 1, confidence=confidence)
+    found = _limits_of_means(differences, 0.0, confidence=confidence)
+    n, bias, sd, z, tail = found.n, found.bias, found.sd, _REACH, 0.5 + 0.5 * confidence
     inner = percentile_factor(n, percentile=0.5 + 0.5 * SHARE, confidence=1 - tail)
     outer = percentile_factor(n, percentile=0.5 + 0.5 * SHARE, confidence=tail)
     pair = [content_factor(n, content=SHARE, confidence=c) for c in (1 - tail, tail)]
-    reach = t * math.sqrt(1 / n + z * z / (2 * (n - 1)))
-    return Limits(
-        n=n,
-        bias=bias,
-        bias_interval=(bias - t * sd / math.sqrt(n), bias + t * sd / math.sqrt(n)),
-        sd=sd,
-        low=bias - z * sd,
-        high=bias + z * sd,
+    reach = lines.student(n - 1, confidence=confidence) * math.sqrt(1 / n + z * z / (2 * (n - 1)))
+    return replace(
+        found,
         low_interval=(bias - outer * sd, bias - inner * sd),
         high_interval=(bias + inner * sd, bias + outer * sd),
         pair_intervals=((bias - pair[1] * sd, bias - pair[0] * sd), (bias + pair[0] * sd, bias + pair[1] * sd)),
@@ -157,27 +148,27 @@ def limits_unlinked(x: Sequence[FloatArray], y: Sequence[FloatArray], *, confide
     (2013), Stat. Methods Med. Res. 22, 630.
     """
     means = np.array([b.mean() - a.mean() for a, b in zip(x, y, strict=True)])
-    n = len(means)
-    if n < 2:
-        raise UndefinedError(f"limits of agreement need at least 2 masses (found {n})")
+    reference, own = _averaged_out(x), _averaged_out(y)
+    found = _limits_of_means(means, reference[0] + own[0], confidence=confidence)
     between = float(means.var(ddof=1))
-    parts = {"means": (between, n - 1), "reference_within": _averaged_out(x), "within": _averaged_out(y)}
-    total = sum(variance for variance, _ in parts.values())
-    bias, z = float(means.mean()), _REACH
-    low, high = bias - z * math.sqrt(total), bias + z * math.sqrt(total)
-    wide, narrow = _recovered(list(parts.values()), total, z=z, bias_variance=between / n, confidence=confidence)
-    t = lines.student(n - 1, confidence=confidence) * math.sqrt(between / n)
-    return Limits(
-        n=n,
-        bias=bias,
-        bias_interval=(bias - t, bias + t),
-        sd=math.sqrt(total),
-        low=low,
-        high=high,
-        low_interval=(low - wide, low + narrow),
-        high_interval=(high - narrow, high + wide),
+    parts = {"means": (between, found.n - 1), "reference_within": reference, "within": own}
+    wide, narrow = _recovered(list(parts.values()), found.sd**2, bias_variance=between / found.n, confidence=confidence)
+    return replace(
+        found,
+        low_interval=(found.low - wide, found.low + narrow),
+        high_interval=(found.high - narrow, found.high + wide),
         components={name: variance for name, (variance, _) in parts.items()},
     )
+
+
+def _limits_of_means(differences: FloatArray, averaged_out: float, *, confidence: float) -> Limits:
+    """Limits without intervals of their own; averaging over replicates took this variance out of the differences."""
+    n = len(differences)
+    if n < 2:
+        raise UndefinedError(f"limits of agreement need at least 2 masses (found {n})")
+    bias, between = float(differences.mean()), float(differences.var(ddof=1))
+    sd, t = math.sqrt(between + averaged_out), lines.student(n - 1, confidence=confidence) * math.sqrt(between / n)
+    return Limits(n, bias, (bias - t, bias + t), sd, low=bias - _REACH * sd, high=bias + _REACH * sd)
 
 
 def _averaged_out(groups: Sequence[FloatArray]) -> tuple[float, int]:
@@ -228,9 +219,7 @@ def errors_are_proportional(x: FloatArray, y: FloatArray) -> bool:
     return bool(np.isfinite(gain) and gain > np.log(LIKELIER))
 
 
-def _recovered(
-    parts: Sequence[tuple[float, int]], total: float, *, z: float, bias_variance: float, confidence: float
-) -> Ends:
+def _recovered(parts: Sequence[tuple[float, int]], total: float, *, bias_variance: float, confidence: float) -> Ends:
     """Outer and inner reach of a limit's interval, from chi-squared intervals of each variance (Zou 2013)."""
     tail = 0.5 - 0.5 * confidence
     below = above = 0.0
@@ -241,8 +230,8 @@ def _recovered(
         above += (variance * (1 - freedom / float(chdtri(freedom, 1 - tail)))) ** 2
     low, high = math.sqrt(max(0.0, total - math.sqrt(below))), math.sqrt(total + math.sqrt(above))
     of_bias = float(ndtri(1 - tail)) ** 2 * bias_variance
-    wide = math.sqrt(of_bias + (z * (high - math.sqrt(total))) ** 2)
-    narrow = math.sqrt(of_bias + (z * (math.sqrt(total) - low)) ** 2)
+    wide = math.sqrt(of_bias + (_REACH * (high - math.sqrt(total))) ** 2)
+    narrow = math.sqrt(of_bias + (_REACH * (math.sqrt(total) - low)) ** 2)
     return wide, narrow
 
 
@@ -390,7 +379,12 @@ def compare_methods(sizes: ModalitySizes, *, confidence: float, error_ratio: flo
     found = sizes.only_detected()
     x, y = found.ex_vivo_mm, found.size_mm
     robust = _fitted(partial(lines.passing_bablok, confidence=float(confidence)))
-    figures = _figures(found, confidence=confidence, error_ratio=error_ratio, robust=robust)
+    slope: Scale = "slope" if method_of(confidence) == "corrected" else "linear"
+    figures: dict[str, Figure] = {}
+    for name, statistic, scale in _statistics(error_ratio, robust, slope):
+        wanted = scale if isinstance(statistic, SumStatistic) or len(x) <= MOST_REFITTED else None
+        figures[name] = figure(statistic, found, scale=wanted, confidence=confidence, leverage=_squared_distance)
+    figures |= limit_figures(found, confidence=confidence)
     judged, level = len(x) >= 2 and _squarable(x, y), float(confidence)
     return MethodComparison(
         masses=len(x),
@@ -402,15 +396,6 @@ def compare_methods(sizes: ModalitySizes, *, confidence: float, error_ratio: flo
         concordance_parts=_or_none(lambda: lines.concordance(x, y, confidence=level)) if judged else None,
         errors_grow_with_size=judged and errors_are_proportional(x, y),
     )
-
-
-def _figures(found: ModalitySizes, *, confidence: float, error_ratio: float, robust: _Fit) -> dict[str, Figure]:
-    figures: dict[str, Figure] = {}
-    slope: Scale = "slope" if method_of(confidence) == "corrected" else "linear"
-    for name, statistic, scale in _statistics(error_ratio, robust, slope):
-        wanted = scale if isinstance(statistic, SumStatistic) or len(found.size_mm) <= MOST_REFITTED else None
-        figures[name] = figure(statistic, found, scale=wanted, confidence=confidence, leverage=_squared_distance)
-    return figures | limit_figures(found, confidence=confidence)
 
 
 def _squared_distance(sizes: ModalitySizes) -> FloatArray:
