@@ -330,15 +330,15 @@ class Moment(Record):
         found = _MOMENT.fullmatch(text)
         way_out = "give YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the time zone if you know it"
         if found is None:
-            raise UsageError(f"{name} is {_short(text)}; {way_out}")
+            raise UsageError(f"{name} is {short(text)}; {way_out}")
         year, month, day, hour, minute, second, zone = found.groups()
         try:
             datetime.datetime(int(year), int(month), int(day), int(hour or 0), int(minute or 0), int(second or 0))
         except ValueError as error:
-            raise UsageError(f"{name} is {_short(text)}: {error}; {way_out}") from None
+            raise UsageError(f"{name} is {short(text)}: {error}; {way_out}") from None
         zone = "+00:00" if zone == "Z" else zone or ""
         if zone and not (int(zone[1:3]) <= 14 and int(zone[4:]) < 60):
-            raise UsageError(f"{name} is {_short(text)}: no time zone is {zone} from UTC; {way_out}")
+            raise UsageError(f"{name} is {short(text)}: no time zone is {zone} from UTC; {way_out}")
         return cls(f"{year}{month}{day}", f"{hour or ''}{minute or ''}{second or ''}", zone.replace(":", ""))
 
     @property
@@ -360,22 +360,30 @@ class Identity(IdentityOptions):
 
     def __post_init__(self) -> None:
         for name in names_of(self):
-            _check_text(name, getattr(self, name))
+            value = getattr(self, name)
+            if _REPLACED in value:
+                way_out = "a letter was lost on its way (U+FFFD); give it as it is written"
+                raise UsageError(f"{name} is {short(value)}: {way_out}")
+            if not value.isprintable() or "\\" in value:
+                way_out = "leave out backslashes, line ends and other characters that cannot be printed"
+                raise UsageError(f"{name} is {short(value)}; {way_out}")
+            if value != value.strip():
+                raise UsageError(f"{name} is {short(value)}; leave out the blanks around it")
         for name in _NAMES:
             groups = getattr(self, name).split("=")
             if len(groups) > 3 or any(len(group) > 64 or group.count("^") > 4 for group in groups):
                 way_out = "give FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX, at most 64 characters"
-                raise UsageError(f"{name} is {_short(getattr(self, name))}; {way_out}")
+                raise UsageError(f"{name} is {short(getattr(self, name))}; {way_out}")
         super().__post_init__()
         if self.study_uid and not _UID.fullmatch(self.study_uid):
             raise UsageError(
-                f"study_uid is {_short(self.study_uid)}; give numbers with points between, at most 64 characters"
+                f"study_uid is {short(self.study_uid)}; give numbers with points between, at most 64 characters"
             )
         for name in ("birth_date", "study_date", "content_date"):
             if text := getattr(self, name):
                 moment = Moment.of(text, name=name)
                 if name == "birth_date" and moment.time:
-                    raise UsageError(f"birth_date is {_short(text)}; give YYYY-MM-DD")
+                    raise UsageError(f"birth_date is {short(text)}; give YYYY-MM-DD")
 
     @property
     def given(self) -> dict[str, str]:
@@ -393,18 +401,8 @@ class Identity(IdentityOptions):
         return Moment.of(self.content_date, name="content_date") if self.content_date else self.study
 
 
-def _check_text(name: str, value: str) -> None:
-    if _REPLACED in value:
-        raise UsageError(f"{name} is {_short(value)}: a letter was lost on its way (U+FFFD); give it as it is written")
-    if not value.isprintable() or "\\" in value:
-        raise UsageError(
-            f"{name} is {_short(value)}; leave out backslashes, line ends and other characters that cannot be printed"
-        )
-    if value != value.strip():
-        raise UsageError(f"{name} is {_short(value)}; leave out the blanks around it")
-
-
-def _short(value: str) -> str:
+def short(value: str) -> str:
+    """A text as an error shows it."""
     return repr(value if len(value) <= 60 else value[:57] + "...")
 
 
@@ -436,7 +434,7 @@ def identity_of(worklist: Path | None, given: Mapping[str, Any]) -> Identity:
         known = getattr(found, name)
         if known and known != value:
             raise UsageError(
-                f"{name} is {_short(value)} by the option and {_short(known)} in the worklist; leave one out"
+                f"{name} is {short(value)} by the option and {short(known)} in the worklist; leave one out"
             )
     return replace(found, **given)
 
@@ -499,7 +497,7 @@ def _check_letters(item: Any, known: Collection[str], path: Path) -> None:
         value = getattr(item.get_item(keyword), "value", b"")
         if isinstance(value, bytes) and not value.isascii():
             byte = next(one for one in value if one > 127)
-            said = f"the character set {_short(str(names[0]))}, which is none" if names else "no character set"
+            said = f"the character set {short(str(names[0]))}, which is none" if names else "no character set"
             what = f"{keyword} holds the byte 0x{byte:02x}, and the item declares {said}"
             way_out = "declare SpecificCharacterSet in it (ISO_IR 192 for UTF-8), or give the name by options"
             raise BadDataError(what, way_out=way_out, path=str(path))

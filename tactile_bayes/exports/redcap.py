@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Final, Literal, NamedTuple
 
 from tactile_bayes.errors import UsageError
-from tactile_bayes.exports.exam import EstimateFile, Identity, SizedMass, content_uuid
+from tactile_bayes.exports.exam import EstimateFile, Identity, SizedMass, content_uuid, short
 from tactile_bayes.files.tables import csv_text
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
@@ -165,10 +165,8 @@ def _record_id(estimate: EstimateFile, finding: SizedMass, identity: Identity, *
     parts = [patient, *(facts[name] for name in ("side", "visit", "mass") if name in facts), *several]
     name = "-".join(parts)
     if not _RECORD.fullmatch(name):
-        shown = name if len(name) <= 60 else f"{name[:57]}..."
-        raise UsageError(
-            f"the record ID {shown!r} is none that REDCap takes; use letters, digits, points and dashes, at most 100"
-        )
+        way_out = "use letters, digits, points and dashes, at most 100"
+        raise UsageError(f"the record ID {short(name)} is none that REDCap takes; {way_out}")
     return name
 
 

@@ -6,7 +6,7 @@ import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,6 @@ from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 # --- Jackknife intervals over patients, keeping a patient's masses together.
 
 Scale = Literal["log", "linear", "fisher", "slope"]
-Values = TypeVar("Values", float, npt.NDArray[np.float64])
 
 # Below this the spread of so few leave-one-out values says little; a Student t with 6 degrees of freedom would hide it.
 MIN_PATIENTS = 8
@@ -62,7 +61,7 @@ def interval_from_values(
     left_out = np.asarray(values, dtype=np.float64)
     if scale == "slope":
         scale = "log" if value > 0 and np.all(left_out > 0) else "linear"
-    everything, others = on_scale(value, scale), on_scale(left_out, scale)
+    everything, others = float(on_scale(value, scale)), on_scale(left_out, scale)
     variance = (groups - 1) / groups * float(np.sum((others - others.mean()) ** 2))
     if variance <= (1e-12 * max(1.0, abs(everything))) ** 2:
         raise UndefinedError("the figure is the same whichever patient is left out, so its error cannot be estimated")
@@ -102,19 +101,18 @@ def kurtosis_freedom(values: npt.NDArray[np.float64]) -> float:
     return 3 * float(squares.sum()) ** 2 / float(np.sum(squares**2))
 
 
-def on_scale(values: Values, scale: Scale) -> Values:
+def on_scale(values: float | FloatArray, scale: Scale) -> FloatArray:
     """Transform values to a scale: unchanged, logarithms, or Fisher's z; `UndefinedError` where one has none."""
+    found = np.asarray(values, dtype=np.float64)
     if scale == "linear":
-        return values
+        return found
     if scale == "fisher":
-        if np.any(np.abs(np.asarray(values)) >= 1):
+        if np.any(np.abs(found) >= 1):
             raise UndefinedError("the coefficient is 1 or -1, or becomes so without one patient")
-        stretched: Values = np.arctanh(values)
-        return stretched
-    if np.any(np.asarray(values) <= 0):
+        return np.arctanh(found)
+    if np.any(found <= 0):
         raise UndefinedError("the figure is 0, or becomes 0 without one patient, and has no logarithm")
-    logarithms: Values = np.log(values)
-    return logarithms
+    return np.log(found)
 
 
 # --- Statistics that depend on masses only through sums, so that resampling patients is cheap.
@@ -242,7 +240,6 @@ def bca_interval(value: float, drawn: FloatArray, left_out: FloatArray, *, confi
 LARGEST = 1e150  #: Room above for percent and squares; NaN fails the comparison too.
 
 Statistic = Callable[[ModalitySizes], float]
-Leverage = Callable[[ModalitySizes], FloatArray]
 
 
 class Figure(Record):
@@ -271,9 +268,7 @@ class Figure(Record):
 Ends = tuple[float, float]
 Count = Annotated[int, Meta(ge=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
-AtMostOne = Annotated[float, Meta(le=1)]
 Share = Annotated[float, Meta(ge=0, le=1)]
-Correlation = Annotated[float, Meta(ge=-1, le=1)]
 Reason = Annotated[str, Meta(min_length=1)]
 Reasons = Annotated[dict[str, Reason], says("Why a figure or an interval is null.")]
 
@@ -312,7 +307,7 @@ def figure(
     *,
     scale: Scale | None = None,
     confidence: float | None = None,
-    leverage: Leverage | None = None,
+    leverage: Callable[[ModalitySizes], FloatArray] | None = None,
 ) -> Figure:
     """Compute a statistic of these masses, with an interval over patients when `scale` and `confidence` are given.
 

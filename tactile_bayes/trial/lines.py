@@ -173,8 +173,6 @@ def _at(angles: PairAngles, twice: int) -> float:
 # x over that of y, as Linnet (1990) does; 1 is orthogonal regression, and 0 and infinity are the two least-squares
 # lines.
 
-MAX_ITERATIONS = 30
-THRESHOLD = 1e-6
 # Differences below this share of the numbers themselves are rounding, as between averages of equal replicates.
 EQUAL = 1e-12
 
@@ -251,8 +249,8 @@ def weighted_deming(
     y: FloatArray,
     *,
     error_ratio: float = 1.0,
-    max_iterations: int = MAX_ITERATIONS,
-    threshold: float = THRESHOLD,
+    max_iterations: int = 30,
+    threshold: float = 1e-6,
 ) -> Line:
     r"""Fit a Deming line whose errors grow in proportion to size: weights 1 over the squared fitted size.
 

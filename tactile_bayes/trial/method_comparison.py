@@ -277,7 +277,7 @@ def _jackknifed(
     """Value with its jackknife interval, and the degrees of freedom of its leave-one-out values."""
     sample = Sample(statistic, (found,))
     value, left = sample.value(), sample.left_out()
-    freedom = kurtosis_freedom(np.asarray(on_scale(left, scale)))
+    freedom = kurtosis_freedom(on_scale(left, scale))
     return value, interval_from_values(value, left, scale=scale, confidence=float(confidence), freedom=freedom)
 
 

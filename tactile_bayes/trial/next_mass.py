@@ -166,7 +166,7 @@ def _fit(
     theta = np.asarray(drawn.theta).reshape(-1, len(centre))
     missed = len(sizes.size_mm) - len(found.size_mm)
     misses = rng.beta(missed + PRIOR_MISS, len(found.size_mm) + PRIOR_MISS, len(theta))
-    of_found = expected_error_percent(model, theta, np.zeros(len(theta)))
+    of_found = expected_error_percent(model, theta)
     error = (1 - misses) * of_found + 100 * misses
     sds = np.sqrt(np.array(variances(theta)))
     tails = [0.5, 0.5 - probability / 2, 0.5 + probability / 2]
@@ -280,8 +280,8 @@ def log_prior(theta: FloatArray, *, spread: float, caliper: float) -> FloatArray
     return np.asarray(np.where(outside, -np.inf, prior))
 
 
-def expected_error_percent(model: LogModel, theta: FloatArray, misses: FloatArray) -> FloatArray:
-    r"""(n,) mean of :math:`100 |y/\xi - 1|` for one reading of a new mass; a miss counts as 100.
+def expected_error_percent(model: LogModel, theta: FloatArray) -> FloatArray:
+    r"""(n,) mean of :math:`100 |y/\xi - 1|` for one reading of a new mass that is found.
 
     On the logarithm the error is normal; its size-dependent mean is averaged over normal sizes like the trial's.
     """
@@ -289,7 +289,7 @@ def expected_error_percent(model: LogModel, theta: FloatArray, misses: FloatArra
     sd = np.exp(theta[:, 2])[:, None]
     mean = theta[:, :1] + (theta[:, 1:2] - 1) * model.spread * at[None, :]
     folded = np.exp(mean + sd**2 / 2) * erf((mean / sd + sd) / math.sqrt(2)) - erf(mean / sd / math.sqrt(2))
-    return np.asarray(100 * ((1 - misses) * (folded @ weight / weight.sum()) + misses))
+    return np.asarray(100 * (folded @ weight / weight.sum()))
 
 
 def _total_variance(log_sd: FloatArray) -> FloatArray:

@@ -13,8 +13,6 @@ from tactile_bayes.trial import accuracy
 from tactile_bayes.trial.calibration import Calibration, Coverage, calibration, coverage, prediction_of
 from tactile_bayes.trial.figures import (
     SEED,
-    AtMostOne,
-    Correlation,
     Count,
     Ends,
     Figure,
@@ -37,8 +35,8 @@ FAMILIES: tuple[Callable[..., dict[str, Figure]], ...] = (
     accuracy.origin_line_figures,
     spread_figures,
 )
-
-
+AtMostOne = Annotated[float, Meta(le=1)]
+Correlation = Annotated[float, Meta(ge=-1, le=1)]
 CONVENTIONS: dict[str, str] = {
     "masses": "sizes are averaged over the detected replicates of a mass first; a mass counts once",
     "detected": "a mass found in at least one replicate",

@@ -70,8 +70,8 @@ def test_the_next_error_is_that_of_the_model() -> None:
     found = modality()
     model = LogModel(found, np.full(len(found.size_mm), CALIPER))
     theta = np.array([[0.1, 1.0, 0.5 * math.log(0.1**2 + 0.2**2 + 0.15**2), 0.0, 0.0]])
-    expected = ErrorModel(0.1, math.sqrt(0.1**2 + 0.2**2 + 0.15**2), miss=0.04).true_mape_percent
-    assert expected_error_percent(model, theta, np.array([0.04]))[0] == pytest.approx(expected)
+    expected = ErrorModel(0.1, math.sqrt(0.1**2 + 0.2**2 + 0.15**2)).true_mape_percent
+    assert expected_error_percent(model, theta)[0] == pytest.approx(expected)
 
 
 def readings(seed: int, *, patients: int = 24, sds: tuple[float, float] = (0.1, 0.4)) -> tuple[list[Reading], dict]:
