@@ -11,7 +11,8 @@ import numpy as np
 from scipy.special import ndtri
 
 from tactile_bayes.declarations import Meta, Record
-from tactile_bayes.options import MOST_PATIENTS, Aim
+from tactile_bayes.options import MOST_PATIENTS, Aim, SizeErrors
+from tactile_bayes.presets import INTERVAL
 from tactile_bayes.trial.accuracy import mape_figure, mape_percent, mape_ratio, sign_flip
 from tactile_bayes.trial.figures import MIN_PATIENTS, Ends, Intervals, Share, UndefinedError, clopper_pearson, figure
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
@@ -133,25 +134,14 @@ FLIPS = 999
 LEVEL = 0.05
 
 
-class PlanCase(Record):
+class PlanCase(SizeErrors, kw_only=True):
     """One design with assumed errors: all that its simulation depends on."""
 
     patients: int
     maps: int
     """`patients`, `maps`: Patients with one mass each, and tactile maps per mass."""
-    tactile_bias: float
-    mass_sd: float
-    map_sd: float
-    """`tactile_bias`, `mass_sd`, `map_sd`: Of ln(size / ex vivo): mean, SD shared by all maps of a mass, SD of single
-    maps."""
-    other_bias: float
-    other_sd: float
-    other_miss: float
-    """`other_bias`, `other_sd`, `other_miss`: The same for the modality compared with, read once, and its probability
-    of missing a mass."""
     trials: int
     seed: int
-    confidence: float = 0.95
 
     @property
     def key(self) -> str:
@@ -336,8 +326,8 @@ def _trial(case: PlanCase, number: int) -> tuple[float, ...]:
     tactile_sizes, other_sizes = _sizes("tactile", ex_vivo, maps), _sizes("other", ex_vivo, other)
     off = np.abs(maps / ex_vivo - 1) - np.abs(other / ex_vivo - 1)
     p = sign_flip(off, seed=number, flips=FLIPS)
-    error = mape_figure(tactile_sizes, confidence=Intervals(case.confidence, method="corrected"))
-    ratio = mape_ratio(other_sizes, tactile_sizes, confidence=case.confidence)
+    error = mape_figure(tactile_sizes, confidence=Intervals(INTERVAL, method="corrected"))
+    ratio = mape_ratio(other_sizes, tactile_sizes, confidence=INTERVAL)
     won = p is not None and p < LEVEL and float(off.sum()) < 0
     widths = (_width(error.interval), _width(ratio.interval))
     return won, mape_percent(tactile_sizes), mape_percent(other_sizes), *widths
