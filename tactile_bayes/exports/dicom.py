@@ -82,22 +82,16 @@ def add_study(dataset: Any, study: Study, source: exam.MapFile | None = None) ->
     """
     identity = study.identity
     dataset.SpecificCharacterSet = UTF_8
-    dataset.PatientName = identity.patient_name
-    dataset.PatientID = identity.patient_id
-    if identity.issuer:
-        dataset.IssuerOfPatientID = identity.issuer
+    keywords = {**exam.ATTRIBUTES, "study_description": "StudyDescription", "study_id": "StudyID"}
+    for name, keyword in keywords.items():
+        if (value := getattr(identity, name)) or name not in ("issuer", "study_description"):
+            setattr(dataset, keyword, value)
     dataset.PatientBirthDate = identity.birth_date.replace("-", "")
-    dataset.PatientSex = identity.sex
     dataset.StudyInstanceUID = study.study_uid
     dataset.StudyDate, dataset.StudyTime = study.moment.date, study.moment.time
     dataset.ContentDate, dataset.ContentTime = study.content.date, study.content.time
     if study.moment.zone:
         dataset.TimezoneOffsetFromUTC = study.moment.zone
-    dataset.AccessionNumber = identity.accession
-    dataset.StudyID = identity.study_id
-    dataset.ReferringPhysicianName = identity.referring_physician
-    if identity.study_description:
-        dataset.StudyDescription = identity.study_description
     dataset.Manufacturer = MANUFACTURER
     dataset.ManufacturerModelName = MODEL
     dataset.DeviceSerialNumber = NO_SERIAL_NUMBER

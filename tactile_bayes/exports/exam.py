@@ -413,7 +413,7 @@ _ONE_ITEM: Final = (
 )
 _MOST_BYTES: Final = 10**6
 # What a worklist item says, by the attributes of DICOM; scheduled dates are no dates of an exam.
-_ATTRIBUTES: Final = {
+ATTRIBUTES: Final = {
     "patient_id": "PatientID",
     "patient_name": "PatientName",
     "sex": "PatientSex",
@@ -493,7 +493,7 @@ def _check_letters(item: Any, known: Collection[str], path: Path) -> None:
     names = [declared] if isinstance(declared, str) else list(declared or [])
     if names and all(name in known for name in names):
         return
-    for keyword in (*_ATTRIBUTES.values(), "PatientBirthDate"):
+    for keyword in (*ATTRIBUTES.values(), "PatientBirthDate"):
         value = getattr(item.get_item(keyword), "value", b"")
         if isinstance(value, bytes) and not value.isascii():
             byte = next(one for one in value if one > 127)
@@ -505,7 +505,7 @@ def _check_letters(item: Any, known: Collection[str], path: Path) -> None:
 
 def _of_dicom(dataset: Any, path: Path) -> Identity:
     with _decoding(path, "holds what cannot be read"):
-        found = {name: str(dataset.get(keyword) or "").strip() for name, keyword in _ATTRIBUTES.items()}
+        found = {name: str(dataset.get(keyword) or "").strip() for name, keyword in ATTRIBUTES.items()}
         birth = str(dataset.get("PatientBirthDate") or "").strip()
     if birth:
         found["birth_date"] = f"{birth[:4]}-{birth[4:6]}-{birth[6:]}" if len(birth) == 8 else birth
