@@ -19,7 +19,6 @@ from tactile_bayes.report import trial as trial_words
 from tactile_bayes.report.compare import Growth
 from tactile_bayes.report.figure_file import FORMATS, figure_file, finish, plain_matplotlib
 from tactile_bayes.report.pages import page
-from tactile_bayes.report.trial import number, shown
 from tactile_bayes.trial.calibration import BINS, Calibration, Prediction, prediction_of
 from tactile_bayes.trial.figures import Figures
 from tactile_bayes.trial.method_comparison import MethodComparison
@@ -191,17 +190,14 @@ def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence
 
     `growth` is of masses with several visits, beside the trial. The template puts figures into words by `report.trial`.
     """
-    methods = [one.method_comparison for one in report.modalities.values()]
     return page(
         "trial",
         title="Sizes against excision",
         report=report,
         trial=trial,
         say=trial_words,
-        percent=f"{100 * report.interval_probability:g} %",
         masses=_masses(trial),
         sizes_svg=sizes_figure(report, trial),
-        error_ratio=f"{methods[0].error_ratio if methods else 1.0:g}",
         differences_svg=differences_figure(report, trial),
         calibrations=list(_calibrations(report, trial)),
         growth=growth,
@@ -242,14 +238,14 @@ def _calibrations(report: TrialReport, trial: Trial) -> Iterator[tuple[str, Cali
 
 def _cells(figures: Figures, wanted: Mapping[str, tuple[str, str]]) -> list[str]:
     """Figures with their intervals, by what is `wanted`: head and format of each by name."""
-    return [shown(figures.figure(key), spec) for key, (_, spec) in wanted.items()]
+    return [trial_words.shown(figures.figure(key), spec) for key, (_, spec) in wanted.items()]
 
 
 def _of_variances(report: ModalityReport) -> list[str]:
     """SDs of masses, readers and maps, percent."""
     parts = report.replicates.variance_components
     variances = (None, None, None) if parts is None else (parts.mass, parts.reader, parts.map)
-    return [number(None if one is None else 100 * one**0.5, ".0f") for one in variances]
+    return [trial_words.number(None if one is None else 100 * one**0.5, ".0f") for one in variances]
 
 
 def _middles(one: NextOfModality, names: Iterable[str]) -> list[str]:
