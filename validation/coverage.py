@@ -63,7 +63,7 @@ def _masses(seed: int) -> ModalitySizes:
 
 def _share(masses: ModalitySizes, model: ErrorModel, method: str, given: argparse.Namespace) -> str:
     chosen = Intervals(0.95, method=method, resamples=1000)  # type: ignore[arg-type]
-    check = check_intervals(masses, model, confidence=chosen, trials=given.trials, seed=given.seed)
+    check = check_intervals(masses, model, intervals=chosen, trials=given.trials, seed=given.seed)
     assert check is not None
     missing = f", {check.undefined} none" if check.undefined else ""
     return f"{check.share:.3f} [{check.share_interval[0]:.3f}, {check.share_interval[1]:.3f}]{missing}"
@@ -77,7 +77,7 @@ def _ratio_share(masses: ModalitySizes, model: ErrorModel, method: str, given: a
     for _ in range(given.trials):
         one = simulate(masses.patient, masses.ex_vivo_mm, tactile, rng=rng)
         other = simulate(masses.patient, masses.ex_vivo_mm, model, rng=rng, name="other")
-        ends = mape_ratio(other, one, confidence=chosen).interval
+        ends = mape_ratio(other, one, intervals=chosen).interval
         if ends is not None:
             hits.append(math.log(ends[0]) <= truth <= math.log(ends[1]))
     return share(hits)

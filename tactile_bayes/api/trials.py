@@ -138,16 +138,16 @@ def analyse(
     trial: Trial, settings: TrialSettings, *, protocol: Path | None = None, title: str | None = None
 ) -> TrialResult:
     """Analyse a trial; `protocol` and `title` are of the pre-specified analysis, where there is one."""
-    confidence = Intervals(INTERVAL, method=settings.intervals, resamples=settings.resamples, seed=settings.seed)
+    intervals = Intervals(INTERVAL, method=settings.intervals, resamples=settings.resamples, seed=settings.seed)
     kept = {name: value for name, value in as_dict(settings).items() if name != "seed"}
     inputs = hash_inputs(**trial.files, protocol=protocol)
     made = Provenance("validate", {"interval_probability": INTERVAL, **kept}, inputs, seed=settings.seed)
     report = summarise(
-        trial, confidence=confidence, error_ratio=settings.error_ratio, seed=settings.seed, provenance=made.as_dict()
+        trial, intervals=intervals, error_ratio=settings.error_ratio, seed=settings.seed, provenance=made.as_dict()
     )
     more: dict[str, Any] = {} if title is None else {"title": title}
     if trials := settings.check_intervals:
-        more["interval_check"] = check_all(trial.sizes(), confidence=confidence, trials=trials, seed=settings.seed)
+        more["interval_check"] = check_all(trial.sizes(), intervals=intervals, trials=trials, seed=settings.seed)
     if settings.bayes:
         rng = np.random.default_rng(settings.seed)
         more["next_mass"] = next_mass(trial, sample=draw, rng=rng, probability=INTERVAL)

@@ -17,6 +17,7 @@ from tactile_bayes.trial.figures import (
     Ends,
     Figure,
     Figures,
+    Intervals,
     NotNegative,
     Reasons,
     Sample,
@@ -27,7 +28,6 @@ from tactile_bayes.trial.figures import (
     effective_number,
     fields_of,
     figure,
-    method_of,
     ratio,
     resampled,
 )
@@ -39,10 +39,10 @@ from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 FEW_MISSES = 3  #: Up to so many misses, each moves the mean error by more than an uncorrected interval allows for.
 
 
-def cautions(sizes: ModalitySizes, *, confidence: float) -> tuple[str, ...]:
+def cautions(sizes: ModalitySizes, *, intervals: Intervals) -> tuple[str, ...]:
     """Cautions about this modality's intervals; docs/coverage.md has the measured shares."""
     missed = len(sizes.size_mm) - int(sizes.detected.sum())
-    if not 0 < missed <= FEW_MISSES or method_of(confidence) == "corrected":
+    if not 0 < missed <= FEW_MISSES or intervals.method == "corrected":
         return ()
     return (
         f"only {missed} of {len(sizes.size_mm)} masses missed: intervals of MAPE hold less often than they say; "
@@ -62,7 +62,7 @@ def figure_with_misses(
     sizes: ModalitySizes,
     *,
     scale: Scale,
-    confidence: float,
+    intervals: Intervals,
     power: int,
     missed: Callable[[ModalitySizes], float],
 ) -> Figure:
@@ -80,15 +80,15 @@ def figure_with_misses(
     def weight(of: ModalitySizes) -> FloatArray:
         return np.asarray((of.ex_vivo_mm / of.ex_vivo_mm.max()) ** power)
 
-    plain = figure(statistic, sizes, scale=scale, confidence=confidence, leverage=weight)
-    if method_of(confidence) != "corrected" or plain.value is None:
+    plain = figure(statistic, sizes, scale=scale, intervals=intervals, leverage=weight)
+    if intervals.method != "corrected" or plain.value is None:
         return plain
-    found = figure(statistic, sizes.only_detected(), scale=scale, confidence=confidence, leverage=weight)
+    found = figure(statistic, sizes.only_detected(), scale=scale, intervals=intervals, leverage=weight)
     if found.value is None or found.interval is None:
         return plain
     weights = weight(sizes)
     share = float(weights[~sizes.detected].sum() / weights.sum())
-    low, high = share_interval(share, effective_number(weights, sizes.patient), confidence=float(confidence))
+    low, high = share_interval(share, effective_number(weights, sizes.patient), confidence=intervals.probability)
     step = missed(sizes) - found.value
     by_share = sorted((step * (low - share), step * (high - share)))
     by_found = ((1 - share) * (end - found.value) for end in found.interval)
@@ -108,26 +108,26 @@ def share_interval(share: float, number: float, *, confidence: float) -> Ends:
 # --- Accuracy against excision: percent and mm errors, and bias.
 
 
-def accuracy_figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
+def accuracy_figures(sizes: ModalitySizes, *, intervals: Intervals) -> dict[str, Figure]:
     """Accuracy of one modality: `mape_percent`, `mae_mm` (a mass not found counts as size 0), the same over detected
     masses only, weighted and median percent errors, and `bias_percent` (detected only: 0 has no logarithm)."""
     found = sizes.only_detected()
-    bias = figure(geometric_ratio, found, scale="log", confidence=confidence)
-    on_log = partial(figure_with_misses, scale="log", confidence=confidence)
+    bias = figure(geometric_ratio, found, scale="log", intervals=intervals)
+    on_log = partial(figure_with_misses, scale="log", intervals=intervals)
     return {
-        "mape_percent": mape_figure(sizes, confidence=confidence),
-        "mape_detected_percent": figure(mape_percent, found, scale="log", confidence=confidence),
+        "mape_percent": mape_figure(sizes, intervals=intervals),
+        "mape_detected_percent": figure(mape_percent, found, scale="log", intervals=intervals),
         "mae_mm": on_log(mae_mm, sizes, power=0, missed=lambda one: float(one.ex_vivo_mm.mean())),
-        "mae_detected_mm": figure(mae_mm, found, scale="log", confidence=confidence),
+        "mae_detected_mm": figure(mae_mm, found, scale="log", intervals=intervals),
         "weighted_mape_percent": on_log(weighted_mape_percent, sizes, power=1, missed=lambda _: 100.0),
         "median_error_percent": figure(median_percent, sizes),
         "bias_percent": bias.mapped(lambda ratio: 100 * (ratio - 1)),
     }
 
 
-def mape_figure(sizes: ModalitySizes, *, confidence: float) -> Figure:
+def mape_figure(sizes: ModalitySizes, *, intervals: Intervals) -> Figure:
     """Percent error with its interval; a mass not found counts as 100 %."""
-    return figure_with_misses(mape_percent, sizes, scale="log", confidence=confidence, power=0, missed=lambda _: 100.0)
+    return figure_with_misses(mape_percent, sizes, scale="log", intervals=intervals, power=0, missed=lambda _: 100.0)
 
 
 def _mm_errors(sizes: ModalitySizes) -> FloatArray:
@@ -180,12 +180,12 @@ def some(values: FloatArray) -> FloatArray:
 # of Fig. 10), so the centred one leads. The regression is of sizes y on ex-vivo sizes e.
 
 
-def origin_line_figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
+def origin_line_figures(sizes: ModalitySizes, *, intervals: Intervals) -> dict[str, Figure]:
     """Slope and r squared with missed masses at size 0 (the paper's convention), then over detected masses only."""
     result: dict[str, Figure] = {}
     for suffix, subset in (("", sizes), ("_detected", sizes.only_detected())):
         result[f"slope_through_origin{suffix}"] = figure_with_misses(
-            slope, subset, scale="linear", confidence=confidence, power=2, missed=lambda _: 0.0
+            slope, subset, scale="linear", intervals=intervals, power=2, missed=lambda _: 0.0
         )
         result |= {f"{name}{suffix}": figure(statistic, subset) for name, statistic in CORRELATIONS.items()}
     return result
@@ -265,7 +265,7 @@ class ModalityRatio(Figures):
     reasons: Reasons
 
 
-def mape_ratios(sizes: Mapping[str, ModalitySizes], *, confidence: float) -> dict[str, ModalityRatio]:
+def mape_ratios(sizes: Mapping[str, ModalitySizes], *, intervals: Intervals) -> dict[str, ModalityRatio]:
     """Ratio of every other modality to the tactile one; empty without a tactile one."""
     reference = sizes.get(REFERENCE)
     if reference is None:
@@ -276,8 +276,8 @@ def mape_ratios(sizes: Mapping[str, ModalitySizes], *, confidence: float) -> dic
             looked_for = on_common_masses(one, reference)
             found = on_common_masses(one.only_detected(), reference.only_detected())
             figures = {
-                "ratio": mape_ratio(*looked_for, confidence=confidence),
-                "ratio_detected": mape_ratio(*found, confidence=confidence),
+                "ratio": mape_ratio(*looked_for, intervals=intervals),
+                "ratio_detected": mape_ratio(*found, intervals=intervals),
             }
             n, both = len(looked_for[0].size_mm), len(found[0].size_mm)
             ratios[name] = ModalityRatio(masses=n, masses_detected=both, **fields_of(figures))
@@ -290,12 +290,12 @@ def on_common_masses(one: ModalitySizes, other: ModalitySizes) -> tuple[Modality
     return one.take(of_one), other.take(of_other)
 
 
-def mape_ratio(sizes: ModalitySizes, reference: ModalitySizes, *, confidence: float) -> Figure:
+def mape_ratio(sizes: ModalitySizes, reference: ModalitySizes, *, intervals: Intervals) -> Figure:
     """Quotient of two percent errors.
 
     The interval leaves each patient out of both at once, so that patients hard for both do not widen it.
     """
-    return resampled(_pair(sizes, reference, ratio), scale="log", confidence=confidence)
+    return resampled(_pair(sizes, reference, ratio), scale="log", intervals=intervals)
 
 
 def _pair(sizes: ModalitySizes, reference: ModalitySizes, combine: Callable[..., FloatArray]) -> Sample:
@@ -329,11 +329,11 @@ class PairedComparison(Figures):
 
 
 def paired_comparisons(
-    sizes: Mapping[str, ModalitySizes], *, confidence: float, seed: int = 0
+    sizes: Mapping[str, ModalitySizes], *, intervals: Intervals, seed: int = 0
 ) -> list[PairedComparison]:
     """Compare every pair of modalities on their common masses, with Holm's correction of p values."""
     pairs = [
-        _compare(sizes[one], sizes[other], confidence=confidence, seed=seed) for one, other in combinations(sizes, 2)
+        _compare(sizes[one], sizes[other], intervals=intervals, seed=seed) for one, other in combinations(sizes, 2)
     ]
     corrected = holm([pair.p_value for pair in pairs])
     return [replace(pair, p_holm=p) for pair, p in zip(pairs, corrected, strict=True)]
@@ -380,10 +380,10 @@ def sign_flip(by_patient: FloatArray, *, seed: int, flips: int = FLIPS) -> float
     return beyond / (flips + 1)
 
 
-def _compare(one: ModalitySizes, other: ModalitySizes, *, confidence: float, seed: int) -> PairedComparison:
+def _compare(one: ModalitySizes, other: ModalitySizes, *, intervals: Intervals, seed: int) -> PairedComparison:
     first, second = on_common_masses(one, other)
-    difference = resampled(_pair(first, second, np.subtract), scale="linear", confidence=confidence)
-    quotient = resampled(_pair(first, second, ratio), scale="log", confidence=confidence)
+    difference = resampled(_pair(first, second, np.subtract), scale="linear", intervals=intervals)
+    quotient = resampled(_pair(first, second, ratio), scale="log", intervals=intervals)
     patients = first.patients
     with np.errstate(all="ignore"):
         off = np.abs(first.size_mm / first.ex_vivo_mm - 1) - np.abs(second.size_mm / second.ex_vivo_mm - 1)

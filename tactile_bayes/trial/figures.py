@@ -174,34 +174,23 @@ def clopper_pearson(k: float, n: float, *, confidence: float) -> tuple[float, fl
 
 # --- Bootstrap intervals over patients (BCa), keeping a patient's masses together.
 
-RESAMPLES = 2000
-SEED = 1999
 _LEAST_DEFINED = 0.99  #: Of the redrawn trials, at least this share must have the figure at all.
 
 
-class Intervals(float):
-    """Probability of intervals together with their method; a plain number means the jackknife.
+class Intervals(Record):
+    """How the intervals of figures are made: their probability and their method.
 
     ``corrected`` is the jackknife with the corrections of record 0077; ``bca`` draws the patients `resamples` times
     from this seed.
     """
 
-    method: IntervalMethod
-    resamples: int
-    seed: int
-
-    def __new__(
-        cls, confidence: float, *, method: IntervalMethod = "jackknife", resamples: int = RESAMPLES, seed: int = SEED
-    ) -> Intervals:
-        """A float with three more attributes."""
-        made = super().__new__(cls, confidence)
-        made.method, made.resamples, made.seed = method, resamples, seed
-        return made
+    probability: float = 0.95
+    method: IntervalMethod = "jackknife"
+    resamples: int = 2000
+    seed: int = 1999
 
 
-def method_of(confidence: float) -> IntervalMethod:
-    """IntervalMethod of the intervals of a probability."""
-    return confidence.method if isinstance(confidence, Intervals) else "jackknife"
+JACKKNIFE = Intervals()
 
 
 @lru_cache(maxsize=8)
@@ -306,24 +295,24 @@ def figure(
     sizes: ModalitySizes,
     *,
     scale: Scale | None = None,
-    confidence: float | None = None,
+    intervals: Intervals | None = None,
     leverage: Callable[[ModalitySizes], FloatArray] | None = None,
 ) -> Figure:
-    """Compute a statistic of these masses, with an interval over patients when `scale` and `confidence` are given.
+    """Compute a statistic of these masses, with an interval over patients when `scale` and `intervals` are given.
 
     `leverage` gives the (n,) weight of each mass in the variance of the figure: the corrected jackknife takes the
     effective number of patients by these weights as its degrees of freedom (Bell & McCaffrey 2002, Survey Methodology
     28, 169).
     """
-    if scale is None or confidence is None:
+    if scale is None or intervals is None:
         try:
             return Figure(finite(statistic, sizes))
         except UndefinedError as undefined:
             return Figure(None, str(undefined))
     freedom = None
-    if leverage is not None and method_of(confidence) == "corrected" and len(sizes.size_mm):
+    if leverage is not None and intervals.method == "corrected" and len(sizes.size_mm):
         freedom = effective_number(leverage(sizes), sizes.patient)
-    return resampled(Sample(statistic, (sizes,)), scale=scale, confidence=confidence, freedom=freedom)
+    return resampled(Sample(statistic, (sizes,)), scale=scale, intervals=intervals, freedom=freedom)
 
 
 class Sample(Record):
@@ -378,15 +367,15 @@ class Sample(Record):
         return values
 
 
-def resampled(sample: Sample, *, scale: Scale, confidence: float, freedom: float | None = None) -> Figure:
+def resampled(sample: Sample, *, scale: Scale, intervals: Intervals, freedom: float | None = None) -> Figure:
     """Compute a figure with its interval over patients; `freedom` as in `interval_from_values`."""
     value: float | None = None
     try:
         value, patients = sample.value(), len(sample.patients)
         need_patients(patients)
-        left_out, level = sample.left_out(), float(confidence)
-        if isinstance(confidence, Intervals) and confidence.method == "bca":
-            draws = draw_patients(patients, resamples=confidence.resamples, seed=confidence.seed)
+        left_out, level = sample.left_out(), intervals.probability
+        if intervals.method == "bca":
+            draws = draw_patients(patients, resamples=intervals.resamples, seed=intervals.seed)
             interval = bca_interval(value, sample.redrawn(draws), left_out, confidence=level)
         else:
             interval = interval_from_values(value, left_out, scale=scale, confidence=level, freedom=freedom)

@@ -17,6 +17,7 @@ from tactile_bayes.trial.figures import (
     Ends,
     Figure,
     Figures,
+    Intervals,
     Reasons,
     Sample,
     Scale,
@@ -28,7 +29,6 @@ from tactile_bayes.trial.figures import (
     figure,
     interval_from_values,
     kurtosis_freedom,
-    method_of,
     on_scale,
     ratio,
 )
@@ -243,26 +243,26 @@ def _recovered(parts: Sequence[tuple[float, int]], total: float, *, bias_varianc
 _ONE = "one mass has no spread"
 
 
-def limit_figures(found: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
+def limit_figures(found: ModalitySizes, *, intervals: Intervals) -> dict[str, Figure]:
     """Lower and upper limit in mm and as the logarithm of the ratio, for single readings of detected masses."""
     return {
-        f"limit_{side}_{unit}": _limit(terms, sign, found, confidence=confidence)
+        f"limit_{side}_{unit}": _limit(terms, sign, found, intervals=intervals)
         for unit, terms in (("mm", partial(_limit_terms, np.asarray)), ("log_ratio", partial(_limit_terms, np.log)))
         for side, sign in (("low", -1), ("high", 1))
     }
 
 
 def _limit(
-    terms: Callable[[ModalitySizes], FloatArray], sign: int, found: ModalitySizes, *, confidence: float
+    terms: Callable[[ModalitySizes], FloatArray], sign: int, found: ModalitySizes, *, intervals: Intervals
 ) -> Figure:
     """A limit; its corrected interval is from those of the mean and, on the log scale, of the SD (Zou 2013)."""
     end = SumStatistic(terms, lambda sums: _limit_mean(sums) + sign * _REACH * _limit_sd(sums), _ONE)
-    plain = figure(end, found, scale="linear", confidence=confidence)
-    if method_of(confidence) != "corrected" or plain.interval is None:
+    plain = figure(end, found, scale="linear", intervals=intervals)
+    if intervals.method != "corrected" or plain.interval is None:
         return plain
     try:
-        mean, around = _jackknifed(SumStatistic(terms, _limit_mean, _ONE), found, scale="linear", confidence=confidence)
-        sd, about = _jackknifed(SumStatistic(terms, _limit_sd, _ONE), found, scale="log", confidence=confidence)
+        mean, around = _jackknifed(SumStatistic(terms, _limit_mean, _ONE), found, scale="linear", intervals=intervals)
+        sd, about = _jackknifed(SumStatistic(terms, _limit_sd, _ONE), found, scale="log", intervals=intervals)
     except UndefinedError as undefined:
         return replace(plain, interval=None, interval_reason=str(undefined))
     limit = mean + sign * _REACH * sd
@@ -272,13 +272,13 @@ def _limit(
 
 
 def _jackknifed(
-    statistic: SumStatistic, found: ModalitySizes, *, scale: Scale, confidence: float
+    statistic: SumStatistic, found: ModalitySizes, *, scale: Scale, intervals: Intervals
 ) -> tuple[float, Ends]:
     """Value with its jackknife interval, and the degrees of freedom of its leave-one-out values."""
     sample = Sample(statistic, (found,))
     value, left = sample.value(), sample.left_out()
     freedom = kurtosis_freedom(on_scale(left, scale))
-    return value, interval_from_values(value, left, scale=scale, confidence=float(confidence), freedom=freedom)
+    return value, interval_from_values(value, left, scale=scale, confidence=intervals.probability, freedom=freedom)
 
 
 def _limit_terms(scale: Callable[[FloatArray], FloatArray], sizes: ModalitySizes) -> FloatArray:
@@ -374,18 +374,18 @@ class MethodComparison(Figures, kw_only=True):
     """Errors are likelier proportional to size than constant: limits in mm suit no one size."""
 
 
-def compare_methods(sizes: ModalitySizes, *, confidence: float, error_ratio: float = 1.0) -> MethodComparison:
+def compare_methods(sizes: ModalitySizes, *, intervals: Intervals, error_ratio: float = 1.0) -> MethodComparison:
     """Compare one modality's detected sizes with excision."""
     found = sizes.only_detected()
     x, y = found.ex_vivo_mm, found.size_mm
-    robust = _fitted(partial(lines.passing_bablok, confidence=float(confidence)))
-    slope: Scale = "slope" if method_of(confidence) == "corrected" else "linear"
+    robust = _fitted(partial(lines.passing_bablok, confidence=intervals.probability))
+    slope: Scale = "slope" if intervals.method == "corrected" else "linear"
     figures: dict[str, Figure] = {}
     for name, statistic, scale in _statistics(error_ratio, robust, slope):
         wanted = scale if isinstance(statistic, SumStatistic) or len(x) <= MOST_REFITTED else None
-        figures[name] = figure(statistic, found, scale=wanted, confidence=confidence, leverage=_squared_distance)
-    figures |= limit_figures(found, confidence=confidence)
-    judged, level = len(x) >= 2 and _squarable(x, y), float(confidence)
+        figures[name] = figure(statistic, found, scale=wanted, intervals=intervals, leverage=_squared_distance)
+    figures |= limit_figures(found, intervals=intervals)
+    judged, level = len(x) >= 2 and _squarable(x, y), intervals.probability
     return MethodComparison(
         masses=len(x),
         error_ratio=error_ratio,

@@ -83,9 +83,9 @@ def simulate(
 
 
 def check_intervals(
-    sizes: ModalitySizes, model: ErrorModel, *, confidence: float, trials: int, seed: int
+    sizes: ModalitySizes, model: ErrorModel, *, intervals: Intervals, trials: int, seed: int
 ) -> IntervalCheck | None:
-    """Count how often intervals of the percent error, by the method in `confidence`, cover the true one.
+    """Count how often intervals of the percent error, by their method, cover the true one.
 
     Patients and ex-vivo sizes stay as they are; `observed_errors` gives the model of a trial. None below `MIN_PATIENTS`
     patients, where no intervals are given.
@@ -94,7 +94,7 @@ def check_intervals(
         return None
     truth, rng = model.true_mape_percent, np.random.default_rng([seed, len(sizes.size_mm)])
     made = (simulate(sizes.patient, sizes.ex_vivo_mm, model, rng=rng) for _ in range(trials))
-    ends = np.array([mape_figure(one, confidence=confidence).interval or (math.nan, math.nan) for one in made])
+    ends = np.array([mape_figure(one, intervals=intervals).interval or (math.nan, math.nan) for one in made])
     defined = ends[np.isfinite(ends[:, 0])]
     if len(defined) == 0:
         return None
@@ -115,11 +115,11 @@ def check_intervals(
 
 
 def check_all(
-    sizes: Mapping[str, ModalitySizes], *, confidence: float, trials: int, seed: int
+    sizes: Mapping[str, ModalitySizes], *, intervals: Intervals, trials: int, seed: int
 ) -> dict[str, IntervalCheck]:
     """Run `check_intervals` for every modality with errors to simulate."""
     checks = {
-        name: check_intervals(one, model, confidence=confidence, trials=trials, seed=seed)
+        name: check_intervals(one, model, intervals=intervals, trials=trials, seed=seed)
         for name, one in sizes.items()
         if (model := observed_errors(one)) is not None
     }
@@ -326,8 +326,8 @@ def _trial(case: PlanCase, number: int) -> tuple[float, ...]:
     tactile_sizes, other_sizes = _sizes("tactile", ex_vivo, maps), _sizes("other", ex_vivo, other)
     off = np.abs(maps / ex_vivo - 1) - np.abs(other / ex_vivo - 1)
     p = sign_flip(off, seed=number, flips=FLIPS)
-    error = mape_figure(tactile_sizes, confidence=Intervals(INTERVAL, method="corrected"))
-    ratio = mape_ratio(other_sizes, tactile_sizes, confidence=INTERVAL)
+    error = mape_figure(tactile_sizes, intervals=Intervals(INTERVAL, method="corrected"))
+    ratio = mape_ratio(other_sizes, tactile_sizes, intervals=Intervals(INTERVAL))
     won = p is not None and p < LEVEL and float(off.sum()) < 0
     widths = (_width(error.interval), _width(ratio.interval))
     return won, mape_percent(tactile_sizes), mape_percent(other_sizes), *widths

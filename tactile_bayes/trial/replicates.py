@@ -14,6 +14,7 @@ from tactile_bayes.trial.figures import (
     Ends,
     Figure,
     Figures,
+    Intervals,
     Reasons,
     SumStatistic,
     UndefinedError,
@@ -167,16 +168,14 @@ def _downhill(
 # --- Spread of replicates of one mass.
 
 
-def spread_figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
+def spread_figures(sizes: ModalitySizes, *, intervals: Intervals) -> dict[str, Figure]:
     """Within-mass standard deviation in mm and in percent of the mass's mean, over masses with two or more replicates.
 
     Without a suffix: the mean of the standard deviations, as the paper prints (15 %, 2.6 mm). With ``_rms``: the root
     of the mean variance, which is not low for few replicates as a mean of standard deviations is.
     """
     replicated = sizes.only_replicated()
-    return {
-        name: figure(statistic, replicated, scale="log", confidence=confidence) for name, statistic in SPREAD.items()
-    }
+    return {name: figure(statistic, replicated, scale="log", intervals=intervals) for name, statistic in SPREAD.items()}
 
 
 def _terms(sizes: ModalitySizes) -> FloatArray:
@@ -220,19 +219,19 @@ SPREAD = {
 _PAIR = 1.959963984540054 * math.sqrt(2)
 
 
-def replicate_figures(sizes: ModalitySizes, *, confidence: float) -> dict[str, Figure]:
+def replicate_figures(sizes: ModalitySizes, *, intervals: Intervals) -> dict[str, Figure]:
     """Figures of replicates in log size, over masses with two or more.
 
     `repeatability_low_percent` and `repeatability_high_percent` bound the change between two readings of one mass in
     95 % of pairs; they are not symmetric, for +50 % and -33 % are the same step up and down.
     """
     replicated = sizes.only_replicated()
-    log_sd = figure(log_sd_within, replicated, scale="log", confidence=confidence)
+    log_sd = figure(log_sd_within, replicated, scale="log", intervals=intervals)
     return {
         "within_mass_log_sd": log_sd,
         "repeatability_low_percent": log_sd.mapped(lambda sd: 100 * math.expm1(-_PAIR * sd)),
         "repeatability_high_percent": log_sd.mapped(lambda sd: 100 * math.expm1(_PAIR * sd)),
-        "icc": figure(icc, replicated, scale="fisher", confidence=confidence),
+        "icc": figure(icc, replicated, scale="fisher", intervals=intervals),
     }
 
 

@@ -12,11 +12,12 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.trial import accuracy
 from tactile_bayes.trial.calibration import Calibration, Coverage, calibration, coverage, prediction_of
 from tactile_bayes.trial.figures import (
-    SEED,
+    JACKKNIFE,
     Count,
     Ends,
     Figure,
     Figures,
+    Intervals,
     NotNegative,
     Reasons,
     Share,
@@ -162,20 +163,20 @@ class TrialReport(Record, kw_only=True):
 def summarise(
     trial: Trial,
     *,
-    confidence: float = 0.95,
+    intervals: Intervals = JACKKNIFE,
     error_ratio: float = 1.0,
-    seed: int = SEED,
+    seed: int = 1999,
     provenance: Mapping[str, Any] | None = None,
 ) -> TrialReport:
     """Compare each modality's sizes with excision.
 
-    `confidence` may be `Intervals`, to choose how the intervals are made; `error_ratio` is the variance of the error of
-    ex-vivo sizes over that of a modality's, for the Deming lines; `seed` is of the sign flips.
+    `error_ratio` is the variance of the error of ex-vivo sizes over that of a modality's, for the Deming lines; `seed`
+    is of the sign flips.
     """
     readings, ex_vivo_mm, sizes = trial.readings, trial.ex_vivo_mm, trial.sizes()
     return TrialReport(
         schema="tactile-bayes/validate/1",
-        interval_probability=float(confidence),
+        interval_probability=intervals.probability,
         counts=Counts(
             patients=len({patient for patient, _ in ex_vivo_mm}),
             masses=len(ex_vivo_mm),
@@ -187,11 +188,11 @@ def summarise(
             readings_after_excision=trial.other_visits.later,
         ),
         modalities={
-            name: modality_report(one, trial, confidence=confidence, error_ratio=error_ratio)
+            name: modality_report(one, trial, intervals=intervals, error_ratio=error_ratio)
             for name, one in sizes.items()
         },
-        mape_ratio_to_tactile=accuracy.mape_ratios(sizes, confidence=confidence),
-        paired_comparisons=tuple(accuracy.paired_comparisons(sizes, confidence=confidence, seed=seed)),
+        mape_ratio_to_tactile=accuracy.mape_ratios(sizes, intervals=intervals),
+        paired_comparisons=tuple(accuracy.paired_comparisons(sizes, intervals=intervals, seed=seed)),
         doubts=tuple(unit_doubts(sizes, np.array(list(ex_vivo_mm.values()), dtype=np.float64))),
         conventions=CONVENTIONS,
         provenance=dict(provenance or {}),
@@ -200,17 +201,17 @@ def summarise(
 
 
 def modality_report(
-    sizes: ModalitySizes, trial: Trial, *, confidence: float, error_ratio: float = 1.0
+    sizes: ModalitySizes, trial: Trial, *, intervals: Intervals, error_ratio: float = 1.0
 ) -> ModalityReport:
     """Report one modality: counts, all figures, coverage."""
     found, prediction = trial.found(sizes.name), prediction_of(trial, sizes.name)
-    fields = fields_of({name: one for family in FAMILIES for name, one in family(sizes, confidence=confidence).items()})
+    fields = fields_of({name: one for family in FAMILIES for name, one in family(sizes, intervals=intervals).items()})
     if prediction is None:
         fields["reasons"]["calibration"] = "no reading states an interval or a standard deviation"
     share, n = None, len(sizes.size_mm)
     if n:  # for the effective number of patients: masses of one are no new trials
         number = effective_number(np.ones(n), sizes.patient)
-        share = clopper_pearson(float(sizes.detected.mean()) * number, number, confidence=float(confidence))
+        share = clopper_pearson(float(sizes.detected.mean()) * number, number, confidence=intervals.probability)
     return ModalityReport(
         n=n,
         detected=int(sizes.detected.sum()),
@@ -221,12 +222,12 @@ def modality_report(
         masses_not_done=sizes.masses_not_done,
         masses_without_reading=sizes.masses_without_reading,
         **fields,
-        coverage=coverage(found, trial.ex_vivo_mm, confidence=float(confidence)),
-        method_comparison=compare_methods(sizes, confidence=confidence, error_ratio=error_ratio),
+        coverage=coverage(found, trial.ex_vivo_mm, confidence=intervals.probability),
+        method_comparison=compare_methods(sizes, intervals=intervals, error_ratio=error_ratio),
         replicates=ReplicateFigures(
-            **fields_of(replicate_figures(sizes, confidence=confidence)),
+            **fields_of(replicate_figures(sizes, intervals=intervals)),
             variance_components=reader_components(found),
         ),
-        calibration=None if prediction is None else calibration(prediction, confidence=float(confidence)),
-        cautions=accuracy.cautions(sizes, confidence=confidence),
+        calibration=None if prediction is None else calibration(prediction, confidence=intervals.probability),
+        cautions=accuracy.cautions(sizes, intervals=intervals),
     )

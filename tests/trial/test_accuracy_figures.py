@@ -15,7 +15,7 @@ from tactile_bayes.trial import accuracy
 from tactile_bayes.trial import accuracy as origin_line
 from tactile_bayes.trial import replicates as spread
 from tactile_bayes.trial.accuracy import mape_ratios, paired_comparisons
-from tactile_bayes.trial.figures import UndefinedError
+from tactile_bayes.trial.figures import JACKKNIFE, UndefinedError
 from tactile_bayes.trial.readings import ModalitySizes, Reading, Trial
 from tactile_bayes.trial.summary import FAMILIES, TrialReport, modality_report, summarise
 
@@ -65,12 +65,12 @@ def test_accuracy_by_hand() -> None:
     assert accuracy.mape_percent(case.only_detected()) == pytest.approx(40)
     assert accuracy.mae_mm(case) == pytest.approx(53 / 3)
     assert accuracy.mae_mm(case.only_detected()) == pytest.approx(6.5)
-    figures = accuracy.accuracy_figures(case, confidence=0.95)
+    figures = accuracy.accuracy_figures(case, intervals=JACKKNIFE)
     assert figures["bias_percent"].value == pytest.approx(100 * (math.sqrt(1.3 * 0.5) - 1))
 
 
 def test_bias_cancels_twice_with_half() -> None:
-    figures = accuracy.accuracy_figures(single([10, 10], [20, 5]), confidence=0.95)
+    figures = accuracy.accuracy_figures(single([10, 10], [20, 5]), intervals=JACKKNIFE)
     assert figures["bias_percent"].value == pytest.approx(0, abs=1e-12)
 
 
@@ -155,7 +155,7 @@ EXTREMES = {
 @pytest.mark.parametrize("name", EXTREMES)
 def test_extremes_have_defined_answers(name: str) -> None:
     (ex_vivo, size), expected = EXTREMES[name]
-    report = modality_report(single(ex_vivo, size), Trial([], {}), confidence=0.95)
+    report = modality_report(single(ex_vivo, size), Trial([], {}), intervals=JACKKNIFE)
     for key, value in expected.items():
         if value is None:
             assert report.figure(key).value is None
@@ -185,7 +185,7 @@ def test_a_modality_never_done_has_counts_and_reasons() -> None:
     cbe = report.modalities["cbe"]
     assert (cbe.n, cbe.detected, cbe.masses_not_done, cbe.masses_without_reading) == (0, 0, 1, 1)
     assert cbe.detected_interval is None
-    figures = {name for family in FAMILIES for name in family(single([], []), confidence=0.95)}
+    figures = {name for family in FAMILIES for name in family(single([], []), intervals=JACKKNIFE)}
     assert all(cbe.figure(name).value is None and cbe.figure(name).reason for name in figures)
     assert report.counts.masses_without_any_reading == 1
     assert dump_json(to_plain(report))
@@ -193,7 +193,7 @@ def test_a_modality_never_done_has_counts_and_reasons() -> None:
 
 def test_ratio_to_an_error_of_zero_is_undefined() -> None:
     perfect, off = single([5, 10], [5, 10]), single([5, 10], [6, 12], name="cbe")
-    ratio = mape_ratios({"tactile": perfect, "cbe": off}, confidence=0.95)["cbe"]
+    ratio = mape_ratios({"tactile": perfect, "cbe": off}, intervals=JACKKNIFE)["cbe"]
     assert ratio.ratio is None
     assert ratio.reasons["ratio"] == "the error of tactile is 0"
 
@@ -211,7 +211,7 @@ def test_ratio_to_an_error_of_one_patient_alone_says_whose() -> None:
     """Without that patient the error is 0, with all it is not."""
     ten = [10.0] * 9
     sizes = {"tactile": single(ten, [11.0] * 9), "cbe": single(ten, [*[10.0] * 8, 12.0], name="cbe")}
-    (pair,) = paired_comparisons(sizes, confidence=0.95)
+    (pair,) = paired_comparisons(sizes, intervals=JACKKNIFE)
     assert pair.reasons["ratio_interval"] == "the error of cbe is 0 without one patient"
 
 

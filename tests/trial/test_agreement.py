@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import integrate, optimize, stats
 
-from tactile_bayes.trial.figures import UndefinedError
+from tactile_bayes.trial.figures import JACKKNIFE, UndefinedError
 from tactile_bayes.trial.lines import concordance, least_squares
 from tactile_bayes.trial.method_comparison import content_factor, limits, limits_unlinked, percentile_factor, trend
 from tactile_bayes.trial.readings import ModalitySizes, Reading
@@ -192,7 +192,7 @@ def test_icc_as_shrout_and_fleiss_print_it() -> None:
 
 
 def test_repeatability_is_as_wide_up_as_down_in_ratio() -> None:
-    found = figures(masses(list(np.exp(RATINGS / 10))), confidence=0.95)
+    found = figures(masses(list(np.exp(RATINGS / 10))), intervals=JACKKNIFE)
     down, up = found["repeatability_low_percent"].value, found["repeatability_high_percent"].value
     assert (1 + down / 100) * (1 + up / 100) == pytest.approx(1)
     pooled = math.sqrt(np.mean(np.var(RATINGS / 10, axis=1, ddof=1)))
@@ -260,9 +260,9 @@ def test_readers_are_left_out_of_what_has_none() -> None:
 
 
 def test_one_replicate_leaves_repeatability_undefined() -> None:
-    found = figures(masses([[10.0], [12.0]]), confidence=0.95)
+    found = figures(masses([[10.0], [12.0]]), intervals=JACKKNIFE)
     assert all(one.value is None and "two detected replicates" in one.reason for one in found.values())
-    same = figures(masses([[10.0, 10.0], [12.0, 12.0]]), confidence=0.95)
+    same = figures(masses([[10.0, 10.0], [12.0, 12.0]]), intervals=JACKKNIFE)
     assert same["within_mass_log_sd"].value == 0
     assert same["icc"].value == pytest.approx(1)
     with pytest.raises(UndefinedError):

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from tactile_bayes.trial.accuracy import mape_figure, mape_ratios, share_interval
-from tactile_bayes.trial.figures import Intervals, effective_number, interval_from_values, kurtosis_freedom
+from tactile_bayes.trial.figures import JACKKNIFE, Intervals, effective_number, interval_from_values, kurtosis_freedom
 from tactile_bayes.trial.method_comparison import compare_methods, limit_figures, limits, limits_unlinked
 from tactile_bayes.trial.planning import ErrorModel, check_intervals
 from tactile_bayes.trial.readings import ModalitySizes, Reading, gather
@@ -33,23 +33,23 @@ def masses() -> ModalitySizes:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_intervals_of_mape_hold_with_rare_misses(seed: int) -> None:
     """400 trials; 3 binomial standard deviations below 0.95 is 0.917."""
-    check = check_intervals(masses(), SINGLE_MISS, confidence=CORRECTED, trials=400, seed=seed)
+    check = check_intervals(masses(), SINGLE_MISS, intervals=CORRECTED, trials=400, seed=seed)
     assert check is not None
     assert check.share >= 0.917
 
 
 def test_the_bootstrap_fails_the_same_check() -> None:
     bootstrap = Intervals(0.95, method="bca", resamples=300)
-    check = check_intervals(masses(), SINGLE_MISS, confidence=bootstrap, trials=400, seed=1)
+    check = check_intervals(masses(), SINGLE_MISS, intervals=bootstrap, trials=400, seed=1)
     assert check is not None
     assert check.share < 0.90
 
 
 def test_without_a_miss_the_interval_over_masses_found_stays() -> None:
     """The lower end is the jackknife's, the upper one allows for the misses that 25 masses cannot rule out."""
-    plain, found = masses(), mape_figure(masses(), confidence=CORRECTED)
+    plain, found = masses(), mape_figure(masses(), intervals=CORRECTED)
     assert found.interval is not None
-    jackknife = mape_figure(plain, confidence=0.95).interval
+    jackknife = mape_figure(plain, intervals=JACKKNIFE).interval
     assert jackknife is not None
     assert found.interval[0] == pytest.approx(jackknife[0])
     most = share_interval(0.0, effective_number(np.ones(25), plain.patient), confidence=0.95)[1]
@@ -90,7 +90,7 @@ def test_limits_over_patients_have_the_values_of_the_exact_ones() -> None:
     single = limits(plain.size_mm - plain.ex_vivo_mm)
     several = limits_unlinked([np.array([e]) for e in replicated.ex_vivo_mm], list(groups))
     for one, expected in ((plain, single), (replicated, several)):
-        found = limit_figures(one, confidence=CORRECTED)
+        found = limit_figures(one, intervals=CORRECTED)
         assert found["limit_low_mm"].value == pytest.approx(expected.low)
         assert found["limit_high_mm"].value == pytest.approx(expected.high)
 
@@ -102,7 +102,7 @@ def held(intervals: str, trials: int = 300) -> float:
     for _ in range(trials):
         one = trial(rng, patient, shared=0.16)
         ends = (
-            limit_figures(one, confidence=CORRECTED)["limit_high_log_ratio"].interval
+            limit_figures(one, intervals=CORRECTED)["limit_high_log_ratio"].interval
             if intervals == "patients"
             else limits(np.log(one.size_mm / one.ex_vivo_mm)).high_interval
         )
@@ -126,7 +126,7 @@ def slope_held(method: str, trials: int = 150) -> float:
     for _ in range(trials):
         one = trial(rng, np.arange(20), sd=0.4)
         chosen = Intervals(0.95, method=method)  # type: ignore[arg-type]
-        ends = compare_methods(one, confidence=chosen).ols_slope_interval
+        ends = compare_methods(one, intervals=chosen).ols_slope_interval
         if ends is not None:
             given += 1
             hits += ends[0] <= math.exp(0.02 + 0.4**2 / 2) <= ends[1]
@@ -147,7 +147,7 @@ def test_ratios_are_over_common_masses_only() -> None:
     tactile = [11.0, 11.0, 15.0, 15.0, 15.0, 15.0]
     readings = [Reading(key, "tactile", 1, "detected", size) for key, size in zip(ex_vivo, tactile, strict=True)]
     readings += [Reading(key, "ultrasound", 1, "detected", 11.0) for key in list(ex_vivo)[:2]]
-    found = mape_ratios(gather(readings, ex_vivo), confidence=0.95)["ultrasound"]
+    found = mape_ratios(gather(readings, ex_vivo), intervals=JACKKNIFE)["ultrasound"]
     assert found.masses == found.masses_detected == 2
     assert found.ratio == pytest.approx(1.0)
     assert found.ratio_detected == pytest.approx(1.0)

@@ -11,6 +11,7 @@ from tactile_bayes.trial.calibration import coverage
 from tactile_bayes.trial.figures import (
     MIN_PATIENTS,
     Figure,
+    Intervals,
     UndefinedError,
     clopper_pearson,
     figure,
@@ -82,7 +83,7 @@ def mape_covered(trials: int, *, shrink: float = 1.0, by_mass: bool = False, **s
         one = trial(rng, **shape)
         if by_mass:
             one = ModalitySizes("x", np.arange(len(one.patient)), one.ex_vivo_mm, one.size_mm, one.replicates_mm)
-        found = figure(accuracy.mape_percent, one, scale="log", confidence=NOMINAL)
+        found = figure(accuracy.mape_percent, one, scale="log", intervals=Intervals(NOMINAL))
         hits += _holds(found, truth, shrink=shrink)
     return hits / trials
 

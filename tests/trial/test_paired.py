@@ -14,6 +14,7 @@ from tactile_bayes.trial import accuracy as origin_line
 from tactile_bayes.trial import replicates as spread
 from tactile_bayes.trial.accuracy import holm, mape_ratio, on_common_masses, paired_comparisons, sign_flip
 from tactile_bayes.trial.figures import (
+    JACKKNIFE,
     Intervals,
     Sample,
     SumStatistic,
@@ -89,7 +90,7 @@ def test_bca_agrees_with_scipy() -> None:
     errors = np.abs(one.size_mm / one.ex_vivo_mm - 1) * 100
     by_patient = ModalitySizes(one.name, np.arange(24), one.ex_vivo_mm, one.size_mm, one.replicates_mm)
     chosen = Intervals(0.95, method="bca", resamples=9_999)
-    found = figure(accuracy.mape_percent, by_patient, scale="log", confidence=chosen).interval
+    found = figure(accuracy.mape_percent, by_patient, scale="log", intervals=chosen).interval
     expected = stats.bootstrap((errors,), np.mean, method="BCa", rng=np.random.default_rng(5)).confidence_interval
     assert found == pytest.approx((expected.low, expected.high), rel=0.03)
 
@@ -103,7 +104,7 @@ def test_bca_of_a_symmetric_figure_is_between_its_quantiles() -> None:
 
 
 def test_bootstraps_refuse_what_they_cannot_do() -> None:
-    few = figure(accuracy.mape_percent, sizes("x", [11.0] * 5), scale="log", confidence=Intervals(0.95, method="bca"))
+    few = figure(accuracy.mape_percent, sizes("x", [11.0] * 5), scale="log", intervals=Intervals(0.95, method="bca"))
     assert few.interval is None
     assert "at least 8 patients" in few.interval_reason
     with pytest.raises(UndefinedError, match="undefined"):
@@ -146,7 +147,7 @@ def test_pairs_are_compared_on_common_masses_only() -> None:
     other = sizes("cbe", [0, 22, 26], mass=[1, 2, 5], e=[11, 12, 20])
     first, second = on_common_masses(one, other)
     assert first.mass.tolist() == second.mass.tolist() == [1, 2]
-    (pair,) = paired_comparisons({"tactile": one, "cbe": other}, confidence=0.95)
+    (pair,) = paired_comparisons({"tactile": one, "cbe": other}, intervals=JACKKNIFE)
     assert pair.masses == 2
     assert pair.second_percent == pytest.approx(50 * (1 + 22 / 12 - 1))
     assert "at least 8 patients" in pair.reasons["difference_percent_interval"]
@@ -154,7 +155,7 @@ def test_pairs_are_compared_on_common_masses_only() -> None:
 
 def test_modalities_without_a_common_mass_have_no_comparison() -> None:
     (pair,) = paired_comparisons(
-        {"a": sizes("a", [11.0], mass=[0]), "b": sizes("b", [11.0], mass=[1])}, confidence=0.95
+        {"a": sizes("a", [11.0], mass=[0]), "b": sizes("b", [11.0], mass=[1])}, intervals=Intervals(0.95)
     )
     assert (pair.masses, pair.p_value, pair.p_holm, pair.difference_percent) == (0, None, None, None)
 
@@ -163,10 +164,10 @@ def test_a_pairs_interval_takes_what_both_share_out() -> None:
     """Errors common to both modalities do not widen the interval of their difference."""
     one = trial(8)
     same = ModalitySizes("cbe", one.patient, one.ex_vivo_mm, one.size_mm * 1.02, one.replicates_mm)
-    (pair,) = paired_comparisons({"tactile": one, "cbe": same}, confidence=0.95)
-    alone = figure(accuracy.mape_percent, one, scale="log", confidence=0.95).interval
+    (pair,) = paired_comparisons({"tactile": one, "cbe": same}, intervals=JACKKNIFE)
+    alone = figure(accuracy.mape_percent, one, scale="log", intervals=JACKKNIFE).interval
     assert np.ptp(pair.difference_percent_interval) < 0.35 * np.ptp(alone)
-    assert mape_ratio(same, one, confidence=0.95).value == pytest.approx(pair.second_percent / pair.first_percent)
+    assert mape_ratio(same, one, intervals=JACKKNIFE).value == pytest.approx(pair.second_percent / pair.first_percent)
 
 
 @pytest.mark.parametrize(
@@ -189,13 +190,13 @@ def test_simulated_trials_have_the_trials_shape_and_errors() -> None:
 
 def test_intervals_are_checked_and_half_intervals_found_out() -> None:
     one, model = trial(11), ErrorModel(0.0, 0.3)
-    honest = check_intervals(one, model, confidence=0.95, trials=400, seed=1)
-    dishonest = check_intervals(one, model, confidence=0.6, trials=400, seed=1)
+    honest = check_intervals(one, model, intervals=JACKKNIFE, trials=400, seed=1)
+    dishonest = check_intervals(one, model, intervals=Intervals(0.6), trials=400, seed=1)
     assert honest.share_interval[0] <= 0.95 <= honest.share_interval[1] + 0.02
     assert dishonest.share < 0.75
     assert honest.covered + honest.above + honest.below == honest.trials == 400
-    assert check_intervals(sizes("x", [11.0] * 4), model, confidence=0.95, trials=10, seed=1) is None
-    assert set(check_all({"tactile": one}, confidence=0.95, trials=20, seed=1)) == {"tactile"}
+    assert check_intervals(sizes("x", [11.0] * 4), model, intervals=JACKKNIFE, trials=10, seed=1) is None
+    assert set(check_all({"tactile": one}, intervals=JACKKNIFE, trials=20, seed=1)) == {"tactile"}
 
 
 def case(**changes: float) -> PlanCase:

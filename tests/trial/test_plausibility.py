@@ -39,7 +39,7 @@ def report(masses: list[tuple[float, list[float]]], name: str = "cbe") -> TrialR
         for key, (_, sizes) in zip(ex_vivo, masses, strict=True)
         for number, size in enumerate(sizes, start=1)
     ]
-    return summarise(Trial(readings, ex_vivo), confidence=Intervals(0.95, method="corrected"))
+    return summarise(Trial(readings, ex_vivo), intervals=Intervals(0.95, method="corrected"))
 
 
 def test_replicates_of_one_patient_alone_give_a_figure_and_no_interval() -> None:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from tactile_bayes.declarations import to_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.tables import Table
+from tactile_bayes.trial.figures import JACKKNIFE
 from tactile_bayes.trial.readings import ModalitySizes, Reading, Trial, gather, readings_from_columns
 from tactile_bayes.trial.summary import FAMILIES, TrialReport, summarise
 
@@ -91,7 +92,7 @@ TRIALS = st.lists(
 )
 Rows = list[tuple[float, list[float], float]]
 NOTHING = ModalitySizes("cbe", np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), ())
-FIGURES = [name for family in FAMILIES for name in family(NOTHING, confidence=0.95)]
+FIGURES = [name for family in FAMILIES for name in family(NOTHING, intervals=JACKKNIFE)]
 
 
 def report_of(rows: Rows, *, scale: float = 1.0, shuffle: Any = None) -> TrialReport:
