@@ -6,8 +6,10 @@ import re
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from validation import agreement_coverage
 from validation.__main__ import NAMES
 from validation.common import RESULTS, Table, percent, pickled, share
 from validation.tables import PAGES, names_in, written
@@ -31,6 +33,15 @@ def test_a_validation_tells_its_options(name: str, capsys: pytest.CaptureFixture
         import_module(f"validation.{name}").main(["--help"])
     assert end.value.code == 0
     assert f"python -m validation {name}" in capsys.readouterr().out
+
+
+def test_limits_and_lines_are_judged_by_three_kinds_of_intervals() -> None:
+    """It read figures by names that a report no longer had, and ended in an error."""
+    design, error = next(iter(agreement_coverage.DESIGNS)), next(iter(agreement_coverage.ERRORS))
+    one = agreement_coverage._trial(design, error, np.random.default_rng(1))
+    corrected, jackknife, customary = agreement_coverage._three(one)
+    assert set(corrected) == set(jackknife) == set(agreement_coverage.WANTED)
+    assert {"ols_slope", "limit_low_mm"} <= set(customary) < set(corrected)
 
 
 def missing(text: str) -> list[str]:

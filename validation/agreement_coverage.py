@@ -14,8 +14,7 @@ import numpy as np
 from tactile_bayes.declarations import replace
 from tactile_bayes.options import IntervalMethod as Method
 from tactile_bayes.trial import accuracy, method_comparison
-from tactile_bayes.trial import accuracy as origin_line
-from tactile_bayes.trial.figures import Figure, Intervals
+from tactile_bayes.trial.figures import JACKKNIFE, Figure, Intervals
 from tactile_bayes.trial.lines import concordance, deming, least_squares
 from tactile_bayes.trial.method_comparison import compare_methods
 from tactile_bayes.trial.planning import ErrorModel, simulate
@@ -95,10 +94,10 @@ def _trial(design: str, error: str, rng: np.random.Generator, *, copies: int = 1
 def _truth(sizes: ModalitySizes) -> dict[str, float]:
     found = sizes.only_detected()
     x, y = found.ex_vivo_mm, found.size_mm
-    limit = method_comparison.limit_figures(found, confidence=0.95)
+    limit = method_comparison.limit_figures(found, intervals=JACKKNIFE)
     return {
         "mape_percent": accuracy.mape_percent(sizes),
-        "slope_through_origin": origin_line.slope(sizes),
+        "slope_through_origin": accuracy.slope(sizes),
         "ols_slope": least_squares(x, y).slope,
         "deming_slope": deming(x, y).slope,
         "concordance": concordance(x, y).coefficient,
@@ -106,11 +105,13 @@ def _truth(sizes: ModalitySizes) -> dict[str, float]:
     }
 
 
-def _figures(sizes: ModalitySizes, confidence: float) -> dict[str, Figure]:
-    found = accuracy.accuracy_figures(sizes, confidence=confidence) | origin_line.origin_line_figures(
-        sizes, confidence=confidence
-    )
-    return found | dict(compare_methods(sizes, confidence=confidence).figures)
+def _figures(sizes: ModalitySizes, intervals: Intervals) -> dict[str, Figure]:
+    found = {
+        **accuracy.accuracy_figures(sizes, intervals=intervals),
+        **accuracy.origin_line_figures(sizes, intervals=intervals),
+    }
+    methods = compare_methods(sizes, intervals=intervals)
+    return {name: found[name] if name in found else methods.figure(name) for name in WANTED}
 
 
 def _three(sizes: ModalitySizes) -> Iterator[Mapping[str, Ends]]:
@@ -123,8 +124,8 @@ def _three(sizes: ModalitySizes) -> Iterator[Mapping[str, Ends]]:
 
 def _customary(sizes: ModalitySizes) -> dict[str, Ends]:
     """What other programs print: analytic intervals of lines, Fisher's z, exact limits of agreement."""
-    one = compare_methods(sizes, confidence=0.95)
-    ends = {name: both for name, both in one.analytic.items() if both is not None and name in WANTED}
+    one = compare_methods(sizes, intervals=JACKKNIFE)
+    ends = {name: both for name, both in one.analytic_intervals.items() if both is not None and name in WANTED}
     found = sizes.only_detected()
     plain = {"mm": found.size_mm - found.ex_vivo_mm, "log_ratio": np.log(found.size_mm / found.ex_vivo_mm)}
     for unit, off in plain.items():
