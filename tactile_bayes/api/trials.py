@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
-from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -362,7 +360,14 @@ def planned(given: Mapping[str, Any], pilot: Pilot | None, progress: Progress) -
     assumptions = {**errors, "trials": asked.trials, "seed": asked.seed}
     each_maps = (MAPS_OF_AIMS,) if wanted and "maps" not in given else sorted(set(asked.maps))
     with open_executor(workers=asked.workers) as executor:
-        run = partial(_simulated, executor=executor, progress=progress)
+
+        def run(cases: Sequence[planning.PlanCase]) -> tuple[planning.Design, ...]:
+            outcomes = run_batch(planning.run_case, cases, key=attrgetter("key"), executor=executor, progress=progress)
+            for outcome in outcomes:
+                if outcome.value is None:
+                    raise BadDataError(f"{outcome.key}: {outcome.error}", way_out="change the errors assumed")
+            return tuple(outcome.value for outcome in outcomes if outcome.value is not None)
+
         if wanted:
             found, needed = _needed(each_maps, wanted, assumptions, run)
         else:
@@ -383,16 +388,6 @@ def planned(given: Mapping[str, Any], pilot: Pilot | None, progress: Progress) -
         research_use=RESEARCH_USE,
     )
     return TrialPlan(report, () if pilot is None else tuple(pilot.doubts()))
-
-
-def _simulated(
-    cases: Sequence[planning.PlanCase], *, executor: Executor, progress: Progress
-) -> tuple[planning.Design, ...]:
-    outcomes = run_batch(planning.run_case, cases, key=attrgetter("key"), executor=executor, progress=progress)
-    for outcome in outcomes:
-        if outcome.value is None:
-            raise BadDataError(f"{outcome.key}: {outcome.error}", way_out="change the errors assumed")
-    return tuple(outcome.value for outcome in outcomes if outcome.value is not None)
 
 
 def _needed(

@@ -298,7 +298,19 @@ def _check_lines(report: TrialReport) -> Iterator[str]:
 def _notes(report: TrialReport) -> Iterator[str]:
     percent = f"{100 * report.interval_probability:g} %"
     for name, one in report.modalities.items():
-        yield from _modality_notes(name, one, percent=percent)
+        if one.masses_not_done or one.masses_without_reading:
+            left_out = f"{one.masses_not_done} not done, {one.masses_without_reading} without a row"
+            yield f"{name}: masses left out: {left_out}"
+        for caution in one.cautions:
+            yield f"{name}: {caution}"
+        for stated in one.coverage:
+            low, high = stated.fraction_interval
+            yield (
+                f"{name}: {100 * stated.probability:g} % intervals cover {stated.covered} of {stated.n} "
+                f"({100 * stated.fraction:.0f} %, {percent} interval {100 * low:.0f} to {100 * high:.0f} %) "
+                f"on {_plural(stated.masses, 'mass')}"
+            )
+        yield from _reasons(name, one, [key for key in one.reasons if key.removesuffix("_interval") in _FIRST])
     if report.counts.masses_without_any_reading:
         yield f"{_plural(report.counts.masses_without_any_reading, 'excised mass')} without any reading, left out"
     yield (
@@ -326,22 +338,6 @@ def ratio_line(name: str, one: ModalityRatio) -> str:
         f"{name}: MAPE {ratio} times the tactile one's on {masses}; {of_found} times on the {one.masses_detected} that "
         "both found"
     )
-
-
-def _modality_notes(name: str, report: ModalityReport, *, percent: str) -> Iterator[str]:
-    if report.masses_not_done or report.masses_without_reading:
-        left_out = f"{report.masses_not_done} not done, {report.masses_without_reading} without a row"
-        yield f"{name}: masses left out: {left_out}"
-    for caution in report.cautions:
-        yield f"{name}: {caution}"
-    for one in report.coverage:
-        low, high = one.fraction_interval
-        yield (
-            f"{name}: {100 * one.probability:g} % intervals cover {one.covered} of {one.n} "
-            f"({100 * one.fraction:.0f} %, {percent} interval {100 * low:.0f} to {100 * high:.0f} %) "
-            f"on {_plural(one.masses, 'mass')}"
-        )
-    yield from _reasons(name, report, [key for key in report.reasons if key.removesuffix("_interval") in _FIRST])
 
 
 def _reasons(name: str, report: ModalityReport, keys: Sequence[str]) -> Iterator[str]:

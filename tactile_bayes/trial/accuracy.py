@@ -30,6 +30,7 @@ from tactile_bayes.trial.figures import (
     figure,
     ratio,
     resampled,
+    squares,
 )
 from tactile_bayes.trial.lines import all_equal
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
@@ -221,14 +222,9 @@ def _sse(sums: FloatArray) -> FloatArray:
     return np.maximum(sums[..., 2] - _slope(sums) * sums[..., 1], 0.0)
 
 
-def _sst(sums: FloatArray) -> FloatArray:
-    return sums[..., 8] - sums[..., 5] ** 2 / sums[..., 3]
-
-
 def _pearson(sums: FloatArray) -> FloatArray:
-    n = sums[..., 3]
-    product = sums[..., 7] - sums[..., 4] * sums[..., 5] / n
-    return np.clip(ratio(product, np.sqrt((sums[..., 6] - sums[..., 4] ** 2 / n) * _sst(sums))), -1.0, 1.0)
+    u, q, p = squares(sums)
+    return np.clip(ratio(p, np.sqrt(u * q)), -1.0, 1.0)
 
 
 # Least-squares slope of sizes on ex-vivo sizes without an intercept: sum e y / sum e^2.
@@ -237,7 +233,7 @@ slope = SumStatistic(_terms, _slope)
 CORRELATIONS = {
     # share of the variance about the mean that the line through zero explains, 1 - SSE0 / SST; below 0 when the mean of
     # the sizes would do better. Kvalseth (1985), Am. Stat. 39, 279, recommends it
-    "r2_centred": SumStatistic(_of_sizes, lambda sums: 1 - ratio(_sse(sums), _sst(sums))),
+    "r2_centred": SumStatistic(_of_sizes, lambda sums: 1 - ratio(_sse(sums), squares(sums)[1])),
     # share of the sum of squares about zero that the line explains, 1 - SSE0 / sum y^2: what R prints for
     # lm(y ~ 0 + x). It flatters: any line through a cloud far from zero explains most of it
     "r2_uncentred": SumStatistic(_terms, lambda sums: 1 - ratio(_sse(sums), sums[..., 2]), "no mass was detected"),

@@ -154,6 +154,15 @@ def ratio(above: FloatArray, below: FloatArray) -> FloatArray:
     return quotient
 
 
+def squares(sums: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sums of squares of x, of y and of products about their means, from (..., k) sums of terms.
+
+    The last six terms are 1, x', y', x'x', x'y', y'y', where ' is about the means of all masses.
+    """
+    n, a, b, aa, ab, bb = np.moveaxis(sums[..., -6:], -1, 0)
+    return aa - a * a / n, bb - b * b / n, ab - a * b / n
+
+
 # --- Exact intervals of a proportion k of n.
 
 

@@ -31,6 +31,7 @@ from tactile_bayes.trial.figures import (
     kurtosis_freedom,
     on_scale,
     ratio,
+    squares,
 )
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 
@@ -412,7 +413,7 @@ def _statistics(error_ratio: float, robust: _Fit, slope: Scale) -> list[tuple[st
     )
 
     def demings(sums: FloatArray) -> FloatArray:
-        return lines.deming_slopes(*_squares(sums), error_ratio=error_ratio)
+        return lines.deming_slopes(*squares(sums), error_ratio=error_ratio)
 
     def part(fit: _Fit, name: str) -> Statistic:
         return lambda sizes: float(getattr(fit(sizes), name))
@@ -434,47 +435,41 @@ _NO_LINE = "the ex-vivo sizes or the sizes do not vary, so no line is determined
 
 
 def _terms(sizes: ModalitySizes) -> FloatArray:
-    """1, x, y, x', y', x'x', x'y', y'y' with ' about the means."""
+    """x, y, 1, x', y', x'x', x'y', y'y' with ' about the means."""
     x, y = sizes.ex_vivo_mm, sizes.size_mm
     if len(x) == 0:
         raise UndefinedError("no mass was detected")
     _need_squares(x, y)
     dx, dy = lines.centred(x, x.mean()), lines.centred(y, y.mean())
-    return columns(1.0, x, y, dx, dy, dx * dx, dx * dy, dy * dy)
-
-
-def _squares(sums: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sums of squares of x, of y and of products about the means of the masses summed."""
-    n, a, b = sums[..., 0], sums[..., 3], sums[..., 4]
-    return sums[..., 5] - a * a / n, sums[..., 7] - b * b / n, sums[..., 6] - a * b / n
+    return columns(x, y, 1.0, dx, dy, dx * dx, dx * dy, dy * dy)
 
 
 def _ols_slope(sums: FloatArray) -> FloatArray:
-    u, _, p = _squares(sums)
+    u, _, p = squares(sums)
     return ratio(p, u)
 
 
 def _intercept_with(slope: Callable[[FloatArray], FloatArray]) -> Callable[[FloatArray], FloatArray]:
     def intercept(sums: FloatArray) -> FloatArray:
-        n = sums[..., 0]
-        return np.asarray(ratio(sums[..., 2], n) - slope(sums) * ratio(sums[..., 1], n))
+        n = sums[..., 2]
+        return np.asarray(ratio(sums[..., 1], n) - slope(sums) * ratio(sums[..., 0], n))
 
     return intercept
 
 
 def _concordance(sums: FloatArray) -> FloatArray:
-    u, q, p = _squares(sums)
+    u, q, p = squares(sums)
     bias = _bias(sums)
-    return np.where((u == 0) | (q == 0), np.nan, ratio(2 * p, u + q + sums[..., 0] * bias**2))
+    return np.where((u == 0) | (q == 0), np.nan, ratio(2 * p, u + q + sums[..., 2] * bias**2))
 
 
 def _bias(sums: FloatArray) -> FloatArray:
-    return ratio(sums[..., 2] - sums[..., 1], sums[..., 0])
+    return ratio(sums[..., 1] - sums[..., 0], sums[..., 2])
 
 
 def _sd(sums: FloatArray) -> FloatArray:
-    u, q, p = _squares(sums)
-    return np.sqrt(np.maximum(ratio(u + q - 2 * p, sums[..., 0] - 1), 0.0))
+    u, q, p = squares(sums)
+    return np.sqrt(np.maximum(ratio(u + q - 2 * p, sums[..., 2] - 1), 0.0))
 
 
 def _fitted(fit: Callable[[FloatArray, FloatArray], lines.Line | lines.PassingBablok]) -> _Fit:
