@@ -21,7 +21,6 @@ else:
 # --- Settings of `estimate`, shared by the command line, Python and batches.
 
 GIVEN: Final = "given in Python"  #: Name of a calibration that is in no file.
-_SITE: Final = {"metavar": "SITE.json", "path": True}
 
 
 class Settings(FitSettings, kw_only=True):
@@ -48,10 +47,11 @@ class Settings(FitSettings, kw_only=True):
     ] = None
     repeatability: Annotated[
         Repeatability | None,
-        says(
+        named(
+            "SITE.json",
             "Spread between exams of one mass at this site, from `calibrate repeatability`: sizes then "
             "have one interval, for any exam there. Default: two, for exams as the paper's and as simulated ones.",
-            extra=_SITE,
+            path=True,
         ),
     ] = None
     known: Annotated[

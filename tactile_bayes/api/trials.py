@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -357,7 +358,7 @@ def planned(given: Mapping[str, Any], pilot: Pilot | None, progress: Progress) -
     by_default = as_dict(PlanErrors(**stated))
     errors = by_default if pilot is None else pilot.errors(asked.against, stated)
     rest: planning.ErrorSource = "default" if pilot is None else "pilot"
-    assumptions = {**errors, "trials": asked.trials, "seed": asked.seed}
+    case = partial(planning.PlanCase, **errors, trials=asked.trials, seed=asked.seed)
     each_maps = (MAPS_OF_AIMS,) if wanted and "maps" not in given else sorted(set(asked.maps))
     with open_executor(workers=asked.workers) as executor:
 
@@ -369,9 +370,10 @@ def planned(given: Mapping[str, Any], pilot: Pilot | None, progress: Progress) -
             return tuple(outcome.value for outcome in outcomes if outcome.value is not None)
 
         if wanted:
-            found, needed = _needed(each_maps, wanted, assumptions, run)
+            found, needed = _needed(each_maps, wanted, case, run)
         else:
-            found, needed = run(list(planning.designs(sorted(set(asked.patients)), each_maps, **assumptions))), ()
+            designs = itertools.product(sorted(set(asked.patients)), each_maps)
+            found, needed = run([case(patients=patients, maps=number) for patients, number in designs]), ()
     assumed = {name: float(f"{errors[name]:.9g}") for name in _ERRORS}
     sources: dict[str, planning.ErrorSource] = {name: "option" if name in stated else rest for name in _ERRORS}
     inputs = hash_inputs(**({} if pilot is None else pilot.files))
@@ -393,28 +395,23 @@ def planned(given: Mapping[str, Any], pilot: Pilot | None, progress: Progress) -
 def _needed(
     maps: Sequence[int],
     aims: Mapping[Aim, float],
-    assumptions: Mapping[str, Any],
+    case: Callable[..., planning.PlanCase],
     run: Callable[[Sequence[planning.PlanCase]], tuple[planning.Design, ...]],
 ) -> tuple[tuple[planning.Design, ...], tuple[planning.Needed, ...]]:
     """Designs about the numbers of patients that reach the aims, and these numbers."""
     found: dict[tuple[int, int], planning.Design] = {}
     needed = []
     for number, (aim, target) in itertools.product(maps, aims.items()):
+        first = case(patients=MIN_PATIENTS, maps=number)
         try:
-            guess = planning.first_guess(
-                planning.PlanCase(patients=MIN_PATIENTS, maps=number, **assumptions), aim, target
-            )
+            guess = planning.first_guess(first, aim, target)
         except UndefinedError as undefined:
             raise BadDataError(str(undefined), way_out="change the errors assumed") from None
         for _ in range(planning.ROUNDS):
             about = planning.sizes_about(guess)
-            cases = [
-                one for one in planning.designs(about, [number], **assumptions) if (number, one.patients) not in found
-            ]
+            cases = [case(patients=one, maps=number) for one in about if (number, one) not in found]
             found |= {(number, one.patients): one for one in run(cases)}
-            answer = planning.patients_needed(
-                [found[number, one] for one in about], aim, target, trials=assumptions["trials"]
-            )
+            answer = planning.patients_needed([found[number, one] for one in about], aim, target, trials=first.trials)
             if answer is None or about[0] <= answer.patients <= about[-1] or answer.patients == guess:
                 break
             guess = answer.patients

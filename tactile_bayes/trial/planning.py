@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import pairwise, product
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -197,11 +197,6 @@ class PlanReport(Record, kw_only=True):
     needed: tuple[Needed, ...] = ()  #: By the designs above, where --power or --precision asked for it.
     provenance: dict[str, Any]
     research_use: Annotated[str, Meta(min_length=1)]
-
-
-def designs(patients: Sequence[int], maps: Sequence[int], **assumptions: Any) -> Iterator[PlanCase]:
-    """All combinations of numbers of patients and numbers of maps."""
-    return (PlanCase(patients=n, maps=m, **assumptions) for n, m in product(patients, maps))
 
 
 def run_case(case: PlanCase) -> Design:

@@ -29,7 +29,6 @@ from tactile_bayes.trial.planning import (
     assumptions_from,
     check_all,
     check_intervals,
-    designs,
     map_gains,
     observed_errors,
     run_case,
@@ -230,4 +229,4 @@ def test_a_pilot_gives_the_assumptions() -> None:
     assert found["mass_sd"] == pytest.approx(0.2, rel=0.15)
     assert found["map_sd"] == pytest.approx(0.1, rel=0.15)
     assert found["other_sd"] == pytest.approx(0.4, rel=0.15)
-    assert len(list(designs([8, 16], [1, 3], **found, trials=50, seed=0))) == 4
+    assert run_case(PlanCase(patients=8, maps=1, **found, trials=50, seed=0)).power > 0
