@@ -149,7 +149,7 @@ def analyse(
         more["interval_check"] = check_all(trial.sizes(), intervals=intervals, trials=trials, seed=settings.seed)
     if settings.bayes:
         rng = np.random.default_rng(settings.seed)
-        more["next_mass"] = next_mass(trial, sample=draw, rng=rng, probability=INTERVAL)
+        more["next_mass"] = next_mass(trial, sample=draw, rng=rng)
     return TrialResult(replace(report, **more), trial)
 
 
@@ -377,8 +377,7 @@ def planned(given: Mapping[str, Any], pilot: Pilot | None, progress: Progress) -
     assumed = {name: float(f"{errors[name]:.9g}") for name in _ERRORS}
     sources: dict[str, planning.ErrorSource] = {name: "option" if name in stated else rest for name in _ERRORS}
     inputs = hash_inputs(**({} if pilot is None else pilot.files))
-    settings: dict[str, Any] = {"trials": asked.trials, "errors": assumed, "errors_from": sources}
-    settings |= {str(aim): target for aim, target in wanted.items()}
+    settings: dict[str, Any] = {"trials": asked.trials, "errors": assumed, "errors_from": sources, **wanted}
     report = planning.PlanReport(
         schema="tactile-bayes/plan/1",
         errors=assumed,

@@ -29,7 +29,6 @@ from tactile_bayes.report.map import map_figure
 
 MANUFACTURER: Final = "tactile_bayes (research software)"
 MODEL: Final = "tactile-bayes"
-UTF_8: Final = "ISO_IR 192"
 EXPLICIT_LITTLE_ENDIAN: Final = "1.2.840.10008.1.2.1"
 # What highdicom writes by the clock; all may be left out.
 _OF_THE_CLOCK: Final = (
@@ -39,8 +38,6 @@ _OF_THE_CLOCK: Final = (
     "TimeOfSecondaryCapture",
     "ContributionDateTime",
 )
-# Written where the standard wants a serial number and nobody gave one.
-NO_SERIAL_NUMBER: Final = "unknown"
 
 
 class Study(Record, eq=False):
@@ -81,7 +78,7 @@ def add_study(dataset: Any, study: Study, source: exam.MapFile | None = None) ->
     `source`: of an image, for what it shows: the breast and its side, neither of a phantom.
     """
     identity = study.identity
-    dataset.SpecificCharacterSet = UTF_8
+    dataset.SpecificCharacterSet = "ISO_IR 192"  # UTF-8
     keywords = {**exam.ATTRIBUTES, "study_description": "StudyDescription", "study_id": "StudyID"}
     for name, keyword in keywords.items():
         if (value := getattr(identity, name)) or name not in ("issuer", "study_description"):
@@ -94,7 +91,7 @@ def add_study(dataset: Any, study: Study, source: exam.MapFile | None = None) ->
         dataset.TimezoneOffsetFromUTC = study.moment.zone
     dataset.Manufacturer = MANUFACTURER
     dataset.ManufacturerModelName = MODEL
-    dataset.DeviceSerialNumber = NO_SERIAL_NUMBER
+    dataset.DeviceSerialNumber = "unknown"  # the standard wants one, and nobody gave it
     dataset.SoftwareVersions = __version__
     if source is not None:
         dataset.Laterality = laterality(source.facts)

@@ -29,6 +29,7 @@ import numpy as np
 from scipy.special import erf, expit, log_expit
 
 from tactile_bayes.declarations import Record, rounded
+from tactile_bayes.presets import INTERVAL
 from tactile_bayes.trial.figures import MIN_PATIENTS, Count
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes, Trial, mass_numbers
 
@@ -114,7 +115,7 @@ class NextMass(Record):
         return [*lines, *(f"{name}: no model: {reason}" for name, reason in self.left_out.items())]
 
 
-def next_mass(trial: Trial, *, sample: Sampler, rng: np.random.Generator, probability: float = 0.95) -> NextMass:
+def next_mass(trial: Trial, *, sample: Sampler, rng: np.random.Generator) -> NextMass:
     """Fit the model to each modality and compare them.
 
     `sample` draws from a log density: by importance sampling or MCMC in the program.
@@ -122,7 +123,7 @@ def next_mass(trial: Trial, *, sample: Sampler, rng: np.random.Generator, probab
     The expected error is that of one reading of a mass drawn from the sizes of this trial, of a new patient. Modalities
     are fitted one by one, so that the probability that one errs less takes their errors as independent.
     """
-    posteriors, left_out = posteriors_of(trial, sample=sample, rng=rng, probability=probability)
+    posteriors, left_out = posteriors_of(trial, sample=sample, rng=rng)
     compared = {}
     for one, other in combinations(posteriors, 2):  # P(A < B) for independent draws, over all pairs of them
         a, b = posteriors[one].mape_percent, posteriors[other].mape_percent
@@ -130,7 +131,7 @@ def next_mass(trial: Trial, *, sample: Sampler, rng: np.random.Generator, probab
         compared[f"{one} errs less than {other}"] = rounded(below)
     return NextMass(
         {name: one.summary for name, one in posteriors.items()},
-        IntervalKind("eti", probability),
+        IntervalKind("eti", INTERVAL),
         compared,
         left_out,
         {name: one.diagnostics for name, one in posteriors.items()},
@@ -138,7 +139,7 @@ def next_mass(trial: Trial, *, sample: Sampler, rng: np.random.Generator, probab
 
 
 def posteriors_of(
-    trial: Trial, *, sample: Sampler, rng: np.random.Generator, probability: float = 0.95
+    trial: Trial, *, sample: Sampler, rng: np.random.Generator
 ) -> tuple[dict[str, Posterior], dict[str, str]]:
     """The model of each modality by its name, and why others have none; as `next_mass`."""
     caliper = {
@@ -152,13 +153,11 @@ def posteriors_of(
         if len(found.patients) < MIN_PATIENTS:
             left_out[name] = f"needs at least {MIN_PATIENTS} patients with a mass found (has {len(found.patients)})"
             continue
-        posteriors[name] = _fit(one, caliper, sample=sample, rng=rng, probability=probability)
+        posteriors[name] = _fit(one, caliper, sample=sample, rng=rng)
     return posteriors, left_out
 
 
-def _fit(
-    sizes: ModalitySizes, caliper: Mapping[int, float], *, sample: Sampler, rng: np.random.Generator, probability: float
-) -> Posterior:
+def _fit(sizes: ModalitySizes, caliper: Mapping[int, float], *, sample: Sampler, rng: np.random.Generator) -> Posterior:
     found = sizes.only_detected()
     model = LogModel(found, np.array([caliper[int(mass)] for mass in found.mass]))
     centre, covariance = model.start()
@@ -169,7 +168,7 @@ def _fit(
     of_found = expected_error_percent(model, theta)
     error = (1 - misses) * of_found + 100 * misses
     sds = np.sqrt(np.array(variances(theta)))
-    tails = [0.5, 0.5 - probability / 2, 0.5 + probability / 2]
+    tails = [0.5, 0.5 - INTERVAL / 2, 0.5 + INTERVAL / 2]
     figures = {
         "mape_percent": error,
         "mape_detected_percent": of_found,
