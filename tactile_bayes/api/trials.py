@@ -377,7 +377,8 @@ def planned(given: Mapping[str, Any], pilot: Pilot | None, progress: Progress) -
     assumed = {name: float(f"{errors[name]:.9g}") for name in _ERRORS}
     sources: dict[str, planning.ErrorSource] = {name: "option" if name in stated else rest for name in _ERRORS}
     inputs = hash_inputs(**({} if pilot is None else pilot.files))
-    settings: dict[str, Any] = {"trials": asked.trials, "errors": assumed, "errors_from": sources, **wanted}
+    settings: dict[str, Any] = {"trials": asked.trials, "errors": assumed, "errors_from": sources}
+    settings |= {str(aim): target for aim, target in wanted.items()}
     report = planning.PlanReport(
         schema="tactile-bayes/plan/1",
         errors=assumed,
