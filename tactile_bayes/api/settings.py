@@ -21,6 +21,7 @@ else:
 # --- Settings of `estimate`, shared by the command line, Python and batches.
 
 GIVEN: Final = "given in Python"  #: Name of a calibration that is in no file.
+_SITE: Final = {"metavar": "SITE.json", "path": True}
 
 
 class Settings(FitSettings, kw_only=True):
@@ -47,11 +48,10 @@ class Settings(FitSettings, kw_only=True):
     ] = None
     repeatability: Annotated[
         Repeatability | None,
-        named(
-            "SITE.json",
+        says(
             "Spread between exams of one mass at this site, from `calibrate repeatability`: sizes then "
             "have one interval, for any exam there. Default: two, for exams as the paper's and as simulated ones.",
-            path=True,
+            extra=_SITE,
         ),
     ] = None
     known: Annotated[
