@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 import tactile_bayes.trial.next_mass as model
-from tactile_bayes.api.trials import draw
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.trial.planning import ErrorModel
 from tactile_bayes.trial.readings import MassKey, Reading, Trial
@@ -74,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def ranks(
-    design: Design, *, trials: int, seed: int, sample: model.Sampler = draw
+    design: Design, *, trials: int, seed: int, sample: model.Sampler = model.draw
 ) -> Iterator[tuple[float, float, float]]:
     """Rank of the true error, with and without misses, in (0, 1), and the median, of each trial that can be fitted."""
     truth = design.truth.true_mape_percent

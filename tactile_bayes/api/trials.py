@@ -14,18 +14,13 @@ import numpy as np
 from tactile_bayes.api.arguments import PathLike, Told, path_of, plain, sequence_of, table_of, takes
 from tactile_bayes.batch import open_executor, run_batch
 from tactile_bayes.declarations import EXACT, Record, as_dict, names_of, replace, to_plain
-from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
+from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
 from tactile_bayes.files.documents import dump_json, read_protocol
 from tactile_bayes.files.estimate_json import fill_from_posteriors
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.tables import Sheet, Table, check_references, read_table
-from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import ParameterDraws
-from tactile_bayes.inference.ensemble import ensemble
-from tactile_bayes.inference.importance import ImportanceOptions, importance
-from tactile_bayes.inference.modes import LogDensity, mode_and_covariance
 from tactile_bayes.options import MOST_PATIENTS, Aim, PlanErrors, PlanOptions, TrialSettings
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.progress import Progress, untold
@@ -42,26 +37,6 @@ from tactile_bayes.trial.summary import TrialReport, summarise
 
 if TYPE_CHECKING:
     import pandas
-
-
-# --- Sampler for the next mass's model: importance sampling about the mode, or MCMC where it cannot be trusted.
-
-_ACCURACY_SD = 0.03  #: Monte-Carlo error of interval ends, in posterior SDs.
-
-
-def draw(
-    log_density: LogDensity, centre: FloatArray, covariance: FloatArray, *, rng: np.random.Generator
-) -> ParameterDraws:
-    """Draw from a log density.
-
-    The density takes (m, p) arrays to (m,); `centre` and `covariance` guess the mode and the covariance about it. Where
-    MCMC, too, does not reach its criteria, `NotConvergedError` says so.
-    """
-    try:
-        mode, about, _ = mode_and_covariance(log_density, centre, scale=np.sqrt(np.diag(covariance)))
-        return importance(log_density, mode, about, rng=rng, options=ImportanceOptions(_ACCURACY_SD))
-    except NotConvergedError:
-        return ensemble(log_density, centre, covariance, rng=rng)
 
 
 # --- Analysis of a trial from its tables: errors, lines, agreement and calibration of each modality.
@@ -149,7 +124,7 @@ def analyse(
         more["interval_check"] = check_all(trial.sizes(), intervals=intervals, trials=trials, seed=settings.seed)
     if settings.bayes:
         rng = np.random.default_rng(settings.seed)
-        more["next_mass"] = next_mass(trial, sample=draw, rng=rng)
+        more["next_mass"] = next_mass(trial, rng=rng)
     return TrialResult(replace(report, **more), trial)
 
 

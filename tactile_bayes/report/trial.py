@@ -10,7 +10,6 @@ from tactile_bayes.declarations import UNSET, replace
 from tactile_bayes.shell import padded, shown_columns
 from tactile_bayes.trial.accuracy import REFERENCE, ModalityRatio, PairedComparison, least_p
 from tactile_bayes.trial.figures import MIN_PATIENTS, Ends, Figure
-from tactile_bayes.trial.method_comparison import Unit
 from tactile_bayes.trial.planning import Design, Needed, PlanReport
 from tactile_bayes.trial.summary import ModalityReport, TrialReport
 
@@ -123,11 +122,7 @@ def _modality_lines(name: str, report: ModalityReport) -> Iterator[str]:
 def limit_rows(report: ModalityReport) -> Iterator[tuple[str, str, str, str]]:
     """Limits of agreement, of the ratio, then in mm: the scale in words, bias, lower and upper limit."""
     methods = report.method_comparison
-    units: tuple[Unit, ...] = ("log_ratio", "mm")
-    for unit in units:
-        one = methods.limits.get(unit)
-        if one is None:
-            continue
+    for unit, one in sorted(methods.limits.items()):
         low, high = methods.figure(f"limit_low_{unit}"), methods.figure(f"limit_high_{unit}")
         if unit == "mm":
             yield "in mm", f"{one.bias:.3g}", shown(low, ".3g"), shown(high, ".3g")

@@ -267,8 +267,7 @@ Ends = tuple[float, float]
 Count = Annotated[int, Meta(ge=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
 Share = Annotated[float, Meta(ge=0, le=1)]
-Reason = Annotated[str, Meta(min_length=1)]
-Reasons = Annotated[dict[str, Reason], says("Why a figure or an interval is null.")]
+Reasons = Annotated[dict[str, Annotated[str, Meta(min_length=1)]], says("Why a figure or an interval is null.")]
 
 
 class Figures(Record):

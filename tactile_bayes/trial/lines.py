@@ -18,8 +18,9 @@ from tactile_bayes.trial.readings import FloatArray
 # Up to so many points the pairs are listed (2 million of them); beyond, ranks are found by counting inversions.
 MOST_LISTED = 2000
 RESOLUTION = 1e-9  #: Beyond MOST_LISTED an ordered angle is found to this many radians.
-# Differences below this share of the mean of the two numbers are rounding, as in laboratories' programs.
-_EQUAL = 1e-12
+# Differences below this share of the numbers themselves are rounding, as in laboratories' programs, and as between
+# averages of equal replicates.
+EQUAL = 1e-12
 
 
 class PairAngles:
@@ -47,7 +48,7 @@ class PairAngles:
             return int(np.searchsorted(self._angles, angle, side="right" if inclusive else "left"))
         slope = math.copysign(1.0, angle) if abs(angle) == math.pi / 4 else math.tan(angle)
         z = self._y - slope * self._x
-        grain = _EQUAL * (np.abs(self._y).max() + abs(slope) * np.abs(self._x).max())
+        grain = EQUAL * (np.abs(self._y).max() + abs(slope) * np.abs(self._x).max())
         z = np.rint(z / grain) if grain > 0 else z
         upright = self._upright if self._vertical < 0 else 0
         return _inversions(self._x, z, ties=inclusive) + upright - (self._coincident if inclusive else 0)
@@ -90,7 +91,7 @@ def _listed(x: FloatArray, y: FloatArray, vertical: float) -> FloatArray:
 
 def _difference(a: FloatArray, b: FloatArray) -> FloatArray:
     difference = a - b
-    return np.where(np.abs(difference) < _EQUAL * (np.abs(a) + np.abs(b)) / 2, 0.0, difference)
+    return np.where(np.abs(difference) < EQUAL * (np.abs(a) + np.abs(b)) / 2, 0.0, difference)
 
 
 def _pairs_of_equals(rows: FloatArray) -> int:
@@ -172,9 +173,6 @@ def _at(angles: PairAngles, twice: int) -> float:
 # x is the reference and y the method under test. The Deming lines take `error_ratio`, the variance of the error of
 # x over that of y, as Linnet (1990) does; 1 is orthogonal regression, and 0 and infinity are the two least-squares
 # lines.
-
-# Differences below this share of the numbers themselves are rounding, as between averages of equal replicates.
-EQUAL = 1e-12
 
 
 class Line(Record):

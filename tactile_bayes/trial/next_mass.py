@@ -23,12 +23,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from itertools import combinations
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.special import erf, expit, log_expit
 
 from tactile_bayes.declarations import Record, rounded
+from tactile_bayes.errors import NotConvergedError
+from tactile_bayes.inference.draws import ParameterDraws
+from tactile_bayes.inference.ensemble import ensemble
+from tactile_bayes.inference.importance import ImportanceOptions, importance
+from tactile_bayes.inference.modes import LogDensity, mode_and_covariance
 from tactile_bayes.presets import INTERVAL
 from tactile_bayes.trial.figures import MIN_PATIENTS, Count
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes, Trial, mass_numbers
@@ -43,8 +48,8 @@ CALIPER = 0.05
 PRIOR_MISS = 1 / 3
 
 
-# Draws from a vectorised log density about its mode: ``sample(log_density, centre, covariance, rng=rng)``.
-Sampler = Callable[..., Any]
+ACCURACY_SD = 0.03  #: Monte-Carlo error of interval ends, in posterior SDs.
+Sampler = Callable[..., ParameterDraws]  #: Draws from a log density, as `draw` does.
 
 
 class Middle(Record):
@@ -115,10 +120,23 @@ class NextMass(Record):
         return [*lines, *(f"{name}: no model: {reason}" for name, reason in self.left_out.items())]
 
 
-def next_mass(trial: Trial, *, sample: Sampler, rng: np.random.Generator) -> NextMass:
-    """Fit the model to each modality and compare them.
+def draw(
+    log_density: LogDensity, centre: FloatArray, covariance: FloatArray, *, rng: np.random.Generator
+) -> ParameterDraws:
+    """Draw from a log density by importance sampling about its mode, or by MCMC where that cannot be trusted.
 
-    `sample` draws from a log density: by importance sampling or MCMC in the program.
+    The density takes (m, p) arrays to (m,); `centre` and `covariance` guess the mode and the covariance about it. Where
+    MCMC, too, does not reach its criteria, `NotConvergedError` says so.
+    """
+    try:
+        mode, about, _ = mode_and_covariance(log_density, centre, scale=np.sqrt(np.diag(covariance)))
+        return importance(log_density, mode, about, rng=rng, options=ImportanceOptions(ACCURACY_SD))
+    except NotConvergedError:
+        return ensemble(log_density, centre, covariance, rng=rng)
+
+
+def next_mass(trial: Trial, *, sample: Sampler = draw, rng: np.random.Generator) -> NextMass:
+    """Fit the model to each modality and compare them.
 
     The expected error is that of one reading of a mass drawn from the sizes of this trial, of a new patient. Modalities
     are fitted one by one, so that the probability that one errs less takes their errors as independent.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -15,7 +15,6 @@ from tactile_bayes.trial.figures import (
     JACKKNIFE,
     Count,
     Ends,
-    Figure,
     Figures,
     Intervals,
     NotNegative,
@@ -31,11 +30,7 @@ from tactile_bayes.trial.planning import IntervalCheck
 from tactile_bayes.trial.readings import ModalitySizes, Trial, unit_doubts
 from tactile_bayes.trial.replicates import ReplicateFigures, reader_components, replicate_figures, spread_figures
 
-FAMILIES: tuple[Callable[..., dict[str, Figure]], ...] = (
-    accuracy.accuracy_figures,
-    accuracy.origin_line_figures,
-    spread_figures,
-)
+FAMILIES = (accuracy.accuracy_figures, accuracy.origin_line_figures, spread_figures)
 AtMostOne = Annotated[float, Meta(le=1)]
 Correlation = Annotated[float, Meta(ge=-1, le=1)]
 CONVENTIONS: dict[str, str] = {

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tactile_bayes.api.trials import draw
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 from tactile_bayes.inference.importance import ImportanceOptions, importance
 from tactile_bayes.inference.modes import mode_and_covariance
 from tactile_bayes.trial import next_mass as model_of
-from tactile_bayes.trial.next_mass import LogModel, expected_error_percent, next_mass, variances
+from tactile_bayes.trial.next_mass import LogModel, draw, expected_error_percent, next_mass, variances
 from tactile_bayes.trial.planning import ErrorModel
 from tactile_bayes.trial.readings import ModalitySizes, Reading, Trial
 from validation.next_mass_coverage import DESIGNS, Design, half_normal_log_prior, ranks
