@@ -344,7 +344,7 @@ def at_excision(
     by_mass: dict[MassKey, list[Row]] = defaultdict(list)
     for row in enumerate(readings):
         by_mass[row[1].key].append(row)
-    several = earlier = later = 0
+    several = later = 0
     dropped: set[int] = set()
     only_there: Counter[str] = Counter()
     for key, rows in by_mass.items():
@@ -356,9 +356,8 @@ def at_excision(
         dropped |= left
         kept = {one.modality for i, one in rows if i not in left}
         only_there.update({one.modality for _, one in rows} - kept)
-    earlier = len(dropped) - later
     analysed = [one for i, one in enumerate(readings) if i not in dropped]
-    return analysed, OtherVisits(several, earlier, later, dict(sorted(only_there.items())))
+    return analysed, OtherVisits(several, len(dropped) - later, later, dict(sorted(only_there.items())))
 
 
 def _visit(reading: Reading) -> str | None:
