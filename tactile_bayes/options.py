@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from tactile_bayes import presets
-from tactile_bayes.declarations import Meta, Options, Record, says
+from tactile_bayes.declarations import Meta, Options, says
 from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import Background, Method, Noise, Normalise, Rotation, SceneAsked, TrackerProtocol
 
@@ -251,8 +251,8 @@ class TrialSettings(Options):
 Aim = Literal["power", "precision"]
 
 
-class SizeErrors(Record):
-    """Errors of ln size, tactile and of the modality compared with; an SD of 0.15 is about 15 %."""
+class PlanErrors(Options):
+    """Errors of ln size that a plan assumes; an SD of 0.15 is about 15 %."""
 
     tactile_bias: Annotated[float, says("Mean of ln(size / ex vivo).", ge=-3, le=3)] = 0.02
     mass_sd: Annotated[float, says("SD of ln size shared by a mass's maps.", ge=0, le=3)] = 0.18
@@ -260,10 +260,6 @@ class SizeErrors(Record):
     other_bias: Annotated[float, says("Mean of ln(size / ex vivo) of the modality compared with.", ge=-3, le=3)] = -0.08
     other_sd: Annotated[float, says("SD of ln size of the modality compared with.", ge=0, le=3)] = 0.40
     other_miss: Annotated[float, says("Share of masses that the modality compared with misses.", ge=0, le=1)] = 0.04
-
-
-class PlanErrors(SizeErrors, Options):
-    """Errors of ln size that a plan assumes; an SD of 0.15 is about 15 %."""
 
 
 class PlanOptions(Options, kw_only=True):

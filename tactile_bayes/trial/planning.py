@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from tactile_bayes.declarations import Meta, Record
-from tactile_bayes.options import MOST_PATIENTS, Aim, SizeErrors
+from tactile_bayes.options import MOST_PATIENTS, Aim
 from tactile_bayes.presets import INTERVAL
 from tactile_bayes.trial.accuracy import mape_figure, mape_percent, mape_ratio, sign_flip
 from tactile_bayes.trial.figures import MIN_PATIENTS, Ends, Intervals, Share, UndefinedError, clopper_pearson, figure
@@ -134,12 +134,18 @@ FLIPS = 999
 LEVEL = 0.05
 
 
-class PlanCase(SizeErrors, kw_only=True):
-    """One design with assumed errors: all that its simulation depends on."""
+class PlanCase(Record, kw_only=True):
+    """One design with assumed errors, as of `PlanErrors`: all that its simulation depends on."""
 
     patients: int
     maps: int
     """`patients`, `maps`: Patients with one mass each, and tactile maps per mass."""
+    tactile_bias: float
+    mass_sd: float
+    map_sd: float
+    other_bias: float
+    other_sd: float
+    other_miss: float
     trials: int
     seed: int
 
