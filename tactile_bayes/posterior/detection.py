@@ -6,7 +6,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.modes import inverse_information
+from tactile_bayes.inference.modes import LeastSquaresFit, inverse_information
 from tactile_bayes.posterior.bump import FitCells
 
 # --- Error model from a fit's residuals: variance, weights by count, correlation.
@@ -29,8 +29,7 @@ def count_weights(cells: FitCells, residual_variance: float) -> FloatArray:
     """(k,) weights from counts, of mean 1: the variance of a cell is ``v / n + delta^2``.
 
     v is the pooled within-cell variance of a reading, n the count; delta^2 is the rest of `residual_variance`, the mean
-    squared residual of a fit with equal weights: the model's own misfit, that more readings do not reduce. So counts
-    weigh where readings are few, and level off where the model, not the sensor, is the limit.
+    squared residual of a fit with equal weights: the model's own misfit, that more readings do not reduce.
     """
     reading = cells.reading_variance
     if not reading > 0:
@@ -40,14 +39,14 @@ def count_weights(cells: FitCells, residual_variance: float) -> FloatArray:
     return np.asarray(weight / weight.mean())
 
 
-def independent_errors(*, jacobian: FloatArray, residual: FloatArray, weight: FloatArray) -> ErrorModel:
+def independent_errors(fit: LeastSquaresFit, weight: FloatArray) -> ErrorModel:
     """Error model without correlation, for fits whose model contains the correlation itself."""
-    k, p = jacobian.shape
+    k, p = fit.jacobian.shape
     dof = max(k - p, 1)
-    return ErrorModel(float(np.sqrt(weight @ residual**2 / dof)), 1.0, float(dof))
+    return ErrorModel(float(np.sqrt(weight @ fit.residual**2 / dof)), 1.0, float(dof))
 
 
-def error_model(cells: FitCells, *, jacobian: FloatArray, residual: FloatArray, weight: FloatArray) -> ErrorModel:
+def error_model(cells: FitCells, fit: LeastSquaresFit, weight: FloatArray) -> ErrorModel:
     """Estimate the error model from a fit's residuals.
 
     Neighbouring cells share frames and the model's misfit, so their errors correlate. The least-squares estimate stays
@@ -59,16 +58,16 @@ def error_model(cells: FitCells, *, jacobian: FloatArray, residual: FloatArray, 
     A level and a tilt are taken out of the residuals first. They are the misfit of a fixed background, which the maps
     that a size calibration was learned from share; `level_offset` reports it instead.
     """
-    k, p = jacobian.shape
+    k, p = fit.jacobian.shape
     dof = max(k - p, 1)
-    residual = residual - fitted_tilt(cells, residual, weight=weight)
+    residual = fit.residual - fitted_tilt(cells, fit.residual, weight=weight)
     noise_variance = float(weight @ residual**2) / dof
     if not noise_variance > 0 or k <= p:
         return ErrorModel(float(np.sqrt(max(noise_variance, 0.0))), 1.0, float(dof))
     white = residual * np.sqrt(weight / noise_variance)
     correlation, half = residual_autocorrelation(*cells.on_grid(np.stack([white, np.ones(k)])))
-    root = jacobian * np.sqrt(weight)[:, None]
-    information = inverse_information(jacobian, weight)
+    root = fit.jacobian * np.sqrt(weight)[:, None]
+    information = inverse_information(fit.jacobian, weight)
     if not np.isfinite(information).all():
         return ErrorModel(float(np.sqrt(noise_variance)), 1.0, float(dof))
     smeared = _correlate_columns(cells, root, correlation, half)

@@ -51,11 +51,8 @@ MOST_LOOKS = 3  #: Places that are no lump by the evidence before the search end
 
 
 def search(tactile_map: TactileMap, options: SamplerSettings) -> tuple[tuple[Candidate, ...], Assessment | None]:
-    """Find the highest bump that can be a lump, also under correlated errors, and is one by the evidence.
-
-    Returns all candidates that were looked at, the answer's last, and its assessment: None where none can be a lump,
-    that of the first where none is one by the evidence.
-    """
+    """All candidates looked at, and the assessment of the last: the highest bump that is a lump by the evidence, or the
+    first where none is; None where none can be a lump."""
     tried: list[Candidate] = []
     first: tuple[Candidate, Assessment] | None = None
     looks = 0
@@ -74,12 +71,9 @@ def search(tactile_map: TactileMap, options: SamplerSettings) -> tuple[tuple[Can
         if looks == MOST_LOOKS:
             break
         rather = f": rather {detection.ridge}" if detection.ridge else ""
-        fault = f"{verdict.NO_EVIDENCE}{rather}"
-        tried[-1] = replace(candidate, fault=fault)
-    if options.correlated:
-        close = _close_search(tactile_map, tried, options)
-        if close is not None:
-            return close
+        tried[-1] = replace(candidate, fault=f"{verdict.NO_EVIDENCE}{rather}")
+    if options.correlated and (close := _close_search(tactile_map, tried, options)) is not None:
+        return close
     if first is None:
         return tuple(tried), None
     return (*(one for one in tried if one.centre_mm != first[0].centre_mm), first[0]), first[1]
@@ -103,10 +97,7 @@ def _with_cells_of(tactile_map: TactileMap, fit: BumpFit, settings: SamplerSetti
 def _close_search(
     tactile_map: TactileMap, tried: list[Candidate], options: SamplerSettings
 ) -> tuple[tuple[Candidate, ...], Assessment] | None:
-    """Search again close to the highest places from which the fit moved away; None where none is a lump.
-
-    Beside a rib, least squares grows over both. Correlated errors can represent the rib, and it is tested for later.
-    """
+    """Search again close to the highest places from which the fit moved away, as beside a rib; None without a lump."""
     looks, settings, found_on = 0, _search_options(tactile_map, options), levelled(tactile_map)
     for i, candidate in enumerate(tried):
         if candidate.fit is not None and not candidate.fault.startswith(white.OUTGROWN):
@@ -114,13 +105,12 @@ def _close_search(
         fit, fault = white.fit_close(found_on, candidate.centre_mm, options=settings)
         if fit is None or fault:
             continue
-        fit = _with_cells_of(tactile_map, fit, settings)
-        seen = assess(tactile_map, fit, options)
+        seen = assess(tactile_map, _with_cells_of(tactile_map, fit, settings), options)
         tried[i] = replace(candidate, detection=seen.detection)
         if seen.scene is None or seen.fault:
             continue
         if seen.detection.probability >= DETECTED:
-            return (*tried[:i], *tried[i + 1 :], replace(candidate, fit=fit, fault="")), seen
+            return (*tried[:i], *tried[i + 1 :], replace(candidate, fit=seen.fit, fault="")), seen
         looks += 1
         if looks == MOST_LOOKS:
             break
@@ -132,9 +122,7 @@ def best_chance(
 ) -> verdict.Weighed | None:
     """The most probable lump among rises that cannot be measured; None where none can be assessed.
 
-    Those that the search has weighed count. Where they are fewer than `MOST_LOOKS` the highest others are weighed too,
-    from a smaller window where the fit ran away or outgrew its own. A fit to a single cell says nothing of a lump and
-    is passed over.
+    Those that the search has weighed count. Where they are fewer than `MOST_LOOKS` the highest others are weighed too.
     """
     weighed: list[verdict.Weighed] = []
     for candidate in sorted(candidates, key=lambda one: one.detection is None):
@@ -151,7 +139,8 @@ def best_chance(
 def _weighed(
     tactile_map: TactileMap, candidate: Candidate, options: SamplerSettings
 ) -> tuple[ModalBump | None, Detection | None]:
-    """Bump and odds of a lump at a faulty place; from close by where the first fit moved away or grew too large."""
+    """Bump and odds of a lump at a faulty place, from close by where the first fit moved away or grew too large; None
+    for a fit to a single cell, which says nothing of a lump."""
     fit, settings = candidate.fit, _search_options(tactile_map, options)
     if fit is None or candidate.fault.startswith(white.OUTGROWN):
         fit, _ = white.fit_close(levelled(tactile_map), candidate.centre_mm, options=settings)
@@ -161,11 +150,8 @@ def _weighed(
 
 
 def _search_options(tactile_map: TactileMap, fit: SamplerSettings) -> SamplerSettings:
-    """Options of the least-squares search for a lump.
-
-    Under a noise field it only has to find the place: there the known level holds it better than a free one, which a
-    rib at the window's rim can lift.
-    """
+    """Options of the least-squares search, which under a noise field only finds the place: there the known level holds
+    it better than a free one, which a rib at the window's rim can lift."""
     known = fit.correlated and tactile_map.background is not None
     return replace(fit, background="fixed") if known else fit
 

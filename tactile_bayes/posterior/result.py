@@ -16,7 +16,7 @@ from tactile_bayes.inference.draws import ParameterDraws, quantiles_of, weighted
 from tactile_bayes.inference.ensemble import DrawGroup
 from tactile_bayes.inference.importance import smooth_weights
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.bump import principal_widths
+from tactile_bayes.posterior.bump import FitCells, principal_widths
 from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import Diagnostics, MapPosterior, ModalBump
 from tactile_bayes.posterior.fit import FieldFit, SceneChoice
@@ -178,24 +178,6 @@ def pointwise_log_likelihood(target: CollapsedTarget, theta: FloatArray) -> Floa
     return -inverse
 
 
-def fitted_values(target: CollapsedTarget, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(n,) values of the model without noise at a (p,) shape, by generalised least squares in the likeliest field.
-
-    And the (n,) field's expectation given the data: the part of what is left that neighbouring cells share.
-    """
-    window, at = target.window, theta[None]
-    likeliest = int(np.argmax(target.by_field(at)[0]))
-    templates = [window.of_cells(one)[0] for one in target.scene.templates(at, window)]
-    regressors = np.stack([*target.linear.plain[:-1], *templates])
-    precision = next(islice(_fields(target), likeliest, None))
-    middle = window.cells.value.mean()
-    across = precision.times(regressors)
-    solved = np.linalg.solve(across @ regressors.T, across @ (window.cells.value - middle))
-    fit = np.asarray(middle + solved @ regressors)
-    left = window.cells.value - fit
-    return fit, left - precision.times(left[None])[0] * window.variance
-
-
 def _fields(target: CollapsedTarget) -> Iterator[_Precision]:
     """The precision of each field and share, in the order of `CollapsedTarget.by_field`."""
     window = target.window
@@ -244,10 +226,8 @@ def _without_each(precision: _Precision, regressors: FloatArray, value: FloatArr
 class FittedCells(Record, eq=False):
     """Cells of a fit window."""
 
-    x_mm: FloatArray
-    y_mm: FloatArray  #: (n,) arrays: Their centres in `plane`.
-    value: FloatArray  #: (n,) array: The map's.
-    fit: FloatArray  #: (n,) array: The model's at the posterior's middle.
+    cells: FitCells
+    fit: FloatArray  #: (n,) array: The model's values at the posterior's middle.
     shared: FloatArray | None = None
     """(n,) array: What neighbouring cells share of the noise, as the noise field has it; None for independent noise.
 
@@ -258,7 +238,7 @@ class FittedCells(Record, eq=False):
     @property
     def residual(self) -> FloatArray:
         """(n,) values less the fit and what neighbouring cells share: noise of single cells."""
-        left = self.value - self.fit
+        left = self.cells.value - self.fit
         return left if self.shared is None else left - self.shared
 
 
@@ -272,13 +252,18 @@ def fitted_cells(estimate: Estimate) -> FittedCells | None:
         return None
     if estimate.scene is None:
         cells = estimate.fit.cells
-        fit = np.asarray(estimate.fit.bump.predict(estimate.fit.theta[None], cells)[0], dtype=np.float64)
-        return FittedCells(cells.x_mm, cells.y_mm, cells.value, fit)
-    target = estimate.scene.fit.target
-    cells = target.window.cells
-    return FittedCells(
-        cells.x_mm, cells.y_mm, cells.value, *fitted_values(target, np.median(estimate.draws.flat, axis=0))
-    )
+        return FittedCells(cells, estimate.fit.bump.predict(estimate.fit.theta[None], cells)[0])
+    target, at = estimate.scene.fit.target, np.median(estimate.draws.flat, axis=0)[None]
+    window, value = target.window, target.window.cells.value
+    templates = [window.of_cells(one)[0] for one in target.scene.templates(at, window)]
+    regressors = np.stack([*target.linear.plain[:-1], *templates])
+    precision = next(islice(_fields(target), int(np.argmax(target.by_field(at)[0])), None))
+    middle, across = value.mean(), precision.times(regressors)
+    solved = np.linalg.solve(across @ regressors.T, across @ (value - middle))
+    fit = np.asarray(middle + solved @ regressors)
+    left = value - fit
+    # the field's expectation given the data: the part of what is left that neighbouring cells share
+    return FittedCells(window.cells, fit, left - precision.times(left[None])[0] * window.variance)
 
 
 # --- What goes beside a posterior's draws in a file that arviz opens: statistics, likelihood, data and prior.
@@ -305,8 +290,7 @@ def inference_groups(
     observed = {name: (("cell",), values) for name, values in {"value": cells.value, **places}.items()}
     groups = {"observed_data": DrawGroup(observed, {"value": "mean of the readings of each cell of the fit window"})}
     fit = None if estimate.scene is None else estimate.scene.fit
-    statistics = _statistics(estimate, fit)
-    if statistics is not None:
+    if (statistics := _statistics(estimate.draws, fit)) is not None:
         groups["sample_stats"] = statistics
     if fit is None:
         return groups
@@ -316,9 +300,7 @@ def inference_groups(
     return groups
 
 
-def _statistics(estimate: Estimate, fit: FieldFit | None) -> DrawGroup | None:
-    draws = estimate.draws
-    assert draws is not None
+def _statistics(draws: ParameterDraws, fit: FieldFit | None) -> DrawGroup | None:
     statistics = dict(draws.statistics)
     if draws.method == "laplace" and fit is not None:
         statistics["lp"] = fit.target(draws.flat).reshape(draws.theta.shape[:2])

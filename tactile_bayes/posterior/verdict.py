@@ -78,13 +78,12 @@ def weigh(
     candidate: Candidate | None = None,
 ) -> Weighed:
     """A rise with the bump that the odds are of; `fault` and `candidate` as the search met it."""
-    centre_mm, widths_mm = (bump.x_mm, bump.y_mm), (bump.sigma_x_mm, bump.sigma_y_mm)
-    wide, narrow = max(widths_mm), max(min(widths_mm), 1e-3)
+    centre_mm, (narrow, wide) = (bump.x_mm, bump.y_mm), sorted((bump.sigma_x_mm, bump.sigma_y_mm))
     evidence = log1p(float(np.clip(detection.log_bayes_factor, 0.0, MOST_EVIDENCE)))
     too_wide = max(log(max(wide, 1e-3) / WIDE_MM), 0.0)
     open_share = 1.0 - covered_share(tactile_map, centre_mm, radius_mm=1.5 * wide)
     faulty = float(bool(fault) and not fault.startswith(NO_EVIDENCE))
-    features = (evidence, min(log(wide / narrow), 2.0), min(too_wide, 2.0), open_share, faulty)
+    features = (evidence, min(log(wide / max(narrow, 1e-3)), 2.0), min(too_wide, 2.0), open_share, faulty)
     return Weighed(detection, centre_mm, features, candidate)
 
 
@@ -135,7 +134,7 @@ def searched(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> 
         )
         place = f"centre_mm ({centre_mm[0]:g}, {centre_mm[1]:g})"
         raise UsageError(f"{place} lies off the map, which has {reach}; give a place on it")
-    return f"near ({centre_mm[0]:.1f}, {centre_mm[1]:.1f}) mm"
+    return _near(centre_mm)
 
 
 def no_verdict(tactile_map: TactileMap) -> Abstention | None:
@@ -170,13 +169,10 @@ def chance_text(probability: float, digits: int = 2) -> str:
 def no_bump(
     tactile_map: TactileMap, candidates: Sequence[Candidate], likeliest: Weighed | None, *, where: str
 ) -> Abstention:
-    """Reason when no candidate can be measured: no lump, or one that the map covers too poorly.
-
-    `likeliest` is the candidate that is most likely a lump all the same, see `estimate.best_chance`.
-    """
+    """Reason when no candidate can be measured, by the likeliest: no lump, or one that the map covers too poorly."""
     candidate = None if likeliest is None else likeliest.candidate
     if candidate is not None and likeliest is not None and likeliest.probability >= LIKELY:
-        reason = f"the rise {_place(candidate)} cannot be measured: {candidate.fault}"
+        reason = f"the rise {_near(candidate.centre_mm)} cannot be measured: {candidate.fault}"
         return _for_fault(tactile_map, candidate, reason)
     first = candidates[0]
     if likeliest is None and "covered cells" in first.fault:
@@ -184,15 +180,16 @@ def no_bump(
         advice = extend_advice(short) or "cover the place with more strokes"
         return Abstention("window", f"no lump found {where}: {first.fault}", advice, advice, first.centre_mm)
     if candidate is not None and likeliest is not None and likeliest.detection.log_bayes_factor > 0:
-        why = _for_fault(tactile_map, candidate, f"no lump found {where}: what rises {_place(candidate)} is a ridge")
+        rise = f"what rises {_near(candidate.centre_mm)} is a ridge"
+        why = _for_fault(tactile_map, candidate, f"no lump found {where}: {rise}")
         if why.code == "ridge":
             return why
     rises = f"none of the {len(candidates)} places that rise is one" if len(candidates) > 1 else first.fault
     return Abstention("undetected", f"no lump found {where}: {rises}", FEEL_AGAIN, FEEL_AGAIN_ON_PAPER)
 
 
-def _place(candidate: Candidate) -> str:
-    return f"near ({candidate.centre_mm[0]:.1f}, {candidate.centre_mm[1]:.1f}) mm"
+def _near(place_mm: tuple[float, float]) -> str:
+    return f"near ({place_mm[0]:.1f}, {place_mm[1]:.1f}) mm"
 
 
 def _for_fault(tactile_map: TactileMap, candidate: Candidate, reason: str) -> Abstention:
@@ -201,8 +198,7 @@ def _for_fault(tactile_map: TactileMap, candidate: Candidate, reason: str) -> Ab
     if fit is None:
         advice = extend_advice(missing_strokes(tactile_map, at, reach_mm=10.0))
         return Abstention("window" if advice else "undetected", reason, advice, advice, at)
-    sigma_x, sigma_y, _ = fit.widths()
-    wide, narrow = max(sigma_x, sigma_y), min(sigma_x, sigma_y)
+    narrow, wide = sorted(fit.widths()[:2])
     if not fit.theta[0] > 0:
         return Abstention("undetected", reason, about_mm=at)
     if wide / max(narrow, 1e-9) > MOST_AXIS_RATIO:
@@ -226,15 +222,12 @@ def _coarse(reason: str, narrow_mm: float, at: tuple[float, float] | None = None
 def missing_strokes(tactile_map: TactileMap, centre_mm: tuple[float, float], *, reach_mm: float) -> dict[str, float]:
     """Distance in mm by which coverage falls short of `reach_mm` from a centre, per side, where at least a cell.
 
-    The sides are named as a viewer of the map's picture sees them: "the patient's left (-x)" with landmarks.
-
-    A side is a quarter turn about its direction. It ends where less than `LEAST_SEEN` of its breadth is covered: a
-    flank of which a corner is missing is still seen.
+    The sides are named as a viewer of the map's picture sees them: "the patient's left (-x)" with landmarks. A side is
+    a quarter turn about its direction. It ends where less than `LEAST_SEEN` of its breadth is covered: a flank of which
+    a corner is missing is still seen.
     """
-    cell = tactile_map.recipe.cell_mm
-    mask = trusted(tactile_map)
-    dx = tactile_map.x_mm[None, :] - centre_mm[0]
-    dy = tactile_map.y_mm[:, None] - centre_mm[1]
+    cell, mask = tactile_map.recipe.cell_mm, trusted(tactile_map)
+    dx, dy = tactile_map.x_mm - centre_mm[0], tactile_map.y_mm[:, None] - centre_mm[1]
     short, view = {}, orientation_of(tactile_map)
     for axis, (x, y) in SIDES.items():
         along, across = dx * x + dy * y, np.abs(dx * y - dy * x)
@@ -284,13 +277,12 @@ def extend_advice(short: dict[str, float]) -> str:
 def undetected(weighed: Weighed, *, where: str) -> Abstention:
     """Reason when noise, or a rib-like ridge, explains the map as well as a lump."""
     at, detection = weighed.centre_mm, weighed.detection
+    rise = f"no lump found {where}: what rises {_near(at)} is"
     if detection.ridge:
-        reason = f"no lump found {where}: what rises near ({at[0]:.1f}, {at[1]:.1f}) mm is rather {detection.ridge}"
-        return Abstention("ridge", reason, FEEL_A_RIB, FEEL_A_RIB_ON_PAPER, at)
+        return Abstention("ridge", f"{rise} rather {detection.ridge}", FEEL_A_RIB, FEEL_A_RIB_ON_PAPER, at)
     if detection.probability < DETECTED:
         reason = f"no lump found {where}: errors of the map explain what rises as well as a lump does"
         return Abstention("undetected", reason, FEEL_AGAIN, FEEL_AGAIN_ON_PAPER)
-    rise = f"no lump found {where}: what rises near ({at[0]:.1f}, {at[1]:.1f}) mm is"
     if weighed.axis_ratio > MOST_AXIS_RATIO:
         return Abstention("ridge", f"{rise} a ridge, not a lump", FEEL_A_RIB, FEEL_A_RIB_ON_PAPER, at)
     reason = f"{rise} wider or less covered than a lump: uneven fat, a rib and the map's rim look so"
@@ -314,14 +306,10 @@ def shape_fault(sigma_x: FloatArray, sigma_y: FloatArray, *, cell_mm: float, pri
 
 
 def width_fault(x: float, y: float, *, cell_mm: float, margin: float) -> Abstention | None:
-    """Reason for widths beyond the cells' or a ridge's limit by a factor of `margin`; else None.
-
-    At the mode `HOPELESS` times the limit is enough: then no draws are needed.
-    """
+    """Reason for widths beyond the cells' or a ridge's limit by a factor of `margin`; else None."""
     wide, narrow = max(x, y), min(x, y)
     if narrow * margin < LEAST_WIDTH_IN_CELLS * cell_mm:
-        reason = f"narrower than a cell (sigma {narrow:.2g} mm on {cell_mm:g} mm cells): not resolved"
-        return _coarse(reason, narrow)
+        return _coarse(f"narrower than a cell (sigma {narrow:.2g} mm on {cell_mm:g} mm cells): not resolved", narrow)
     if wide / narrow > MOST_AXIS_RATIO * margin:
         reason = f"what rises is a ridge, not a lump (sigma {wide:.3g} by {narrow:.3g} mm)"
         return Abstention("ridge", reason, FEEL_A_RIB, FEEL_A_RIB_ON_PAPER)
@@ -383,11 +371,9 @@ def _places(tactile_map: TactileMap) -> tuple[FloatArray, float]:
     rows, columns = np.nonzero(mask)
     x, y = tactile_map.x_mm[columns], tactile_map.y_mm[rows]
     middle = (x.min() + x.max()) / 2, (y.min() + y.max()) / 2
-    axes = []
-    for axis, low, high in ((0, x.min(), x.max()), (1, y.min(), y.max())):
-        number = int((high - low) / spacing / 2)
-        axes.append(middle[axis] + spacing * np.arange(-number, number + 1))
-    grid = [(a, b) for b in axes[1] for a in axes[0]]
+    numbers = (int(np.ptp(one) / spacing / 2) for one in (x, y))
+    across, along = (at + spacing * np.arange(-n, n + 1) for at, n in zip(middle, numbers, strict=True))
+    grid = [(a, b) for b in along for a in across]
     kept = [at for at in grid if covered_share(tactile_map, at, radius_mm=NEAR_MM) >= LEAST_SHARE]
     return np.array(kept or [middle]), spacing
 
@@ -412,16 +398,15 @@ def _smallest(needed: FloatArray, depth_mm: float, fat_mm: float) -> FloatArray:
 
 def lump_features(d_mm: FloatArray, depth_mm: FloatArray | float, fat_mm: FloatArray | float) -> FloatArray:
     """(n, 7) features of balls in fat: size, depth, and how far they stand out of the gland, with products."""
-    d, h = np.log(d_mm / 10.0), np.log(np.broadcast_to(depth_mm, d_mm.shape) / 15.0)
-    seat = np.tanh(2.0 * (fat_mm - np.broadcast_to(depth_mm, d_mm.shape)) / d_mm)
+    depth = np.broadcast_to(depth_mm, d_mm.shape)
+    d, h, seat = np.log(d_mm / 10.0), np.log(depth / 15.0), np.tanh(2.0 * (fat_mm - depth) / d_mm)
     return np.stack([np.ones_like(d), d, h, seat, d * h, d**2, h**2], axis=-1)
 
 
 def needed_amplitudes(tactile_map: TactileMap, centre_mm: tuple[float, float]) -> FloatArray:
     """(widths,) amplitude at which a bump of each of `WIDTHS_MM` at a place reaches `LOG_FACTOR`; inf if none.
 
-    The log Bayes factor is of a bump of this place and width against the window's level, tilt and errors, without the
-    price of the search.
+    That is against the window's level, tilt and errors, without the price of the search.
     """
     cells = window_cells(tactile_map, centre_mm, radius_mm=FIT_RADIUS_MM)
     if len(cells) < LEAST_CELLS:

@@ -219,11 +219,8 @@ def fitted_candidates(tactile_map: TactileMap, options: SamplerSettings) -> Iter
 def fit_bump(
     tactile_map: TactileMap, centre_mm: tuple[float, float], *, options: SamplerSettings
 ) -> tuple[BumpFit | None, str]:
-    """Fit a bump near `centre_mm`; the window follows the fitted centre.
-
-    The fit is None when none can be made at all; the fault says why the bump cannot be a lump, and is empty when it
-    can.
-    """
+    """Fit a bump near `centre_mm`, which the window follows; None when none can be made at all, and why the bump cannot
+    be a lump, empty when it can."""
     check_background(tactile_map, options)
     level = None if options.background == "free" else tactile_map.background
     bump = Bump(rotated=options.rotation == "on", background=level, scale=value_scale(tactile_map))
@@ -244,10 +241,7 @@ def fit_bump(
         weight_variance = float(np.mean(fit.residual**2))
         if settled:
             break
-    if options.correlated:
-        errors = independent_errors(jacobian=fit.jacobian, residual=fit.residual, weight=weight)
-    else:
-        errors = error_model(cells, jacobian=fit.jacobian, residual=fit.residual, weight=weight)
+    errors = independent_errors(fit, weight) if options.correlated else error_model(cells, fit, weight)
     # a map without any noise still has the rounding of its numbers
     rounding = 1e-9 * bump.scale + 1e-14 * float(np.abs(cells.value).max())
     errors = replace(errors, noise_sd=max(errors.noise_sd, rounding))
@@ -261,10 +255,7 @@ def fit_bump(
 def fit_close(
     tactile_map: TactileMap, centre_mm: tuple[float, float], *, options: SamplerSettings
 ) -> tuple[BumpFit | None, str]:
-    """Fit in a window of `CLOSE_IN_RADII`, where a neighbour would pull the bump away.
-
-    The ellipse may turn, so that a ridge shows as one.
-    """
+    """Fit in a window of `CLOSE_IN_RADII`, where a neighbour would pull the bump away; it turns, so a ridge shows."""
     near = replace(options, fit_radius_mm=CLOSE_IN_RADII * options.fit_radius_mm, rotation="on")
     return fit_bump(tactile_map, centre_mm, options=near)
 
@@ -352,9 +343,7 @@ def _start(
 
 def lump_fault(result: BumpFit, options: SamplerSettings) -> str:
     """Reason why a fitted bump is not measured, with the figure and the limit; empty if it can be."""
-    sigma_x, sigma_y, _ = result.widths()
-    cell = result.cells.cell_mm
-    wide, narrow = max(sigma_x, sigma_y), min(sigma_x, sigma_y)
+    (narrow, wide), cell = sorted(result.widths()[:2]), result.cells.cell_mm
     if not result.theta[0] > 0:
         return f"a depression (amplitude {result.theta[0]:.3g})"
     if not np.isfinite(result.covariance).all():

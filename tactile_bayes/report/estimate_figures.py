@@ -15,7 +15,8 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.result import Estimate, FittedCells, fitted_cells
+from tactile_bayes.posterior.bump import FitCells
+from tactile_bayes.posterior.result import Estimate, fitted_cells
 from tactile_bayes.report.estimate_text import exams_label, no_estimate_line
 from tactile_bayes.report.figure_file import figure_file, finish, load_matplotlib
 from tactile_bayes.report.map import draw_panel, map_figure
@@ -44,8 +45,8 @@ def draw_fit(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, 
     fitted = fitted_cells(estimate)
     assert fitted is not None
     two = fitted.shared is not None
-    given = [fitted.value, fitted.fit, *([] if fitted.shared is None else [fitted.shared]), fitted.residual]
-    window, (value, fit, *left) = _window(tactile_map, fitted, given)
+    given = [fitted.cells.value, fitted.fit, *([] if fitted.shared is None else [fitted.shared]), fitted.residual]
+    window, (value, fit, *left) = _window(tactile_map, fitted.cells, given)
     low, high = (float(end) for end in np.nanquantile(np.stack([value, fit]), _ENDS))
     most = max(float(np.nanquantile(np.abs(left), _ENDS[1])), 1e-12)
     rest = fitted.residual
@@ -64,12 +65,10 @@ def draw_fit(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, 
 
 
 def _window(
-    tactile_map: TactileMap, fitted: FittedCells, given: Sequence[FloatArray]
+    tactile_map: TactileMap, cells: FitCells, given: Sequence[FloatArray]
 ) -> tuple[TactileMap, list[FloatArray]]:
     """The map cut to the window, and values of the window's cells on its grid, NaN outside the window."""
-    cell = tactile_map.recipe.cell_mm
-    columns = np.rint((fitted.x_mm - tactile_map.x_mm[0]) / cell).astype(int)
-    rows = np.rint((fitted.y_mm - tactile_map.y_mm[0]) / cell).astype(int)
+    rows, columns = cells.row, cells.column
     part = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
     cut = replace(
         tactile_map,
@@ -79,12 +78,8 @@ def _window(
         x_mm=tactile_map.x_mm[part[1]],
         y_mm=tactile_map.y_mm[part[0]],
     )
-    grids = []
-    for values in given:
-        grid = np.full(tactile_map.mean.shape, np.nan)
-        grid[rows, columns] = values
-        grids.append(grid[part])
-    return cut, grids
+    inside, *grids = cells.on_grid(np.stack([np.ones(len(cells)), *given]))
+    return cut, [np.where(inside > 0, grid, np.nan) for grid in grids]
 
 
 # --- Picture of a size posterior: densities, medians and intervals of the largest and smallest size.

@@ -40,11 +40,11 @@ def estimated(noise: str, *, slope: float) -> SizeEstimate:
 def test_the_fit_is_the_truth_to_within_its_noise_and_the_residual_is_the_noise(noise: str, slope: float) -> None:
     fitted = fitted_cells(estimated(noise, slope=slope).estimate)
     assert fitted is not None
-    off = fitted.fit - truth(fitted.x_mm, fitted.y_mm, amplitude=0.4, slope=slope)
+    off = fitted.fit - truth(fitted.cells.x_mm, fitted.cells.y_mm, amplitude=0.4, slope=slope)
     assert np.abs(off).max() < NOISE_SD  # some ten parameters from over a thousand cells
     assert fitted.residual.std() == pytest.approx(NOISE_SD, rel=0.06)
     # the control: the bump alone is no fit of a sloping map
-    flat = fitted.value - truth(fitted.x_mm, fitted.y_mm, amplitude=0.4, slope=0.0)
+    flat = fitted.cells.value - truth(fitted.cells.x_mm, fitted.cells.y_mm, amplitude=0.4, slope=0.0)
     assert bool(flat.std() > 2 * NOISE_SD) is bool(slope)
 
 
@@ -72,11 +72,11 @@ def test_what_neighbours_share_is_drawn_apart_so_that_the_rest_is_noise() -> Non
     fitted = fitted_cells(tb.estimate(made, size_calibration="none", method="laplace", noise="field").estimate)
     assert fitted is not None
     assert fitted.shared is not None
-    left = fitted.value - fitted.fit
+    left = fitted.cells.value - fitted.fit
     assert np.mean(left > 0) > 0.65  # what the figure showed as one
     assert 0.47 < np.mean(fitted.residual > 0) < 0.53
     assert fitted.residual.std() == pytest.approx(NOISE_SD, rel=0.1)
-    away = np.hypot(fitted.x_mm, fitted.y_mm)
+    away = np.hypot(fitted.cells.x_mm, fitted.cells.y_mm)
     assert fitted.shared[away < 12].mean() > fitted.shared[away > 18].mean() + 0.5 * NOISE_SD
 
 
