@@ -118,9 +118,8 @@ def summarise(
 ) -> Quantity:
     """Summarise draws with their equal-tailed interval, leaving NaN out; `ValueError` when no draw is finite.
 
-    `effective_draws` is how many independent draws they are worth for a tail (by default all). With `replicates`, the
-    label of the independent replicate of each draw in the order of ``draws.ravel()``, the Monte-Carlo error comes from
-    the spread between replicates instead.
+    The Monte-Carlo error comes from the spread between the `replicates` of ``draws.ravel()``, or without them from how
+    many independent draws they are worth for a tail (by default all).
     """
     flat = draws.ravel()
     finite = np.isfinite(flat)
@@ -134,8 +133,7 @@ def summarise(
         step = float(np.sqrt(tail * (1.0 - tail) / max(effective_draws or values.size, 1.0)))
     else:
         step = _tail_error(values, replicates[finite], (low, high))
-    # an end's standard error is half the way between order statistics a standard error below and above (Maritz-Jarrett
-    # in spirit)
+    # an end's standard error is half the way between order statistics a standard error below and above
     about = np.clip([tail - step, tail + step, 1 - tail - step, 1 - tail + step], 0.0, 1.0)
     ends = quantiles_of(ordered, about)
     return Quantity(
@@ -223,10 +221,8 @@ class Solved:
 
 
 def distinct_rows(rows: FloatArray) -> tuple[FloatArray, IndexArray]:
-    """Distinct rows in order, and the index of each row among them: ``np.unique``, quicker for random points.
-
-    No two of those agree in their first coordinate; where some do, rows are compared as a whole.
-    """
+    """Distinct rows in order, and the index of each row among them: ``np.unique``, quicker where no two rows agree in
+    their first coordinate."""
     _, first, back = np.unique(rows[:, 0], return_index=True, return_inverse=True)
     if np.array_equal(rows[first[back]], rows):
         return rows[first], back
@@ -406,11 +402,10 @@ LEAST_SD = 1e-2  #: Least SD of a component, as a share of the mixture's: a narr
 def paired_points(key: FloatArray, replicates: Labels, dimension: int, rng: np.random.Generator) -> FloatArray:
     """(n, dimension) uniform points in (0, 1) for drawing further quantities, one point per draw.
 
-    The (n,) `key` is what the result depends on most among the draws, such as their log size; every replicate gets a
-    random shift of its own; `dimension` is at most `MOST_PAIRED`. Within a replicate the rank of the key and the point
-    together are a Sobol set under a random digital shift, sorted by its first coordinate (L'Ecuyer, Lecot & Tuffin
-    2008, Operations Research 56:958, sort their chains so). A sum over the draws then has the error of an integral of
-    few dimensions, not that of as many random numbers.
+    The (n,) `key` is what the result depends on most among the draws, such as their log size; `dimension` is at most
+    `MOST_PAIRED`. Within a replicate the rank of the key and the point together are a Sobol set under a random digital
+    shift, sorted by its first coordinate (L'Ecuyer, Lecot & Tuffin 2008, Operations Research 56:958, sort their chains
+    so). A sum over the draws then has the error of an integral of few dimensions.
     """
     counts = np.bincount(replicates)
     shifts = rng.integers(2**BITS, size=(len(counts), dimension + 1), dtype=np.uint32)

@@ -29,11 +29,8 @@ def _arviz() -> Any:
 
 
 def chain_diagnostics(chains: FloatArray) -> dict[str, float]:
-    """Worst rank-normalised R-hat and smallest bulk and tail effective draws over the parameters of (chain, draw, p)
-    draws.
-
-    Vehtari, Gelman, Simpson, Carpenter & Buerkner (2021), Bayesian Analysis 16:667.
-    """
+    """Worst R-hat and smallest bulk and tail effective draws over the parameters of (chain, draw, p) draws (Vehtari,
+    Gelman, Simpson, Carpenter & Buerkner 2021, Bayesian Analysis 16:667)."""
     each = [_agreement(np.ascontiguousarray(chains[:, :, i])) for i in range(chains.shape[2])]
     return {name: (max if name == "rhat" else min)(one[name] for one in each) for name in each[0]}
 
@@ -46,12 +43,8 @@ def _agreement(draws: FloatArray) -> dict[str, float]:
 
 
 def convergence(draws: FloatArray) -> dict[str, float]:
-    """R-hat, effective draws and Monte-Carlo errors of one quantity from (chain, draw) draws.
-
-    ``rhat`` (rank-normalised, split), ``ess_bulk``, ``ess_tail``, and ``mcse_median``, ``mcse_low``, ``mcse_high`` of
-    the median and the ends of the central 95 %, in the quantity's unit. Draws without a value (NaN) count as the
-    smallest, as they do among ranks.
-    """
+    """R-hat, effective draws and Monte-Carlo errors (of the median and the ends of the central 95 %, in the quantity's
+    unit) from (chain, draw) draws; those without a value count as the smallest, as they do among ranks."""
     known = np.where(np.isfinite(draws), draws, np.nanmin(draws))
     errors = {"mcse_median": 0.5, "mcse_low": 0.025, "mcse_high": 0.975}
     quantile = {name: float(_arviz().mcse(known, method="quantile", prob=at)) for name, at in errors.items()}
@@ -134,8 +127,7 @@ def ensemble(
     store: ChainStore | None = None,
     key: str = "",
 ) -> ParameterDraws:
-    """Draw from a log density, (m, p) to (m,), starting from given draws or from overdispersed normal draws about its
-    mode.
+    """Draw from a log density, (m, p) to (m,), starting from given draws or from overdispersed ones about its mode.
 
     Differential-evolution moves (ter Braak 2006) in emcee (Foreman-Mackey et al. 2013), from the (p,) mode and (p, p)
     approximate covariance or from some of the (n, p) draws in `start`. The first third of each ensemble's steps is
@@ -166,9 +158,9 @@ def ensemble(
         if progress is not None:
             progress(int(min(least, options.least_ess)), int(options.least_ess))
         if least >= options.least_ess and figures["rhat"] <= options.most_rhat:
-            figures |= {"steps": float(steps), "walkers": float(samplers[0].walkers), "ensembles": len(samplers)}
-            figures |= {"evaluations": float(steps * samplers[0].walkers * len(samplers))}
-            figures |= {"acceptance": float(np.mean([sampler.acceptance() for sampler in samplers]))}
+            walkers, accepted = samplers[0].walkers, [sampler.acceptance() for sampler in samplers]
+            figures |= {"steps": float(steps), "walkers": float(walkers), "ensembles": len(samplers)}
+            figures |= {"evaluations": float(steps * walkers * len(samplers)), "acceptance": float(np.mean(accepted))}
             return _kept_draws(samplers, chains, figures, log_density=log_density, keep=options.keep)
     if not figures:
         raise NotConvergedError(f"the checkpoint has {samplers[0].steps} steps, more than max_steps allows")

@@ -196,25 +196,22 @@ def fitted_gaussians(
     weight, _ = smooth_weights(log_target - log_share)
     mean = weight @ theta
     whole = _covariance(theta, weight, mean)
-    fitted = Gaussians.one(mean, whole)
     means, covariances = [mean], [whole]
-    for number in range(MOST_ADDED):
+    for number in range(1, MOST_ADDED + 1):
         weight, shape = smooth_weights(log_target - log_share)
         if 1.0 / np.sum(weight**2) > ENOUGH * len(theta) and shape <= LIGHT_TAIL:
             break
         centre = theta[np.argmax(log_target - log_share)]
-        added = Gaussians.one(centre, _covariance_about(theta, weight, centre, whole))
-        points = centre + rng.standard_normal((ADDED, len(centre))) @ np.linalg.cholesky(added.covariance[0]).T
-        log_share = np.logaddexp(log_share, np.log(ADDED) + added.log_density(theta))
         means.append(centre)
-        covariances.append(added.covariance[0])
-        earlier = Gaussians(np.full(number + 1, 1.0 / (number + 1)), np.array(means[1:]), np.array(covariances[1:]))
-        there = np.log(ADDED * (number + 1)) + earlier.log_density(points)
+        covariances.append(_covariance_about(theta, weight, centre, whole))
+        points = centre + rng.standard_normal((ADDED, len(centre))) @ np.linalg.cholesky(covariances[-1]).T
+        log_share = np.logaddexp(log_share, np.log(ADDED) + Gaussians.one(centre, covariances[-1]).log_density(theta))
+        earlier = Gaussians(np.full(number, 1.0 / number), np.array(means[1:]), np.array(covariances[1:]))
+        there = np.log(ADDED * number) + earlier.log_density(points)
         log_share = np.concatenate([log_share, np.logaddexp(np.log(n) + first.log_density(points), there)])
         theta, log_target = np.concatenate([theta, points]), np.concatenate([log_target, log_density(points)])
-        size = np.array([n, *[ADDED] * (number + 1)], dtype=np.float64)
-        fitted = Gaussians(size / size.sum(), np.array(means), np.array(covariances))
-    return fitted, ADDED * (len(fitted) - 1)
+    size = np.array([n, *[ADDED] * (len(means) - 1)], dtype=np.float64)
+    return Gaussians(size / size.sum(), np.array(means), np.array(covariances)), ADDED * (len(means) - 1)
 
 
 def _covariance(theta: FloatArray, weight: FloatArray, centre: FloatArray) -> FloatArray:
@@ -275,13 +272,12 @@ def importance(
 
     The proposal has the (p,) mode and (p, p) covariance given, or is made of `parts`, Gaussians that the density is
     about a mixture of, where one of them is `TOO_WIDE` for the one above. `NotConvergedError` when the weights' tail is
-    too heavy, or the error is not reached; `ensemble` is the next method to try.
+    too heavy even for a mixture fitted to the points (`fitted_gaussians`), or the error is not reached.
 
     The points are a Sobol set under random digital shifts. The proposal is smooth, close to a normal in its middle and
     wider in its tails, so that the points stay even and the weights bounded where the density falls a little more
     slowly than a normal. Put the parameters that matter first: a Sobol set fills its first coordinates most evenly, and
-    the proposal's root is triangular. Where the weights' tail stays too heavy a mixture is fitted to the points
-    (`fitted_gaussians`), once, and new points are drawn from it.
+    the proposal's root is triangular.
     """
     options = options or ImportanceOptions()
     gaussians = Gaussians.one(mode, covariance)
@@ -303,16 +299,12 @@ def importance(
     lp, log_weight = sampler.log_target.ravel()[chosen], sampler.log_weights.ravel()[chosen] - log_evidence
     statistics = {"lp": lp[None], "log_weight": log_weight[None]}
     labels = chosen // sampler.points
-    return draws.ParameterDraws(
-        sampler.theta[chosen][None], "importance", figures, labels=labels, statistics=statistics
-    )
+    return draws.ParameterDraws(sampler.theta[chosen][None], "importance", figures, labels, statistics)
 
 
 def _sampled(sampler: _Sampler, options: ImportanceOptions) -> _Sampler:
-    """More points until the error is reached, if need be from a proposal fitted to them.
-
-    Where the fitted proposal turns out worse than the first one, the first one goes on if its points can be trusted.
-    """
+    """More points until the error is reached, if need be from a proposal fitted to them; where that is worse the first
+    one goes on if its points can be trusted."""
     wanted = options.accuracy_sd
     if sampler.extended(wanted, most=min(FITTED_AT, options.most), patience=ADAPTED_FROM).reached(wanted):
         return sampler
@@ -365,10 +357,8 @@ def _settled(
 
 
 class _Sampler:
-    """Points with densities and smoothed weights, in order of the replicates.
-
-    Replicates are independent random shifts of the point set; their spread is the error.
-    """
+    """Points with densities and smoothed weights, by replicate: independent shifts of the set, whose spread is the
+    error."""
 
     weights: FloatArray  #: (n,) of all points.
     shape: float  #: Pareto shape of their tail.
@@ -421,13 +411,10 @@ class _Sampler:
         self.weights, self.shape = smooth_weights(self.log_weights.ravel())
 
     def extended(self, accuracy_sd: float, *, most: int, patience: int, heavy: float = 0.0) -> _Sampler:
-        """Double the points until the error is reached, or `most` a replicate.
-
-        Or until the tail is heavier than trusted by `heavy`, from `patience` points a replicate on.
-        """
+        """Double the points until the error is reached, or `most` a replicate, or the tail is heavier than trusted by
+        `heavy`, from `patience` points a replicate on."""
         while True:
-            # a few replicates' spread misses what a heavy tail does now and then: 0.036 SD was seen where they said
-            # 0.015
+            # a few replicates' spread misses what a heavy tail does now and then: 0.036 SD was seen for 0.015
             self.error = self._end_error() * (1.0 + max(self.shape, 0.0) if np.isfinite(self.shape) else 1.0)
             hopeless = self.points >= patience and not _trusted(self.shape - heavy)
             if self.reached(accuracy_sd) or self.points >= most or hopeless:

@@ -39,9 +39,8 @@ def finite_differences(values: FloatArray, *, step: FloatArray) -> tuple[FloatAr
 def optimise(theta: FloatArray, covariance: FloatArray, *, dof: float, rng: np.random.Generator) -> ParameterDraws:
     """Draw about the (p,) least-squares estimate, with its (p, p) covariance and t tails for the estimated noise.
 
-    The covariance includes correlated errors; `dof` are the noise estimate's effective degrees of freedom. Wellman &
-    Howe (1999), section 2.4, minimise the squared error between map and Eq 7; the covariance of that estimate is this
-    program's addition.
+    Wellman & Howe (1999), section 2.4, minimise the squared error between map and Eq 7; the covariance, which includes
+    correlated errors, is this program's addition.
     """
     flat = student_draws(theta, covariance, dof=dof, number=INDEPENDENT_DRAWS, rng=rng)
     return ParameterDraws(flat[None], "optimise", {"draws": float(INDEPENDENT_DRAWS)})
@@ -83,10 +82,8 @@ def inverse_information(jacobian: FloatArray, weight: FloatArray) -> FloatArray:
 
 def numerical_jacobian(model: ModelFunction, theta: FloatArray, *, scale: FloatArray) -> FloatArray:
     """(k, p) Jacobian by central differences; `scale` (p,) is the model's typical length in each parameter."""
-    step = 1e-5 * scale
-    shifts = np.diag(step)
-    values = model(np.concatenate([theta + shifts, theta - shifts]))
-    p = len(theta)
+    step, p = 1e-5 * scale, len(theta)
+    values = model(np.concatenate([theta + np.diag(step), theta - np.diag(step)]))
     return np.asarray((values[:p] - values[p:]).T / (2.0 * step))
 
 
@@ -112,8 +109,7 @@ def fit_least_squares(
     """
     theta = np.array(start, dtype=np.float64)
     residual = data - model(theta[None])[0]
-    sse = float(weight @ residual**2)
-    damping, grow = 1e-3, 2.0
+    sse, damping, grow = float(weight @ residual**2), 1e-3, 2.0
     jacobian = numerical_jacobian(model, theta, scale=scale)
     for iteration in range(1, MOST_ITERATIONS + 1):
         step = _damped_step(jacobian, residual, weight=weight, scale=scale, damping=damping)
@@ -144,8 +140,7 @@ def _damped_step(
 ) -> FloatArray:
     """Step in units of `scale`; each column is damped by its own curvature and by a floor."""
     scaled = jacobian * scale
-    information = scaled.T @ (weight[:, None] * scaled)
-    gradient = scaled.T @ (weight * residual)
+    information, gradient = scaled.T @ (weight[:, None] * scaled), scaled.T @ (weight * residual)
     diagonal = np.diag(information)
     floor = 1e-12 * max(float(diagonal.max()), np.finfo(float).tiny)
     try:
@@ -164,11 +159,9 @@ MOST_STEPS = 100
 def laplace(
     log_density: LogDensity, start: FloatArray, *, scale: FloatArray, dof: float, rng: np.random.Generator
 ) -> ParameterDraws:
-    """Draw from the t density with the mode and curvature of a log density.
+    """Draw from the t density with the mode and curvature of a log density, as `mode_and_covariance` finds them.
 
-    Given the noise scale the approximation is normal; that scale has `dof` degrees of freedom, so the draws are those
-    of a multivariate t. For a linear model this is exact. `log_density`, `start` and `scale` as in
-    `mode_and_covariance`.
+    Given the noise scale, of `dof` degrees of freedom, the approximation is normal. For a linear model it is exact.
     """
     mode, covariance, steps = mode_and_covariance(log_density, start, scale=scale)
     widened = covariance if np.isinf(dof) else covariance * (dof + len(mode)) / dof
@@ -181,8 +174,8 @@ def mode_and_covariance(
 ) -> tuple[FloatArray, FloatArray, int]:
     """Mode of a log density by damped Newton steps, the inverse of its negative Hessian there, and the number of steps.
 
-    The density maps (m, p) to (m,); the (p,) scale is about one posterior standard deviation of each parameter.
-    `NotConvergedError` when no mode is found or the curvature there is not that of a maximum.
+    The (p,) scale is about one posterior standard deviation of each parameter. `NotConvergedError` when no mode is
+    found or the curvature there is not that of a maximum.
     """
     mode, taken = find_mode(log_density, start, scale=scale, tolerance=tolerance)
     _, hessian = _slopes(log_density, mode, step=5e-2 * scale)
@@ -195,11 +188,8 @@ def mode_and_covariance(
 def find_mode(
     log_density: LogDensity, start: FloatArray, *, scale: FloatArray, tolerance: float = 1e-4
 ) -> tuple[FloatArray, int]:
-    """As `mode_and_covariance`, without the curvature.
-
-    The last step is smaller than `tolerance` in units of `scale`. A mode is nearer than that: steps shrink as their
-    squares, down to the error of differences.
-    """
+    """As `mode_and_covariance`, without the curvature; the last step, smaller than `tolerance` in units of `scale`, is
+    farther than the mode: steps shrink as their squares, down to the error of differences."""
     theta = np.array(start, dtype=np.float64)
     value = float(log_density(theta[None])[0])
     damping = 1e-8

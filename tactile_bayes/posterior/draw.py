@@ -174,8 +174,7 @@ class Sampled(Record, eq=False):
     """Density to be sampled: the bump's parameters, with a second structure's fixed at their mode.
 
     A rib whose crest lies outside the window shows a flank only: its place and width trade against each other along a
-    curve that no sampler follows cheaply and that hardly concerns the bump. What that costs the bump in certainty is
-    added afterwards, as large as the Gaussians have it.
+    curve that no sampler follows cheaply. What that costs the bump in certainty is added as the Gaussians have it.
     """
 
     log_density: LogDensity  #: (m,) of (m, k) parameters of the bump.
@@ -231,8 +230,7 @@ def draw_parameters(
 ) -> tuple[ParameterDraws, tuple[str, ...]]:
     """Draw by the requested method, or by the next one if its diagnostics fail, with the faults of those before it.
 
-    Importance sampling leaves what it solved in `solved`. `NotConvergedError` when the last method does not converge
-    either; its message says what was wrong with each.
+    `NotConvergedError` when the last method does not converge either; its message says what was wrong with each.
     """
     passed_over: list[str] = []
     figures: Mapping[str, float] = {}
@@ -301,10 +299,8 @@ def ensemble_draws(
     accuracy_sd: float | None = None,
     progress: Progress | None = None,
 ) -> ParameterDraws:
-    """Draw by MCMC, under a noise field starting from importance draws.
-
-    `NotConvergedError` when the chains do not agree with each other, or not with the importance draws.
-    """
+    """Draw by MCMC, under a noise field starting from importance draws; `NotConvergedError` when chains do not agree
+    with each other, or not with those."""
     settings = EnsembleOptions()
     if options.max_steps is not None:
         settings = replace(settings, max_steps=options.max_steps)

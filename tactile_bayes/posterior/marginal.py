@@ -325,8 +325,7 @@ class CollapsedTarget:
         return np.concatenate([one.evidence for one in self._solutions(theta)]) + self._made_up
 
     def settle_fields(self, theta: FloatArray) -> bool:
-        """Keep only the noise fields with evidence at one shape; the others cost time and add nothing. True if that
-        changed."""
+        """Keep only the noise fields with evidence at one shape; True if that changed which."""
         before = self.chosen_fields()
         self._fields, self._made_up = self.linear.with_evidence(self.scene.templates(theta[None], self.window))
         return before != self.chosen_fields()
@@ -351,11 +350,8 @@ class CollapsedTarget:
         return {"field_length_mm": float(weight @ length), "field_share": float(weight @ (share / (1.0 + share)))}
 
     def conditional(self, theta: FloatArray) -> Solution:
-        """Linear solutions at (m, p) vectors under each of h fields.
-
-        Log of prior times evidence (m, h), and of `LinearSolution` the amplitudes (m, h, v), their power (m, h, v, v),
-        by how much the level falls with each (m, h, v), and the sum of squares (m, h).
-        """
+        """Solutions at (m, p) vectors under each of h fields: log of prior times evidence (m, h), and amplitudes
+        (m, h, v), their power (m, h, v, v), the level's fall with each (m, h, v) and the sum of squares (m, h)."""
         parts = [
             (one.evidence, one.amplitude, one.power, one.level_slope[..., 0], one.sum_of_squares)
             for one in self._solutions(theta)
@@ -365,10 +361,7 @@ class CollapsedTarget:
     def draw_linear(
         self, theta: FloatArray, rng: np.random.Generator, *, solved: Solved | None = None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Draw amplitudes (m, v), level (m,) and noise scale (m,) given the shape: exact, field first.
-
-        Points that `solved` knows are not solved again.
-        """
+        """Draw amplitudes (m, v), level (m,) and noise scale (m,) given the shape: exact, field first."""
         unique, back = distinct_rows(theta)
         evidence, centre, power, slope, squares = (solved or self.conditional)(unique)
         c = len(self.linear.plain) - 1
@@ -437,10 +430,7 @@ class CollapsedTarget:
         return np.asarray(np.exp(evidence - np.logaddexp.reduce(evidence)))
 
     def gains(self, templates: Templates, theta: FloatArray) -> FloatArray:
-        """(m,) log evidence gained at `theta` by adding each template; -inf for a dent.
-
-        Fields are those settled; the scene has one structure.
-        """
+        """(m,) log evidence gained at one shape, of one structure, by adding each template; -inf for a dent."""
         (bump,) = self.scene.templates(theta[None], self.window)
         (alone,), _ = self.linear.projected([bump])
         (beside,), _ = self.linear.projected([templates])
