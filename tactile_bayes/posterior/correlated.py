@@ -251,12 +251,11 @@ def with_neighbours(
     ridges = neighbours.rising_ribs(choice.plain, surroundings)
     choice = neighbours.add_beside(choice, surroundings, ridges=ridges, scene=asked)
     ridge = neighbours.ridge_instead(choice, ridges)
-    if ridge is None or ridge.log_evidence < choice.plain.target.null_log_evidence():
-        return ask_departure(choice), detection
-    against = ridge.log_evidence + _searched(choice.plain, tactile_map)
-    detection = detection_from_odds(choice.fit.log_evidence - against, ridge=neighbours.ridge_text(ridge))
-    if detection.probability < DETECTED and (both := neighbours.beside_ridge(choice, ridge)) is not None:
-        detection = detection_from_odds(both.log_evidence - against, ridge=detection.ridge)
+    if ridge is not None and ridge.log_evidence >= choice.plain.target.null_log_evidence():
+        against = ridge.log_evidence + _searched(choice.plain, tactile_map)
+        detection = detection_from_odds(choice.fit.log_evidence - against, ridge=neighbours.ridge_text(ridge))
+        if detection.probability < DETECTED and (both := neighbours.beside_ridge(choice, ridge)) is not None:
+            detection = detection_from_odds(both.log_evidence - against, ridge=detection.ridge)
     return ask_departure(choice), detection
 
 

@@ -104,10 +104,9 @@ class FieldFit(Record, eq=False, dict=True):
         mean, covariance = self.mixture.moments()
         k, target = self.scene.own, self.target
         parts = newton_mixture(target, self.mode, self.covariance, least_share=NEGLIGIBLE)
-        key = partial(checkpoint_key, self)
         if k == len(mean):
             density = target if solved is None else partial(target, solved=solved)
-            return Sampled(density, mean, covariance, parts, checkpoint_key=key)
+            return Sampled(density, mean, covariance, parts, checkpoint_key=self.checkpoint_key)
         across, beside = covariance[:k, k:], self.mode[k:]
         added = across @ np.linalg.solve(covariance[k:, k:], across.T)
         values, vectors = np.linalg.eigh(0.5 * (added + added.T))
@@ -120,8 +119,30 @@ class FieldFit(Record, eq=False, dict=True):
             given,
             beside,
             spread,
-            key,
+            self.checkpoint_key,
         )
+
+    def checkpoint_key(self, settings: str, rng: np.random.Generator) -> str:
+        """Hash of everything that a chain depends on: cells, scene, priors, fields, settings and seed."""
+        target, digest = self.target, hashlib.sha256()
+        cells = target.window.cells
+        arrays = [cells.x_mm, cells.y_mm, cells.value, cells.count, target.window.variance, self.mode, self.covariance]
+        arrays += [] if target.problem.departure is None else [target.problem.departure]
+        for values in arrays:
+            digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
+        said = {
+            "scene": as_dict(self.scene),
+            "prior": as_dict(target.problem.prior),
+            "scale": target.problem.amplitude_scale,
+            "bounds": [target.problem.widest_mm, target.problem.radius_mm],
+            "fields": target.chosen_fields(),
+            "cosines": target.window.cosines,
+            "pose_noise": None if cells.pose_noise is None else as_dict(cells.pose_noise),
+            "settings": settings,
+            "rng": str(rng.bit_generator.state),
+        }
+        digest.update(json.dumps(said, sort_keys=True).encode())
+        return digest.hexdigest()
 
 
 def fit_scene(problem: Problem, scene: Scene, start: FloatArray) -> FieldFit:
@@ -185,30 +206,6 @@ def _newton_gaussian(
     if np.sqrt(step @ np.linalg.solve(limit, step)) > 3.0:
         return None
     return step, covariance, 0.5 * float(gradient @ step)
-
-
-def checkpoint_key(fit: FieldFit, settings: str, rng: np.random.Generator) -> str:
-    """Hash of everything that a chain depends on: cells, scene, priors, fields, settings and seed."""
-    target = fit.target
-    digest = hashlib.sha256()
-    cells = target.window.cells
-    arrays = [cells.x_mm, cells.y_mm, cells.value, cells.count, target.window.variance, fit.mode, fit.covariance]
-    arrays += [] if target.problem.departure is None else [target.problem.departure]
-    for values in arrays:
-        digest.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
-    said = {
-        "scene": as_dict(fit.scene),
-        "prior": as_dict(target.problem.prior),
-        "scale": target.problem.amplitude_scale,
-        "bounds": [target.problem.widest_mm, target.problem.radius_mm],
-        "fields": target.chosen_fields(),
-        "cosines": target.window.cosines,
-        "pose_noise": None if cells.pose_noise is None else as_dict(cells.pose_noise),
-        "settings": settings,
-        "rng": str(rng.bit_generator.state),
-    }
-    digest.update(json.dumps(said, sort_keys=True).encode())
-    return digest.hexdigest()
 
 
 # --- Derivatives of a window's cells by all free parameters of a fitted scene.

@@ -12,7 +12,6 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import SMOOTHING_MM, smoothed_excess
 from tactile_bayes.posterior.draw import ModalBump
 from tactile_bayes.posterior.fit import (
-    ASKING,
     LEAST_ODDS,
     FieldFit,
     SceneChoice,
@@ -129,8 +128,6 @@ def add_beside(
     `ridges` are where a rib can be: `rising_ribs`. What is found must stand out on the map by `LEAST_RISE` of the
     bump's amplitude, see `Surroundings.rise`. What is not found is not in the fit, even if `scene` names it.
     """
-    if scene not in ASKING:
-        return choice
     plain, wanted = choice.plain, WANTED.get(scene)
     lumps = second_lumps(plain)
     places: dict[Neighbour, FloatArray] = {

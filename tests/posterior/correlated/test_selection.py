@@ -12,7 +12,7 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import neighbours as beside
 from tactile_bayes.posterior.bump import window_cells
-from tactile_bayes.posterior.fit import SceneChoice, Structure, choose_shape
+from tactile_bayes.posterior.fit import ASKING, SceneChoice, Structure, choose_shape
 from tactile_bayes.posterior.marginal import Scene
 from tactile_bayes.posterior.neighbours import Surroundings, add_beside, rising_ribs
 from tactile_bayes.posterior.window import Problem, Window, independent_variance
@@ -44,6 +44,8 @@ def choose(values: np.ndarray, *, scene: str = "auto", width: float = 5.0, r: fl
     start = np.array([np.log(width), np.log(width), 1.0, -1.0, r])
     window = Window(cells, independent_variance(cells))
     choice = choose_shape(Problem(window, BumpPrior(), RADIUS), start, scene=scene)
+    if scene not in ASKING:
+        return choice
     surroundings = Surroundings.of(tactile_map)
     return add_beside(choice, surroundings, ridges=rising_ribs(choice.plain, surroundings), scene=scene)
 
