@@ -191,8 +191,8 @@ def on_map(tactile_map: TactileMap, x_mm: float, y_mm: float) -> bool:
 def covered_share(tactile_map: TactileMap, centre_mm: tuple[float, float], *, radius_mm: float) -> float:
     """Share of the disc about `centre_mm` that the map covers, counting what lies beyond its edge as not covered."""
     cell = tactile_map.recipe.cell_mm
-    disc = np.pi * max(radius_mm, 0.75 * cell) ** 2 / cell**2
-    return min(1.0, len(window_cells(tactile_map, centre_mm, radius_mm=max(radius_mm, 0.75 * cell))) / disc)
+    radius_mm = max(radius_mm, 0.75 * cell)
+    return min(1.0, len(window_cells(tactile_map, centre_mm, radius_mm=radius_mm)) / (np.pi * radius_mm**2 / cell**2))
 
 
 def typical_level(tactile_map: TactileMap) -> float:

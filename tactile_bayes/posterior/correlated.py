@@ -11,7 +11,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import MOST_PAIRED, ParameterDraws, Solved, paired_points
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior import neighbours
-from tactile_bayes.posterior.bump import covariance_from_log_widths, drawn_widths, overlap, trusted
+from tactile_bayes.posterior.bump import covariance_from_log_widths, drawn_widths, overlap, smoothed_excess, trusted
 from tactile_bayes.posterior.detection import Detection, detection_from_odds
 from tactile_bayes.posterior.draw import (
     DETECTED,
@@ -247,7 +247,7 @@ def with_neighbours(
     """
     if asked not in ASKING:
         return ask_departure(choice), detection
-    surroundings = neighbours.Surroundings.of(tactile_map)
+    surroundings = neighbours.Surroundings(tactile_map.x_mm, tactile_map.y_mm, smoothed_excess(tactile_map))
     ridges = neighbours.rising_ribs(choice.plain, surroundings)
     choice = neighbours.add_beside(choice, surroundings, ridges=ridges, scene=asked)
     ridge = neighbours.ridge_instead(choice, ridges)

@@ -458,7 +458,8 @@ class CollapsedTarget:
                     yield spanned.solution(fields)
                     continue
             for j in range(0, len(points), BLOCK):
-                yield self.linear.under_each(self.scene.templates(points[j : j + BLOCK], self.window), fields)
+                projected, cross = self.linear.projected(self.scene.templates(points[j : j + BLOCK], self.window))
+                yield joined([self.linear.under(projected, cross, columns) for columns in fields])
 
 
 def choose(evidence: FloatArray, rng: np.random.Generator) -> IndexArray:

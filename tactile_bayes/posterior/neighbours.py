@@ -8,8 +8,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.geometry import BoolArray, FloatArray
-from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.bump import SMOOTHING_MM, smoothed_excess
+from tactile_bayes.posterior.bump import SMOOTHING_MM
 from tactile_bayes.posterior.draw import ModalBump
 from tactile_bayes.posterior.fit import (
     LEAST_ODDS,
@@ -40,11 +39,6 @@ class Surroundings(Record, eq=False):
     x_mm: FloatArray  #: (nx,) array.
     y_mm: FloatArray  #: (ny,) array.
     excess: FloatArray  #: (ny, nx) array.
-
-    @classmethod
-    def of(cls, tactile_map: TactileMap) -> Surroundings:
-        """Prepare from a map."""
-        return cls(tactile_map.x_mm, tactile_map.y_mm, smoothed_excess(tactile_map))
 
     def rise(self, extra: Neighbour, places: FloatArray, bump: ModalBump, *, middle: tuple[float, float]) -> FloatArray:
         """(g,) excess of the map, without a round bump, under second lumps or ribs; -inf where the map has no data.

@@ -11,7 +11,7 @@ from posterior_maps import bump_values, correlated_field, grid_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import neighbours as beside
-from tactile_bayes.posterior.bump import window_cells
+from tactile_bayes.posterior.bump import smoothed_excess, window_cells
 from tactile_bayes.posterior.fit import ASKING, SceneChoice, Structure, choose_shape
 from tactile_bayes.posterior.marginal import Scene
 from tactile_bayes.posterior.neighbours import Surroundings, add_beside, rising_ribs
@@ -46,7 +46,7 @@ def choose(values: np.ndarray, *, scene: str = "auto", width: float = 5.0, r: fl
     choice = choose_shape(Problem(window, BumpPrior(), RADIUS), start, scene=scene)
     if scene not in ASKING:
         return choice
-    surroundings = Surroundings.of(tactile_map)
+    surroundings = Surroundings(tactile_map.x_mm, tactile_map.y_mm, smoothed_excess(tactile_map))
     return add_beside(choice, surroundings, ridges=rising_ribs(choice.plain, surroundings), scene=scene)
 
 
