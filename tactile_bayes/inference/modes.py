@@ -188,8 +188,8 @@ def mode_and_covariance(
 def find_mode(
     log_density: LogDensity, start: FloatArray, *, scale: FloatArray, tolerance: float = 1e-4
 ) -> tuple[FloatArray, int]:
-    """As `mode_and_covariance`, without the curvature; the last step, smaller than `tolerance` in units of `scale`, is
-    farther than the mode: steps shrink as their squares, down to the error of differences."""
+    """As `mode_and_covariance`, without the curvature; the last step is smaller than `tolerance` in units of `scale`,
+    and the mode nearer than that: steps shrink as their squares, down to the error of differences."""
     theta = np.array(start, dtype=np.float64)
     value = float(log_density(theta[None])[0])
     damping = 1e-8
