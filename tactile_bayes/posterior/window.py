@@ -435,6 +435,8 @@ class LinearModel:
         shares = np.array(SHARES)
         for length in (0.0, *sorted(LENGTHS_MM, reverse=True)):
             chosen = shares[(shares > 0) == (length > 0)]
+            if not len(chosen):
+                continue
             if length not in self._lengths:
                 cosines = self.window.cosines**2  # a share of 0, the same for every length, has no directions
                 none = Whitening(float(np.mean(LENGTHS_MM)), np.zeros((cosines, 0)), np.zeros(0))
