@@ -9,7 +9,7 @@ import numpy as np
 
 from tactile_bayes.api.arguments import PathLike, Told, door, path_of, required_path
 from tactile_bayes.errors import UsageError, check_choice
-from tactile_bayes.files.map_nc import PosteriorDraws, read_posterior
+from tactile_bayes.files.posterior_nc import PosteriorDraws, read_posterior
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.inference.ensemble import convergence
 from tactile_bayes.presets import RESEARCH_USE

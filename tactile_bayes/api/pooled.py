@@ -15,7 +15,7 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, SizedExam, SizeEstimate, check_one_mass, size_priors
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError
-from tactile_bayes.files.map_nc import write_posterior
+from tactile_bayes.files.posterior_nc import write_posterior
 from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.files.reports import EstimateReport, PooledReport
 from tactile_bayes.findings import by_weight

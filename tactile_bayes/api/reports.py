@@ -23,7 +23,8 @@ from tactile_bayes.exports.run import export as exported_files
 from tactile_bayes.files.atomic import given_twice, sha256
 from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.estimate_json import checked_report
-from tactile_bayes.files.map_nc import is_posterior, read_estimate, read_map_and_scans
+from tactile_bayes.files.map_nc import read_map_and_scans
+from tactile_bayes.files.posterior_nc import is_posterior, read_estimate
 from tactile_bayes.files.provenance import scans_of
 from tactile_bayes.files.reading import HDF5_MAGIC, first_bytes
 from tactile_bayes.files.reports import EstimateReport

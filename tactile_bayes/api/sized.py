@@ -15,7 +15,7 @@ from tactile_bayes.api.arguments import PathLike, door, in_keywords, output_path
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, UsageError
-from tactile_bayes.files.map_nc import OF_A_MAP, write_posterior
+from tactile_bayes.files.posterior_nc import OF_A_MAP, write_posterior
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.findings import Finding, Verdict, finding_lines, verdict

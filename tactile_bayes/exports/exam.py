@@ -23,7 +23,8 @@ from tactile_bayes.files import reading
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.documents import load_json, parse_json, parse_record
 from tactile_bayes.files.estimate_json import checked_report
-from tactile_bayes.files.map_nc import posterior_attributes, read_map_and_scans
+from tactile_bayes.files.map_nc import read_map_and_scans
+from tactile_bayes.files.posterior_nc import posterior_attributes
 from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
 from tactile_bayes.files.reports import REPORTS, EstimateReport, MassReport, PooledReport, centre_of
 from tactile_bayes.findings import capital, finding_lines

@@ -1,4 +1,7 @@
-"""Maps and posteriors as netCDF."""
+"""Tactile maps as netCDF by the CF conventions; equal maps give equal bytes.
+
+The cells' centres are the coordinate variables ``x`` and ``y`` (record 0089).
+"""
 
 from __future__ import annotations
 
@@ -14,23 +17,13 @@ from tactile_bayes.declarations import EXACT, UNSET, Record, UnsetType, from_pla
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.documents import parse_json
-from tactile_bayes.files.estimate_json import checked_report
 from tactile_bayes.files.netcdf import Contents, Group, Variable, grouped_netcdf_bytes, open_netcdf
 from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.files.reading import CELLS, check_limit
-from tactile_bayes.files.reports import EstimateReport, PooledReport
-from tactile_bayes.findings import Finding, FindingEntry, findings_in
+from tactile_bayes.findings import FindingEntry
 from tactile_bayes.geometry import FloatArray, check_rigid
-from tactile_bayes.inference.ensemble import DrawGroup
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
-from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scans import HeadShape
-from tactile_bayes.size.draws import SizePosterior
-
-# --- Tactile maps as netCDF by the CF conventions; equal maps give equal bytes.
-#
-# The cells' centres are the coordinate variables ``x`` and ``y`` (record 0089).
 
 SCHEMA: Final = "tactile-bayes/map/2"
 _WAY_OUT = "give a map this program wrote, or make it again with `tactile-bayes map`"
@@ -194,118 +187,3 @@ def _check_lattice(axes: Mapping[str, FloatArray], cell_mm: float) -> None:
         if len(steps) and float(np.abs(steps - cell_mm).max()) > min(rounding, 0.01 * cell_mm):
             what = f"variable {name} steps by {steps.min():g} to {steps.max():g} mm, not by the cell of {cell_mm:g} mm"
             raise BadDataError(what, way_out=_WAY_OUT)
-
-
-# --- Posteriors as netCDF that arviz opens: every draw of a map's parameters and of the sizes, and what goes with them.
-
-POSTERIOR_SCHEMA = "tactile-bayes/posterior/1"
-OF_A_MAP: Final = ("amplitude", "sigma_x_mm", "sigma_y_mm", "x_mm", "y_mm", "angle_rad", "background", "noise_sd")
-_OF_A_SIZE: Final = ("d_x_mm", "d_y_mm", "max_size_mm", "min_size_mm")
-
-
-def write_posterior(
-    path: Path,
-    found: Estimate | SizePosterior,
-    *,
-    provenance: Provenance,
-    report: EstimateReport | PooledReport,
-    groups: Mapping[str, DrawGroup] | None = None,
-    force: bool = False,
-) -> None:
-    """Write the draws of an estimate, or of a mass's size from several maps, atomically; equal draws give equal bytes.
-
-    The file has groups as InferenceData has them: the (chain, draw) variables of the posterior, then `groups`, see
-    `inference_groups`; `report` is the estimate's, which `read_estimate` gives back. A map without an estimate has no
-    draws: a ValueError.
-    """
-    method, draws, figures = _draws_of(found)
-    finite = {name: v for name, v in figures.items() if not isinstance(v, float) or math.isfinite(v)}
-    attributes = {
-        "schema": POSTERIOR_SCHEMA,
-        "research_use": RESEARCH_USE,
-        "method": method,
-        "provenance": json.dumps(provenance.as_dict()),
-        "diagnostics": json.dumps(finite),
-        "estimate": json.dumps(report.document),
-    }
-    on_axes = {name: (("chain", "draw"), np.asarray(values, dtype=np.float64)) for name, values in draws.items()}
-    held = {"posterior": Contents(_with_coordinates(on_axes), attributes)}
-    held |= {name: Contents(_with_coordinates(group.arrays), group.notes) for name, group in (groups or {}).items()}
-    write_bytes(path, grouped_netcdf_bytes(held), force=force)
-
-
-def _draws_of(found: Estimate | SizePosterior) -> tuple[str, dict[str, FloatArray], Mapping[str, Any]]:
-    """The method, the (chain, draw) arrays by name, and the figures of the method."""
-    if isinstance(found, SizePosterior):
-        return "pooled", {name: np.atleast_2d(getattr(found, name)) for name in _OF_A_SIZE}, found.figures
-    if found.map_posterior is None or found.draws is None:
-        raise ValueError("no estimate, so no posterior to write")
-    draws = {name: getattr(found.map_posterior, name) for name in OF_A_MAP}
-    if found.size is not None:
-        draws |= {name: getattr(found.size, name) for name in _OF_A_SIZE}
-    return found.draws.method, draws, {} if found.diagnostics is None else found.diagnostics.as_dict()
-
-
-def _with_coordinates(arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]) -> dict[str, Variable]:
-    """The variables after a coordinate of whole numbers for each of their axes."""
-    lengths: dict[str, int] = {}
-    for axes, values in arrays.values():
-        lengths |= dict(zip(axes, np.shape(values), strict=True))
-    held = {name: Variable(np.arange(length), (name,), {}) for name, length in lengths.items()}
-    return held | {name: Variable(values, axes, {}) for name, (axes, values) in arrays.items()}
-
-
-class PosteriorDraws(Record, eq=False):
-    """Contents of a posterior file."""
-
-    method: str  #: That gave the draws.
-    draws: dict[str, FloatArray]  #: (chain, draw) arrays by name.
-    diagnostics: dict[str, Any]  #: As the estimate's JSON has them.
-    scans: tuple[dict[str, str], ...] = ()  #: The scans at the beginning, as `Provenance.scans` has them.
-    findings: tuple[Finding, ...] = ()  #: They speak against the estimate.
-
-
-def read_posterior(path: Path) -> PosteriorDraws:
-    """Read what `write_posterior` wrote."""
-    way_out = "give what `estimate` wrote with -o"
-    with open_netcdf(path, way_out=way_out) as file:
-        group = file.group("posterior")
-        attributes = {} if group is None else group.attributes()
-        if group is None or attributes.get("schema") != POSTERIOR_SCHEMA:
-            raise BadDataError("holds no posterior of this program", way_out=way_out)
-        names = [name for name in group.variables() if name not in ("chain", "draw")]
-        draws = {name: group.array(name, kind="f8", dimensions=("chain", "draw")) for name in names}
-    if not draws or not all(values.size > 1 for values in draws.values()):
-        raise BadDataError("holds no draws", way_out=way_out, path=str(path))
-    for name, values in draws.items():
-        if np.isinf(values).any() or np.isnan(values).all():  # single draws may have no value
-            raise BadDataError(f"variable {name} holds infinity, or no number", way_out=way_out, path=str(path))
-    diagnostics = parse_json(attributes.get("diagnostics", "{}"))
-    figures = diagnostics if isinstance(diagnostics, dict) else {}
-    scans = scans_of(parse_json(attributes.get("provenance", "{}")))
-    document = parse_json(attributes.get("estimate", "{}"))
-    findings = findings_in(document.get("findings", []) if isinstance(document, dict) else [])
-    return PosteriorDraws(attributes.get("method", ""), draws, figures, scans, findings)
-
-
-def read_estimate(path: Path) -> EstimateReport:
-    """The estimate's report, as ``estimate --json`` prints it, from its posterior's file; a pooled one is refused."""
-    attributes = posterior_attributes(path, way_out="give what `estimate` wrote with -o") or {}
-    if attributes.get("method") == "pooled":
-        raise BadDataError("holds a size pooled from several maps", way_out="give the maps", path=str(path))
-    if "estimate" not in attributes:
-        what = "holds draws without their estimate"
-        raise BadDataError(what, way_out="give its map, or write it again with `estimate -o`", path=str(path))
-    return checked_report(parse_json(attributes["estimate"]), EstimateReport, path=path)
-
-
-def is_posterior(path: Path) -> bool:
-    """True when a netCDF file holds a posterior, of this program or another, and no map."""
-    return posterior_attributes(path, way_out="give a map, or what `estimate` wrote with -o") is not None
-
-
-def posterior_attributes(path: Path, *, way_out: str) -> dict[str, str] | None:
-    """Attributes of the posterior in a netCDF file; None where it holds none."""
-    with open_netcdf(path, way_out=way_out) as file:
-        group = file.group("posterior")
-        return None if group is None else group.attributes()

@@ -13,7 +13,7 @@ from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.map_nc import read_posterior
+from tactile_bayes.files.posterior_nc import read_posterior
 from tactile_bayes.presets import RESEARCH_USE
 
 with warnings.catch_warnings():

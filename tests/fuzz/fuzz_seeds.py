@@ -194,8 +194,8 @@ def _map(folder: Path) -> bytes:
 
 
 def _posterior() -> bytes:
-    from tactile_bayes.files.map_nc import POSTERIOR_SCHEMA as SCHEMA
     from tactile_bayes.files.netcdf import Contents, Variable, grouped_netcdf_bytes
+    from tactile_bayes.files.posterior_nc import POSTERIOR_SCHEMA as SCHEMA
 
     sizes = np.random.default_rng(2).lognormal(2.5, 0.1, (1, 60))
     names = ("d_x_mm", "d_y_mm", "max_size_mm", "min_size_mm", "amplitude")

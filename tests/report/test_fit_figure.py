@@ -13,7 +13,7 @@ import tactile_bayes as tb
 from tactile_bayes.api.maps import Map
 from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import replace
-from tactile_bayes.files.map_nc import read_posterior
+from tactile_bayes.files.posterior_nc import read_posterior
 from tactile_bayes.posterior.result import fitted_cells
 from tactile_bayes.report.figure_file import named_exam
 
