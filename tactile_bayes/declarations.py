@@ -115,17 +115,18 @@ def _allowed(kind: Any, value: object) -> bool:
 
 def kinds(record: Any) -> Mapping[str, Any]:
     """What is declared for each field of a record."""
-    return _kinds(record)
+    return {part.name: part.type for part in _fields(record)}
 
 
 @cache
-def _kinds(record: Any) -> Mapping[str, Any]:
-    return {part.name: part.type for part in msgspec.structs.fields(record)}
+def _fields(record: Any) -> tuple[msgspec.structs.FieldInfo, ...]:
+    """Fields of a record; Python evaluates their declarations anew whenever it is asked."""
+    return msgspec.structs.fields(record)
 
 
 def default_of(record: Any, name: str) -> Any:
     """The default of a field; None where it has none."""
-    part = next(one for one in msgspec.structs.fields(record) if one.name == name)
+    part = next(one for one in _fields(record) if one.name == name)
     return None if part.default is msgspec.NODEFAULT else part.default
 
 
@@ -155,7 +156,7 @@ def extra_of(kind: Any) -> Mapping[str, Any]:
 
 def part_of(record: Any, names: Sequence[str], meaning: str) -> Any:
     """A record of some fields of another, with this docstring: of a file that holds no others."""
-    fields = [(part.name, part.type, part.default) for part in msgspec.structs.fields(record) if part.name in names]
+    fields = [(part.name, part.type, part.default) for part in _fields(record) if part.name in names]
     fields.sort(key=lambda one: names.index(one[0]))
     name = f"{record.__name__}Part"
     return msgspec.defstruct(name, fields, bases=(Record,), namespace={"__doc__": meaning}, frozen=True, kw_only=True)
@@ -280,7 +281,7 @@ def schema_name(kind: Any) -> str | None:
     """The value that the key ``schema`` of a record's files has; None where they have none."""
     for one in _members(kind):
         if _is_record(one):
-            for part in msgspec.structs.fields(one):
+            for part in _fields(one):
                 if part.encode_name == "schema" and get_origin(_bare(part.type)) is Literal:
                     return str(get_args(_bare(part.type))[0])
     return None
@@ -427,7 +428,7 @@ def _finite(value: Any) -> bool:
 def _key_at_fault(record: Any, value: Mapping[str, Any], where: str) -> BadDataError | None:
     """The first key that a table may not have, or has not."""
     config = record.__struct_config__
-    fields = {part.encode_name: part for part in msgspec.structs.fields(record)}
+    fields = {part.encode_name: part for part in _fields(record)}
     known = [*([config.tag_field] if config.tag_field else []), *fields]
     for key in value if config.forbid_unknown_fields else ():
         if key not in known:
@@ -440,7 +441,7 @@ def _parts(kind: Any, value: Any, where: str) -> Iterator[tuple[str, Any, Any]]:
     """Parts of a value with the place, the kind that is declared for it, and the part."""
     if isinstance(value, dict):
         if _is_record(kind):
-            fields = {part.encode_name: part.type for part in msgspec.structs.fields(kind)}
+            fields = {part.encode_name: part.type for part in _fields(kind)}
             yield from ((_joined(where, key), fields[key], one) for key, one in value.items() if key in fields)
             return
         for of_key, of_value in (
