@@ -18,8 +18,6 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from google.protobuf.message import DecodeError
-from mcap.writer import CompressionType, Writer
-from mcap_protobuf.schema import build_file_descriptor_set
 from numpy.typing import NDArray
 
 from tactile_bayes import __version__, scans
@@ -69,6 +67,8 @@ class ScanWriter:
         truth: Mapping[str, Any] | None = None,
         findings: Sequence[Finding] = (),
     ) -> None:
+        from mcap.writer import CompressionType, Writer  # what only reads a scan need not load it
+
         self._shape = head.shape
         self._sequence: dict[int, int] = {}
         message_bytes = 2 * head.shape[0] * head.shape[1] + 512
@@ -101,6 +101,8 @@ class ScanWriter:
         self._grid = _grid_of(head).SerializeToString(deterministic=True)
 
     def _schema(self, kind: Any) -> int:
+        from mcap_protobuf.schema import build_file_descriptor_set
+
         data = build_file_descriptor_set(kind).SerializeToString(deterministic=True)
         return int(self._writer.register_schema(name=kind.DESCRIPTOR.full_name, encoding="protobuf", data=data))
 
