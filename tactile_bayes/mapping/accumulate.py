@@ -63,8 +63,9 @@ def sources_of(selections: Sequence[SelectedFrames], *, plane_from_base: FloatAr
 
 MAX_GAIN_PASSES = 50
 GAIN_TOLERANCE = 1e-4
-# Cells of this many readings are kept between passes (4 bytes each); beyond, they are found anew in every pass.
-KEPT_READINGS = 2**26
+# Cells of this many readings are kept between passes (4 bytes each), and of fewer all of them (17 bytes); what is not
+# kept is found anew in every pass.
+KEPT_READINGS, ALL_KEPT = 2**26, 2**22
 _CHUNK = 128
 
 
@@ -104,6 +105,9 @@ def _extrapolated(start: FloatArray, first: FloatArray, second: FloatArray) -> F
     return start + 2 * length * step + length**2 * bend
 
 
+_Part = tuple[NDArray[np.integer], FloatArray, BoolArray | None]
+
+
 class _System:
     """All used frames of all scans on one block of cells."""
 
@@ -115,8 +119,8 @@ class _System:
             max(first[0] + shape[0] for first, shape in blocks) - self._first[0],
             max(first[1] + shape[1] for first, shape in blocks) - self._first[1],
         )
-        readings = sum(len(source.projection) * len(source.selection.readout.taxels) for source in sources)
-        self._kept: dict[tuple[int, int], NDArray[np.int32]] | None = {} if readings <= KEPT_READINGS else None
+        self._readings = sum(len(source.projection) * len(source.selection.readout.taxels) for source in sources)
+        self._kept: dict[tuple[int, int], _Part | NDArray[np.int32]] = {}
         self._count = self._total(None)
 
     def improved(self, gains: FloatArray) -> FloatArray:
@@ -137,31 +141,32 @@ class _System:
         cells = self._shape[0] * self._shape[1]
         total = np.zeros(cells)
         for frames, flat, pressure, valid in self._parts():
-            if gains is not None:
-                pressure /= gains[frames, None]
-            weight = pressure if gains is not None else np.ones_like(pressure) if valid is None else valid
+            counted = np.ones_like(pressure) if valid is None else valid
+            weight = counted if gains is None else pressure / gains[frames, None]
             total += np.bincount(flat.ravel(), weight.ravel(), cells)
         return total
 
-    def _parts(self) -> Iterator[tuple[slice, NDArray[np.integer], FloatArray, BoolArray | None]]:
+    def _parts(self) -> Iterator[tuple[slice, *_Part]]:
         """Chunks: frames' indices, their cells, pressures (0 where not valid) and which are valid."""
         start, total = 0, sum(len(source.projection) for source in self._sources)
         for number, source in enumerate(self._sources):
             for part, counts in source.parts(_CHUNK):
-                pressure, valid = source.selection.readout.pressure_kpa(counts)
-                if valid is not None:
-                    pressure *= valid
-                yield slice(start, start + len(counts)), self._flat(number, part), pressure, valid
+                yield slice(start, start + len(counts)), *self._part(number, part, counts)
                 start += len(counts)
                 self._progress(start, total)
 
-    def _flat(self, number: int, part: slice) -> NDArray[np.integer]:
-        if self._kept is not None and (number, part.start) in self._kept:
-            return self._kept[number, part.start]
-        flat = self._sources[number].projection.part(part).flat(self._first, self._shape)
-        if self._kept is not None:
-            self._kept[number, part.start] = flat.astype(np.int32)
-        return flat
+    def _part(self, number: int, part: slice, counts: CountArray) -> _Part:
+        kept, source = self._kept.get((number, part.start)), self._sources[number]
+        if isinstance(kept, tuple):
+            return kept
+        pressure, valid = source.selection.readout.pressure_kpa(counts)
+        if valid is not None:
+            pressure *= valid
+        flat = source.projection.part(part).flat(self._first, self._shape) if kept is None else kept
+        found = flat, pressure, valid
+        if kept is None and self._readings <= KEPT_READINGS:
+            self._kept[number, part.start] = found if self._readings <= ALL_KEPT else flat.astype(np.int32)
+        return found
 
 
 # --- Response of each taxel to an even pressure, from frames without a lump.
