@@ -51,6 +51,8 @@ _LEVER: Final = ((), ("lever-inverse",), ("lever-none",))
 _ROTATIONS: Final = tuple(CONVENTIONS.values())
 
 Corrections = tuple[str, ...]
+Trial = tuple[Corrections, float]
+"""Corrections, and by how many ms poses are later."""
 
 MOST_CHANGES: Final = 3
 LIKELY_ODDS: Final = 10.0
@@ -69,6 +71,8 @@ LEAST_LASTING: Final = 0.15
 _ROUNDING: Final = 1e-12
 """What varies no more, in readings over their frames' means, does not vary."""
 MOST_FRAMES: Final = 250
+_ROUGH_FRAMES, _ROUGH_TOLERANCE, _ROUGH_BY = 60, 0.5, 0.15
+"""What so many frames, fitted so far, gain is at most 0.05 too little where it matters (67 scans): 0.15 are allowed."""
 _LEAST_BLOCKS: Final = 8
 _CLOCK_STEPS_MS: Final = (-40, -30, -20, -10, 10, 20, 30, 40)
 _OWN_LATENCY_MS: Final = (-20, -10, 10, 20)
@@ -322,41 +326,66 @@ def check_arrangement(selection: SelectedFrames, *, latency_ms: float = 0.0, tho
     others = sorted((one for one in every if 0 < len(one) <= MOST_CHANGES), key=len)
     single = [one for one in others if len(one) == 1]
     stated = overlap.still[0]
-    if _lasting(overlap.varying[0]) < LEAST_LASTING:
+    if _lasting(overlap.array.varying) < LEAST_LASTING:
         return ArrangementCheck(stated, stated, 0.0, {one[0]: 0.0 for one in single})
-    tried = [stated, *map(overlap.judged, single), *(overlap.late(sign * ms) for ms in CLOCK_MS for sign in (1, -1))]
-    check = _compared(overlap, tried)
+    trials: list[Trial] = [(one, 0.0) for one in single]
+    trials += [((), float(sign * ms)) for ms in CLOCK_MS for sign in (1, -1)]
+    rough = None if thorough else _Overlap.of(selection, latency_ms, rough=True)
+    if rough is not None:
+        close, excluded = _screened(rough, trials, stretches=overlap.stretches)
+        check = _compared(overlap, [stated, *(overlap.judged(*one) for one in close)], tried=len(trials) + 1)
+        if check.best is stated and not check.contradicting:
+            return _still(overlap, replace(check, excluded={**excluded, **check.excluded}))
+    judged = [stated, *(overlap.judged(*one) for one in trials)]
+    check = _compared(overlap, judged, tried=len(judged))
     if thorough or check.contradicting or check.best.corrections:
-        check = _compared(overlap, [*tried, *map(overlap.judged, others[len(single) :])])
+        judged += map(overlap.judged, others[len(single) :])
+        check = _compared(overlap, judged, tried=len(judged))
     return check if check.best is not stated else _still(overlap, check)
 
 
-def _compared(overlap: _Overlap, tried: Sequence[Arrangement]) -> ArrangementCheck:
-    """The best of the arrangements tried against the first, which is stated."""
-    stated, stretches = tried[0], int(overlap.block.max()) + 1
-    likely = [one for one in tried if one is stated or one.plausible]
+def _screened(rough: _Overlap, trials: Sequence[Trial], *, stretches: int) -> tuple[list[Trial], dict[str, float]]:
+    """The trials that a quarter of the frames does not rule out, and log odds against the corrections that it does.
+
+    Ruled out is what gains too little to be the best by far, and of the array's orders what is excluded too.
+    """
+    stated, close, excluded = rough.still[0], [], {}
+    for trial in trials:
+        gain = rough.judged(*trial).gain_over(stated)
+        odds = -stretches * gain - log(len(trials) + 1)
+        if stretches * (gain + _ROUGH_BY) >= log(LIKELY_ODDS) or (trial[0] in _ARRAY[1:] and odds < log(LIKELY_ODDS)):
+            close.append(trial)
+        elif trial[0]:
+            excluded[trial[0][0]] = odds
+    return close, excluded
+
+
+def _compared(overlap: _Overlap, judged: Sequence[Arrangement], *, tried: int) -> ArrangementCheck:
+    """The best of the arrangements judged, of so many tried, against the first, which is stated."""
+    stated, stretches = judged[0], overlap.stretches
+    likely = [one for one in judged if one is stated or one.plausible]
     best = max(likely, key=lambda one: stretches * one.gain_over(stated) - log(LIKELY_ODDS) * one.changes)
     against, beside = stated, np.inf
     if best.late_ms:
-        near = [overlap.late(best.late_ms + step) for step in _CLOCK_STEPS_MS]
+        near = [overlap.judged((), best.late_ms + step) for step in _CLOCK_STEPS_MS]
         best = max([best, *near], key=lambda one: one.gain_over(stated))
-        own = [overlap.late(ms) for ms in _OWN_LATENCY_MS]
+        own = [overlap.judged((), ms) for ms in _OWN_LATENCY_MS]
         against = max([stated, *own], key=lambda one: one.gain_over(stated))
-        beside = min(best.gain_over(overlap.late(best.late_ms + ms)) for ms in _BESIDE_MS)
+        beside = min(best.gain_over(overlap.judged((), best.late_ms + ms)) for ms in _BESIDE_MS)
     excluded = {
-        one.corrections[0]: stretches * stated.gain_over(one) - log(len(tried))
-        for one in tried
+        one.corrections[0]: stretches * stated.gain_over(one) - log(tried)
+        for one in judged
         if len(one.corrections) == 1
     }
-    log_odds = stretches * best.gain_over(against) - log(len(tried))
-    if best is stated or min(log_odds, stretches * beside - log(len(tried))) < log(LIKELY_ODDS):
+    log_odds = stretches * best.gain_over(against) - log(tried)
+    if best is stated or min(log_odds, stretches * beside - log(tried)) < log(LIKELY_ODDS):
         return ArrangementCheck(stated, stated, 0.0, excluded, stated.contradicting)
     return ArrangementCheck(stated, best, log_odds, excluded, asked_ms=overlap.latency_ms)
 
 
 def _still(overlap: _Overlap, check: ArrangementCheck) -> ArrangementCheck:
     """The check, or that the body moved where frames agree better then."""
-    stated, stretches = check.stated, int(overlap.block.max()) + 1
+    stated, stretches = check.stated, overlap.stretches
     if stated.lasting < MOST_LASTING:
         return check
     moved = overlap.swaying()
@@ -391,71 +420,92 @@ def _lasting(values: FloatArray) -> float:
     return float(np.sum(values[1:] * values[:-1])) / square if square > _ROUNDING**2 * values.size else 0.0
 
 
-def _moves(course: FloatArray, cells: Cells, values: FloatArray, error: FloatArray) -> tuple[float, FloatArray]:
-    """How much less the squared errors are for moves with each of (m, a) courses, and these (a, 2) moves, mm."""
-    slope = cells.gradient(values).reshape(len(course), -1, 2)
-    design = np.einsum("ma,mki->mkai", course, slope).reshape(len(error), -1)
-    moves = np.linalg.lstsq(design, error, rcond=None)[0]
-    return float(error @ (design @ moves)), moves.reshape(-1, 2)
+def _moves(course: FloatArray, slope: FloatArray, error: FloatArray) -> tuple[float, FloatArray]:
+    """How much less the squared (n,) errors are for moves with each of (m, a) courses, and these (a, 2) moves, mm, from
+    the map's (n, 2) slopes there.
+    """
+    slope, error = slope.reshape(len(course), -1, 2), error.reshape(len(course), -1)
+    of_frame, right = slope.swapaxes(1, 2) @ slope, (error[:, None] @ slope)[:, 0]
+    normal = np.einsum("ma,mb,mij->aibj", course, course, of_frame).reshape(course.shape[1] * 2, -1)
+    pull = (course.T @ right).reshape(-1)
+    moves = np.linalg.lstsq(normal, pull, rcond=None)[0]
+    return float(pull @ moves), moves.reshape(-1, 2)
+
+
+class _Array(Record, eq=False):
+    """Averaged frames of a scan in one order of the array."""
+
+    coarse: CoarseFrames
+    varying: FloatArray
+    """(m, k) averaged readings without what frames and taxels add: what they say of the breast, and noise."""
+    taxels: IndexArray  #: Flat indices of the good ones.
+
+    @classmethod
+    def of(cls, selection: SelectedFrames, frames: IndexArray) -> _Array:
+        coarse = CoarseFrames.of(selection, frames)
+        return cls(coarse, coarse.without_head(coarse.pressure), np.flatnonzero(selection.good_taxels))
 
 
 class _Overlap(Record, eq=False, dict=True):
-    """Averaged frames of a scan, as they are and with the array transposed, and what is needed to place them."""
+    """Averaged frames of a scan, and what is needed to place them."""
 
+    selection: SelectedFrames
     scan: Scan  #: With distinct poses.
     frames: IndexArray
     latency_ms: float
-    coarse: tuple[CoarseFrames, CoarseFrames]
-    varying: tuple[FloatArray, FloatArray]
-    """(m, k) averaged readings without what frames and taxels add: what they say of the breast, and noise."""
-    taxels: tuple[IndexArray, IndexArray]
-    """Flat indices of the good ones, for each of `coarse`."""
+    array: _Array  #: As it is stated.
     block: IndexArray
     """(m,) stretch of 0.2 s that each averaged frame lies in."""
+    rough: bool  #: True for fewer frames, whose map is fitted less closely.
     paths: dict[Corrections, FramePoses] = field(default_factory=dict)
     """Mean pose of the tracker at each averaged frame, for the corrections of rotations asked so far."""
 
     @classmethod
-    def of(cls, stated: SelectedFrames, latency_ms: float) -> _Overlap | None:
+    def of(cls, stated: SelectedFrames, latency_ms: float, *, rough: bool = False) -> _Overlap | None:
         scan, used = replace(stated.scan, poses=stated.fresh), np.flatnonzero(stated.used)
         if not len(used):
             return None
         time_s = scan.frames.time_s[used]
-        frames = used[every_stretch(time_s, thinning([time_s], most=MOST_FRAMES))]
-        bad = np.argwhere(~_rearranged(stated.good_taxels, "transposed")).tolist()
-        faults = tuple(TaxelFault(row, column, "left out") for row, column in bad)
-        other = replace(stated, scan=corrected(scan, ["transposed"]), faults=faults)
-        coarse = (CoarseFrames.of(stated, frames), CoarseFrames.of(other, frames))
-        block = coarse[0].blocks(scan.frames.time_s)
-        if int(block.max()) + 1 < _LEAST_BLOCKS:
-            return None
-        taxels = (np.flatnonzero(stated.good_taxels), np.flatnonzero(other.good_taxels))
-        varying = (coarse[0].without_head(coarse[0].pressure), coarse[1].without_head(coarse[1].pressure))
-        return cls(scan, frames, latency_ms, coarse, varying, taxels, block)
+        frames = used[every_stretch(time_s, thinning([time_s], most=_ROUGH_FRAMES if rough else MOST_FRAMES))]
+        array = _Array.of(stated, frames)
+        found = cls(stated, scan, frames, latency_ms, array, array.coarse.blocks(scan.frames.time_s), rough)
+        return found if found.stretches >= _LEAST_BLOCKS else None
 
-    def late(self, late_ms: float) -> Arrangement:
-        """What is stated, with poses that are later by so much."""
-        return replace(replace(self, latency_ms=self.latency_ms + late_ms, paths={}).judged(()), late_ms=late_ms)
+    @property
+    def stretches(self) -> int:
+        """Stretches of 0.2 s that hold frames."""
+        return int(self.block.max()) + 1
+
+    @cached_property
+    def transposed(self) -> _Array:
+        """The array read in the other order."""
+        bad = np.argwhere(~_rearranged(self.selection.good_taxels, "transposed")).tolist()
+        faults = tuple(TaxelFault(row, column, "left out") for row, column in bad)
+        return _Array.of(replace(self.selection, scan=corrected(self.scan, ["transposed"]), faults=faults), self.frames)
 
     @cached_property
     def still(self) -> tuple[Arrangement, Cells, FloatArray, FloatArray]:
         """What is stated, of a body that lies still, as `_fitted` has it."""
         return self._fitted(())
 
-    def judged(self, corrections: Corrections) -> Arrangement:
-        """Predict each averaged reading by those of other times in its cell of the plane."""
-        return self._fitted(corrections)[0]
+    def judged(self, corrections: Corrections, late_ms: float = 0.0) -> Arrangement:
+        """Predict each averaged reading by those of other times in its cell, with poses that are later by so much."""
+        if not late_ms:
+            return self._fitted(corrections)[0]
+        other = replace(self, latency_ms=self.latency_ms + late_ms, paths={})
+        return replace(other.judged(corrections), late_ms=late_ms)
 
     def swaying(self) -> Arrangement | None:
         """What is stated, of a body that moves to and fro along its skin at the best rate.
 
         None where the first step takes off little.
         """
-        time_s = block_means(self.scan.frames.time_s[self.frames, None], self.coarse[0].first)
-        still = self.still[1:]
+        time_s = block_means(self.scan.frames.time_s[self.frames, None], self.array.coarse.first)
+        cells, levelled, error = still = self.still[1:]
+        slope = cells.gradient(levelled)
         waves = {rate: np.hstack([np.cos(turn := 2 * np.pi * rate * time_s), np.sin(turn)]) for rate in _SWAYS_HZ}
-        gains = {rate: _moves(wave, *still)[0] for rate, wave in waves.items()}
-        if max(gains.values()) < _LEAST_SWAY_START * float(still[-1] @ still[-1]):
+        gains = {rate: _moves(wave, slope, error)[0] for rate, wave in waves.items()}
+        if max(gains.values()) < _LEAST_SWAY_START * float(error @ error):
             return None
         found = []
         for rate in sorted(gains, key=gains.__getitem__)[-_SWAYS_TRIED:]:
@@ -479,7 +529,7 @@ class _Overlap(Record, eq=False, dict=True):
         """What is stated, of a body that moves with (m, a) courses, by Gauss-Newton steps; and its (a, 2) moves, mm."""
         moves, (cells, levelled, error) = np.zeros((course.shape[1], 2)), still
         for _ in range(_SWAY_STEPS):
-            moves += _moves(course, cells, levelled, error)[1]
+            moves += _moves(course, cells.gradient(levelled), error)[1]
             made, cells, levelled, error = self._fitted((), (course @ moves)[:, None])
         return made, moves
 
@@ -487,11 +537,12 @@ class _Overlap(Record, eq=False, dict=True):
         self, corrections: Corrections, moves_mm: FloatArray | float = 0.0
     ) -> tuple[Arrangement, Cells, FloatArray, FloatArray]:
         """The arrangement judged with places moved by (m, 1, 2), the cells, levelled readings, and their errors."""
-        transposed = "transposed" in corrections
-        coarse, varying = self.coarse[transposed], self.varying[transposed]
+        array = self._array(corrections)
+        coarse, varying = array.coarse, array.varying
         places, agreement = self._places_mm(corrections)
         cells = Cells.of([places + moves_mm])
-        rest, levelled = map_fit([coarse], varying.reshape(-1), cells, tolerance=COMPARED)
+        tolerance = _ROUGH_TOLERANCE if self.rough else COMPARED
+        rest, levelled = map_fit([coarse], varying.reshape(-1), cells, tolerance=tolerance, within=not self.rough)
         values, block = varying.reshape(-1), np.repeat(self.block, varying.shape[1])
         # by another clock the first or last frames have no pose: kept at one place they would seem to agree
         placed = np.repeat(self._path(corrections).known.astype(np.float64), varying.shape[1])
@@ -513,26 +564,33 @@ class _Overlap(Record, eq=False, dict=True):
         )
         return made, cells, levelled, error
 
+    def _array(self, corrections: Corrections) -> _Array:
+        return self.transposed if "transposed" in corrections else self.array
+
     def _places_mm(self, corrections: Corrections) -> tuple[FloatArray, float]:
         """(m, k, 2) places of the averaged readings on the plane in which they lie, and how the face agrees with it."""
-        transposed = "transposed" in corrections
-        coarse, surface = self.coarse[transposed], self.scan.head.surface_mm
+        array, surface = self._array(corrections), self.scan.head.surface_mm
         for name in set(corrections) & {"rows-reversed", "columns-reversed", "half-turn"}:
             surface = np.stack([_rearranged(surface[..., i], name) for i in range(3)], axis=-1)
         mounted = corrected(self.scan, (name for name in corrections if name.startswith(("lever", "quarter"))))
         tracker_from_head = inverse(mounted.head.scanhead_from_tracker)
-        on_tracker = apply(tracker_from_head, surface.reshape(-1, 3)[self.taxels[transposed]])
-        path = self._path(corrections)
-        place = path.position_mm[:, None] + (path.rotation @ (coarse.weight.T @ on_tracker).T).transpose(0, 2, 1)
-        axes = principal_axes(place.reshape(-1, 3))
-        agreement = abs(float(axes[:, 0] @ (path.rotation @ tracker_from_head[:3, 2]).mean(axis=0)))
-        return np.asarray(place @ axes[:, [2, 1]]), agreement
+        on_tracker = array.coarse.weight.T @ apply(tracker_from_head, surface.reshape(-1, 3)[array.taxels])
+        middle, path = on_tracker.mean(axis=0), self._path(corrections)
+        centre, around = path.places_mm(middle), on_tracker - middle
+        spread = len(around) * np.cov(centre.T, bias=True) + np.mean(
+            path.rotation @ (around.T @ around) @ path.rotation.swapaxes(1, 2), axis=0
+        )
+        axes = np.linalg.eigh(spread)[1]
+        plane, normal = axes[:, [2, 1]].T, axes[:, 0]
+        place = (centre @ plane.T)[:, :, None] + plane @ path.rotation @ around.T
+        agreement = abs(float(normal @ (path.rotation @ tracker_from_head[:3, 2]).mean(axis=0)))
+        return place.swapaxes(1, 2), agreement
 
     def _path(self, corrections: Corrections) -> FramePoses:
         """Mean poses of the tracker at the averaged frames; known where all lie between its first and its last."""
         rotations = tuple(name for name in corrections if name in _ROTATIONS[-1])
         if rotations not in self.paths:
-            scan, first = corrected(self.scan, rotations), self.coarse[0].first
+            scan, first = corrected(self.scan, rotations), self.array.coarse.first
             time_s = scan.frames.time_s[self.frames]
             poses = poses_at(scan.poses, time_s, latency_ms=self.latency_ms, max_gap_ms=np.inf)
             means = block_means(poses.rotation.reshape(-1, 9), first).reshape(-1, 3, 3)

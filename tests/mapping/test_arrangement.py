@@ -17,11 +17,12 @@ from tactile_bayes.mapping.arrangement import (
     LEAST_SWAY_MM,
     ArrangementCheck,
     _Overlap,
+    _screened,
     check_arrangement,
     check_scan,
     corrected,
 )
-from tactile_bayes.mapping.select import select_frames
+from tactile_bayes.mapping.select import SelectedFrames, select_frames
 from tactile_bayes.presets import CORRECTIONS
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
 from validation.lump_probability_scenes import draw
@@ -75,12 +76,16 @@ def reshaped(array: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(array.swapaxes(-1, -2)).reshape(array.shape)
 
 
+def select(scan: Scan) -> SelectedFrames:
+    return select_frames(scan, pressure_window_kpa=(5.0, 14.0))
+
+
 def checked(scan: Scan) -> ArrangementCheck:
-    return check_arrangement(select_frames(scan, pressure_window_kpa=(5.0, 14.0)), thorough=False)
+    return check_arrangement(select(scan), thorough=False)
 
 
 def overlap(scan: Scan) -> _Overlap:
-    found = _Overlap.of(select_frames(scan, pressure_window_kpa=(5.0, 14.0)), 0.0)
+    found = _Overlap.of(select(scan), 0.0)
     assert found is not None
     return found
 
@@ -248,14 +253,31 @@ def test_the_latency_that_is_stated_is_what_the_clock_is_held_against():
 def test_a_clock_that_is_no_better_than_those_beside_it_is_not_named():
     """Frames over uneven fat agree better the earlier their poses are said to be."""
     scan = draw(95, seed=20292303).scan()
-    check, early = checked(scan), overlap(scan).late(-500.0)
+    check, early = checked(scan), overlap(scan).judged((), -500.0)
     assert early.plausible
     assert early.gain_over(check.stated) > 0.15
     assert check.best is check.stated
 
 
 def test_frames_without_a_pose_by_another_clock_do_not_count():
-    never = overlap(lump()).late(60_000.0)
+    never = overlap(lump()).judged((), 60_000.0)
     assert never.spread == never.explained == 0.0
     assert not never.plausible
     assert never.gain_over(checked(lump()).stated) < 0
+
+
+@pytest.mark.parametrize("late_ms", [0.0, 40.0])
+def test_few_frames_rule_out_nothing_that_all_frames_do_not(late_ms):
+    scan = later(lump(), late_ms)
+    all_frames, few = (_Overlap.of(select(scan), 0.0, rough=rough) for rough in (False, True))
+    assert all_frames is not None
+    assert few is not None
+    assert len(few.block) < len(all_frames.block) / 2
+    trials = [((name,), 0.0) for name in CORRECTIONS] + [((), float(ms)) for ms in (-300, -100, -30, 30, 100, 300)]
+    close, excluded = _screened(few, trials, stretches=all_frames.stretches)
+    assert 0 < len(close) < len(trials) / 2
+    for trial in set(trials) - set(close):
+        gain = all_frames.judged(*trial).gain_over(all_frames.still[0])
+        assert gain < 0
+        if trial[0]:
+            assert -all_frames.stretches * gain - np.log(len(trials) + 1) > excluded[trial[0][0]] - 2.0
