@@ -178,26 +178,18 @@ CALM_FACTOR = 1.1
 LEAST_FRAMES = 50
 
 
-class FlatField(Record, eq=False):
-    """Response of each taxel relative to the array's mean."""
-
-    response: FloatArray
-    """(rows, columns) array: 1 where the taxel reads as much as its frame's mean; 1 for taxels left out."""
-    frames: int  #: Lump-free frames it was taken from.
-
-    def applied(self, scan: Scan) -> Scan:
-        """Copy of the scan with its calibration divided by the response."""
-        calibration = scan.element_calibration
-        flat = replace(
-            calibration,
-            gain_kpa_per_count=calibration.gain_kpa_per_count / self.response,
-            offset_kpa=calibration.offset_kpa / self.response,
-        )
-        return replace(scan, element_calibration=flat)
+def divided(scan: Scan, response: FloatArray) -> Scan:
+    """Copy of the scan with its calibration divided by the (rows, columns) response of its taxels."""
+    held = scan.element_calibration
+    gain, offset = held.gain_kpa_per_count / response, held.offset_kpa / response
+    return replace(scan, element_calibration=replace(held, gain_kpa_per_count=gain, offset_kpa=offset))
 
 
-def flat_field(selection: SelectedFrames) -> FlatField:
-    """Estimate the taxels' response over the lump-free frames of a scan; `BadDataError` when too few frames look alike.
+def flat_field(selection: SelectedFrames) -> tuple[FloatArray, int]:
+    """(rows, columns) response of the taxels over the lump-free frames of a scan, and how many those are.
+
+    It is 1 where a taxel reads as much as its frame's mean, and for taxels left out. `BadDataError` when too few frames
+    look alike.
 
     The usual profile of the head is each taxel's median over frames, which a lump under a minority of them does not
     move. Frames that depart from it no more than the calmest ones are lump-free; their mean is the response. A lump
@@ -221,7 +213,7 @@ def flat_field(selection: SelectedFrames) -> FlatField:
         )
     response = np.ones(good.shape)
     response[good] = np.clip(ratio[calm].mean(axis=0), 0.05, None)
-    return FlatField(response, int(np.count_nonzero(calm)))
+    return response, int(np.count_nonzero(calm))
 
 
 # --- Normalise the frames and average them in cells (paper steps ii and iii).

@@ -98,10 +98,6 @@ NOT_CHECKED: Final = Finding(
     "HEAD.json from then on",
     "scan a phantom with a lump once and have it checked",
 )
-_CONTRADICTING: Final = "strokes over one place do not agree on what they felt there; size and place may be wrong"
-_LATE: Final = "the tracker's times do not fit those of the sensor array; size and place may be wrong"
-_MOVED: Final = "the body moved to and fro during the scan, as breathing moves it; size and place may be wrong"
-_MOUNTED: Final = "the sensor array or the tracker seems not to be mounted as stated; size and place may be wrong"
 TOO_SHORT: Final = "too few frames to compare arrangements"
 _QUARTER: Final = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 
@@ -254,23 +250,44 @@ class ArrangementCheck(Record, eq=False):
         return f"array, lever arm and quaternions are as stated: overlapping frames agree to {_percent(self.stated)}"
 
     @property
+    def _against(self) -> Finding | None:
+        """What speaks against the scan as it is stated, with what to check, or to state to `map`, or to correct."""
+        if self.contradicting:
+            return Finding(
+                "frames_contradict",
+                "strokes over one place do not agree on what they felt there; size and place may be wrong",
+                "check the lever arm, both clocks, and that the breast lay still",
+                "make sure that the breast lies still, and have the tracker's mounting and its clock checked",
+            )
+        if self.best.late_ms:
+            return Finding(
+                "late_poses",
+                "the tracker's times do not fit those of the sensor array; size and place may be wrong",
+                f"map it with --latency-ms {self.asked_ms + self.best.late_ms:.0f}",
+                "have the scan mapped again with the tracker's delay",
+            )
+        if self.best.sway_mm:
+            return Finding(
+                "frames_contradict",
+                "the body moved to and fro during the scan, as breathing moves it; size and place may be wrong",
+                "record with a reference tool on the body (--reference), or have the breath held",
+                "have the scan taken again with the breath held",
+            )
+        if self.best is not self.stated:
+            return Finding(
+                "wrong_arrangement",
+                "the sensor array or the tracker seems not to be mounted as stated; size and place may be wrong",
+                import_again(self.best.corrections),
+                "have it checked how the array and the tracker are mounted",
+            )
+        return None
+
+    @property
     def findings(self) -> tuple[Finding, ...]:
         """Findings against a map made of the scan as it is stated."""
-        if self.contradicting:
-            on_paper = "make sure that the breast lies still, and have the tracker's mounting and its clock checked"
-            return (Finding("frames_contradict", _CONTRADICTING, f"{self.words}; {self.remedy}", on_paper),)
-        if self.best.late_ms:
-            on_paper = "have the scan mapped again with the tracker's delay"
-            return (Finding("late_poses", _LATE, f"{self.words}; {self.remedy}", on_paper),)
-        if self.best.sway_mm:
-            on_paper = "have the scan taken again with the breath held"
-            return (Finding("frames_contradict", _MOVED, f"{self.words}; {self.remedy}", on_paper),)
-        if self.best is not self.stated:
-            on_paper = "have it checked how the array and the tracker are mounted"
-            return (Finding("wrong_arrangement", _MOUNTED, f"{self.words}; {self.remedy}", on_paper),)
-        if self.says_nothing:
-            return (NOT_CHECKED,)
-        return ()
+        if (found := self._against) is None:
+            return (NOT_CHECKED,) if self.says_nothing else ()
+        return (replace(found, remedy=f"{self.words}; {found.remedy}"),)
 
     def findings_of(self, scan: Scan) -> tuple[Finding, ...]:
         """The same; that nothing is shown is no finding where the scan's head was checked by another scan."""
@@ -279,15 +296,7 @@ class ArrangementCheck(Record, eq=False):
     @property
     def remedy(self) -> str:
         """What to check or, where another arrangement is better, to state to `map` or to correct by `import`."""
-        if self.contradicting:
-            return "check the lever arm, both clocks, and that the breast lay still"
-        if self.says_nothing:
-            return NOT_CHECKED.remedy
-        if self.best.sway_mm:
-            return "record with a reference tool on the body (--reference), or have the breath held"
-        if self.best.late_ms:
-            return f"map it with --latency-ms {self.asked_ms + self.best.late_ms:.0f}"
-        return import_again(self.best.corrections)
+        return (self._against or NOT_CHECKED).remedy if self.findings else ""
 
     def lines(self) -> list[str]:
         """The answer in full: what the frames agree with, what they exclude, what they leave open, and what to do."""

@@ -16,6 +16,7 @@ from tactile_bayes.mapping.accumulate import (
     Accumulated,
     accumulate,
     add_all,
+    divided,
     shared_frame_figures,
     sources_of,
 )
@@ -26,7 +27,7 @@ from tactile_bayes.mapping.convention import check_convention, convention_findin
 from tactile_bayes.mapping.latency import estimate_latency
 from tactile_bayes.mapping.map import FEW_READINGS, MapRecipe, TactileMap, broken_assumptions, handling_findings, smooth
 from tactile_bayes.mapping.plausibility import exam_figures, exam_findings, map_findings, with_cause
-from tactile_bayes.mapping.profile import evenness_figures, head_profile_figures, pose_noise_figures
+from tactile_bayes.mapping.profile import evenness_figures, head_profile_figures, motion, pose_noise_figures
 from tactile_bayes.mapping.select import (
     SelectedFrames,
     every_nth,
@@ -105,22 +106,14 @@ def plane_figures(selections: Sequence[SelectedFrames], plane: Plane) -> dict[st
 
     ``plane_condition`` is the longest over the second spread of the taxel centres: large for strokes along a line.
     """
-    transform = plane.plane_from_base
-    normals, yaws, centres = [], [], []
-    for part in selections:
-        poses, tracker_from_head = part.poses.part(part.used), inverse(part.scan.head.scanhead_from_tracker)
-        normals.append((poses.rotation * tracker_from_head[:3, 2]).sum(axis=2).sum(axis=0))
-        x_axis = (poses.rotation * tracker_from_head[:3, 0]).sum(axis=2) @ transform[:2, :3].T
-        yaws.append(np.degrees(np.arctan2(x_axis[:, 1], x_axis[:, 0])))
-        centres.append(apply(transform, poses.places_mm(tracker_from_head[:3, 3])))
-    normal = np.sum(normals, axis=0)
-    tilt = np.arctan2(np.linalg.norm(np.cross(transform[2, :3], normal)), transform[2, :3] @ normal)
-    span = np.ptp(np.concatenate(centres), axis=0)
+    place_mm, axes = map(np.concatenate, zip(*(motion(part, plane) for part in selections), strict=True))
+    x, y, z = axes[:, :, 2].sum(axis=0)
+    span = np.ptp(place_mm, axis=0)
     return {
         "plane_rms_mm": plane.rms_mm,
         "plane_condition": float(plane.spread_mm[0] / plane.spread_mm[1]),
-        "tilt_deg": float(np.degrees(tilt)),
-        "yaw_sd_deg": float(np.concatenate(yaws).std()),
+        "tilt_deg": float(np.degrees(np.arctan2(np.hypot(x, y), z))),
+        "yaw_sd_deg": float(np.degrees(np.arctan2(axes[:, 1, 0], axes[:, 0, 0])).std()),
         "span_x_mm": float(span[0]),
         "span_y_mm": float(span[1]),
     }
@@ -273,9 +266,9 @@ def _flattened(selections: list[SelectedFrames], figures: dict[str, float]) -> l
     """The scans with a used frame, the head's own response divided out of them."""
     used = [part for part in selections if part.used.any()]
     flats = [find_flat_field(part) for part in used]
-    figures["flat_field_frames"] = float(sum(flat.frames for flat in flats))
-    figures["flat_field_sd"] = float(np.mean([flat.response.std() for flat in flats]))
-    return [flat.applied(part.scan) for flat, part in zip(flats, used, strict=True)]
+    figures["flat_field_frames"] = float(sum(frames for _, frames in flats))
+    figures["flat_field_sd"] = float(np.mean([response.std() for response, _ in flats]))
+    return [divided(part.scan, response) for (response, _), part in zip(flats, used, strict=True)]
 
 
 def _plane(selections: list[SelectedFrames]) -> Plane:

@@ -218,13 +218,13 @@ def evenness_figures(selections: Sequence[SelectedFrames], plane: Plane) -> dict
     way. The last four are missing where too few frames are free of a lump or the head hardly moved.
     """
     parts = [part for part in selections if part.used.any()]
-    motions = [_motion(part, plane) for part in parts]
+    motions = [motion(part, plane) for part in parts]
     profiles = [_profiles(part, *motion) for part, motion in zip(parts, motions, strict=True)]
     rows, designs, groups = (np.concatenate(some) for some in zip(*profiles, strict=True))
     return _curvature(motions) | _profile_changes(rows, designs, groups)
 
 
-def _motion(part: SelectedFrames, plane: Plane) -> tuple[FloatArray, FloatArray]:
+def motion(part: SelectedFrames, plane: Plane) -> tuple[FloatArray, FloatArray]:
     """(n, 3) places of the head on the plane and (n, 3, 3) directions of its axes at the used frames of a scan."""
     poses, tracker_from_head = part.poses.part(part.used), inverse(part.scan.head.scanhead_from_tracker)
     place = apply(plane.plane_from_base, poses.places_mm(tracker_from_head[:3, 3]))

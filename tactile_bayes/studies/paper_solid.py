@@ -17,7 +17,7 @@ from tactile_bayes.forward.scene import Head
 from tactile_bayes.forward.simulate import RANK_TOLERANCE, SkinPerturbation, SolidHead, skin_perturbation, solid_head
 from tactile_bayes.forward.tissue import Body, Layers
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.accumulate import FlatField
+from tactile_bayes.mapping.accumulate import divided
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import Bump, FitCells, window_cells
@@ -57,7 +57,7 @@ def raster_map(frames: RasterFrames) -> TactileMap:
     )
     if frames.plain_kpa is not None:
         plain = _readings(frames.plain_kpa)
-        scan = FlatField(plain / plain.mean(), frames=1).applied(scan)
+        scan = divided(scan, plain / plain.mean())
     return build_map(scan, cell_mm=head.pitch_mm / 2, pressure_window_kpa=_WINDOW, normalise="mean", as_stated=True)
 
 
