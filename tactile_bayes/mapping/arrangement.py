@@ -38,14 +38,8 @@ from tactile_bayes.mapping.select import SelectedFrames, TaxelFault, scan_findin
 from tactile_bayes.presets import CORRECTIONS, PRESSURE_WINDOW_KPA
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
 
-_ARRAY: Final = (
-    (),
-    ("rows-reversed",),
-    ("columns-reversed",),
-    ("half-turn",),
-    ("quarter-turn",),
-    ("quarter-turn-back",),
-)
+_ORDERS: Final = ("rows-reversed", "columns-reversed", "half-turn", "quarter-turn", "quarter-turn-back")
+_ARRAY: Final = ((), *((name,) for name in _ORDERS))
 _FRAMES: Final = ((), ("transposed",))
 _LEVER: Final = ((), ("lever-inverse",), ("lever-none",))
 _ROTATIONS: Final = tuple(CONVENTIONS.values())
@@ -224,7 +218,7 @@ class ArrangementCheck(Record, eq=False):
     @property
     def says_nothing(self) -> bool:
         """True where the frames do not exclude each other order of the array."""
-        return self.best is self.stated and any(name in self.not_shown for (name,) in _ARRAY[1:])
+        return self.best is self.stated and any(name in self.not_shown for name in _ORDERS)
 
     @property
     def too_short(self) -> bool:
@@ -455,12 +449,13 @@ class _Array(Record, eq=False):
         return cls(coarse, coarse.without_head(coarse.pressure), np.flatnonzero(selection.good_taxels))
 
 
+_Fit = tuple[Arrangement, Cells, FloatArray, FloatArray]
+
+
 class _Overlap(Record, eq=False, dict=True):
     """Averaged frames of a scan, and what is needed to place them."""
 
-    selection: SelectedFrames
-    scan: Scan  #: With distinct poses.
-    frames: IndexArray
+    selection: SelectedFrames  #: Of a scan with distinct poses.
     latency_ms: float
     array: _Array  #: As it is stated.
     block: IndexArray
@@ -471,13 +466,13 @@ class _Overlap(Record, eq=False, dict=True):
 
     @classmethod
     def of(cls, stated: SelectedFrames, latency_ms: float, *, rough: bool = False) -> _Overlap | None:
-        scan, used = replace(stated.scan, poses=stated.fresh), np.flatnonzero(stated.used)
+        selection = replace(stated, scan=replace(stated.scan, poses=stated.fresh))
+        used, all_s = np.flatnonzero(stated.used), stated.scan.frames.time_s
         if not len(used):
             return None
-        time_s = scan.frames.time_s[used]
-        frames = used[every_stretch(time_s, thinning([time_s], most=_ROUGH_FRAMES if rough else MOST_FRAMES))]
-        array = _Array.of(stated, frames)
-        found = cls(stated, scan, frames, latency_ms, array, array.coarse.blocks(scan.frames.time_s), rough)
+        every = thinning([all_s[used]], most=_ROUGH_FRAMES if rough else MOST_FRAMES)
+        array = _Array.of(selection, used[every_stretch(all_s[used], every)])
+        found = cls(selection, latency_ms, array, array.coarse.blocks(all_s), rough)
         return found if found.stretches >= _LEAST_BLOCKS else None
 
     @property
@@ -490,10 +485,11 @@ class _Overlap(Record, eq=False, dict=True):
         """The array read in the other order."""
         bad = np.argwhere(~_rearranged(self.selection.good_taxels, "transposed")).tolist()
         faults = tuple(TaxelFault(row, column, "left out") for row, column in bad)
-        return _Array.of(replace(self.selection, scan=corrected(self.scan, ["transposed"]), faults=faults), self.frames)
+        scan = corrected(self.selection.scan, ["transposed"])
+        return _Array.of(replace(self.selection, scan=scan, faults=faults), self.array.coarse.frames)
 
     @cached_property
-    def still(self) -> tuple[Arrangement, Cells, FloatArray, FloatArray]:
+    def still(self) -> _Fit:
         """What is stated, of a body that lies still, as `_fitted` has it."""
         return self._fitted(())
 
@@ -509,8 +505,8 @@ class _Overlap(Record, eq=False, dict=True):
 
         None where the first step takes off little.
         """
-        time_s = block_means(self.scan.frames.time_s[self.frames, None], self.array.coarse.first)
-        cells, levelled, error = still = self.still[1:]
+        coarse, (_, cells, levelled, error) = self.array.coarse, self.still
+        time_s = block_means(self.selection.scan.frames.time_s[coarse.frames, None], coarse.first)
         slope = cells.gradient(levelled)
         waves = {rate: np.hstack([np.cos(turn := 2 * np.pi * rate * time_s), np.sin(turn)]) for rate in _SWAYS_HZ}
         gains = {rate: _moves(wave, slope, error)[0] for rate, wave in waves.items()}
@@ -518,7 +514,7 @@ class _Overlap(Record, eq=False, dict=True):
             return None
         found = []
         for rate in sorted(gains, key=gains.__getitem__)[-_SWAYS_TRIED:]:
-            made, sway = self._moving(waves[rate], still)
+            made, sway = self._moving(waves[rate])
             found.append(replace(made, sway_mm=2 * float(np.linalg.norm(sway, 2)), sways_a_minute=60 * rate))
         return min(found, key=lambda one: one.spread)
 
@@ -530,29 +526,23 @@ class _Overlap(Record, eq=False, dict=True):
         """
         path = self._places_mm(())[0].mean(axis=1)
         strokes = (path - path.mean(axis=0)) @ principal_axes(path)[:, [-1]]
-        return self._moving(strokes, self.still[1:])[0]
+        return self._moving(strokes)[0]
 
-    def _moving(
-        self, course: FloatArray, still: tuple[Cells, FloatArray, FloatArray]
-    ) -> tuple[Arrangement, FloatArray]:
+    def _moving(self, course: FloatArray) -> tuple[Arrangement, FloatArray]:
         """What is stated, of a body that moves with (m, a) courses, by Gauss-Newton steps; and its (a, 2) moves, mm."""
-        moves, (cells, levelled, error) = np.zeros((course.shape[1], 2)), still
+        moves, (made, cells, levelled, error) = np.zeros((course.shape[1], 2)), self.still
         for _ in range(_SWAY_STEPS):
             moves += _moves(course, cells.gradient(levelled), error)[1]
             made, cells, levelled, error = self._fitted((), (course @ moves)[:, None])
         return made, moves
 
-    def _fitted(
-        self, corrections: Corrections, moves_mm: FloatArray | float = 0.0
-    ) -> tuple[Arrangement, Cells, FloatArray, FloatArray]:
+    def _fitted(self, corrections: Corrections, moves_mm: FloatArray | float = 0.0) -> _Fit:
         """The arrangement judged with places moved by (m, 1, 2), the cells, levelled readings, and their errors."""
-        array = self._array(corrections)
-        coarse, varying = array.coarse, array.varying
-        places, agreement = self._places_mm(corrections)
-        cells = Cells.of([places + moves_mm])
-        tolerance = _ROUGH_TOLERANCE if self.rough else COMPARED
-        rest, levelled = map_fit([coarse], varying.reshape(-1), cells, tolerance=tolerance, within=not self.rough)
+        array, (places, agreement) = self._array(corrections), self._places_mm(corrections)
+        varying, cells = array.varying, Cells.of([places + moves_mm])
         values, block = varying.reshape(-1), np.repeat(self.block, varying.shape[1])
+        tolerance = _ROUGH_TOLERANCE if self.rough else COMPARED
+        rest, levelled = map_fit([array.coarse], values, cells, tolerance=tolerance, within=not self.rough)
         # by another clock the first or last frames have no pose: kept at one place they would seem to agree
         placed = np.repeat(self._path(corrections).known.astype(np.float64), varying.shape[1])
         cell = cells.number
@@ -578,10 +568,11 @@ class _Overlap(Record, eq=False, dict=True):
 
     def _places_mm(self, corrections: Corrections) -> tuple[FloatArray, float]:
         """(m, k, 2) places of the averaged readings on the plane in which they lie, and how the face agrees with it."""
-        array, surface = self._array(corrections), self.scan.head.surface_mm
+        array, scan = self._array(corrections), self.selection.scan
+        surface = scan.head.surface_mm
         for name in set(corrections) & {"rows-reversed", "columns-reversed", "half-turn"}:
             surface = np.stack([_rearranged(surface[..., i], name) for i in range(3)], axis=-1)
-        mounted = corrected(self.scan, (name for name in corrections if name.startswith(("lever", "quarter"))))
+        mounted = corrected(scan, (name for name in corrections if name.startswith(("lever", "quarter"))))
         tracker_from_head = inverse(mounted.head.scanhead_from_tracker)
         on_tracker = array.coarse.weight.T @ apply(tracker_from_head, surface.reshape(-1, 3)[array.taxels])
         middle, path = on_tracker.mean(axis=0), self._path(corrections)
@@ -599,8 +590,8 @@ class _Overlap(Record, eq=False, dict=True):
         """Mean poses of the tracker at the averaged frames; known where all lie between its first and its last."""
         rotations = tuple(name for name in corrections if name in _ROTATIONS[-1])
         if rotations not in self.paths:
-            scan, first = corrected(self.scan, rotations), self.array.coarse.first
-            time_s = scan.frames.time_s[self.frames]
+            scan, coarse = corrected(self.selection.scan, rotations), self.array.coarse
+            time_s, first = scan.frames.time_s[coarse.frames], coarse.first
             poses = poses_at(scan.poses, time_s, latency_ms=self.latency_ms, max_gap_ms=np.inf)
             means = block_means(poses.rotation.reshape(-1, 9), first).reshape(-1, 3, 3)
             known = np.logical_and.reduceat(poses.known, first)

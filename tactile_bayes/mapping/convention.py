@@ -57,10 +57,7 @@ class CoarseFrames(Record, eq=False):
     frames: IndexArray  #: (n,) int array: The scan's frames that were averaged.
     first: IndexArray  #: (m,) int array: Where each block of frames begins among them.
     weight: FloatArray  #: (t, k) array: Share of each good taxel in each block of taxels; columns add up to 1.
-    row: IndexArray
-    block: IndexArray
-    """`row`, `block` (k,) int arrays: Which rows of the head a block of taxels is of, and its number among all blocks
-    of the head."""
+    row: IndexArray  #: (k,) int array: Which rows of the head a block of taxels is of.
     basis: FloatArray  #: (k, 6) array: Orthonormal: a level, two slopes and three curvatures over the head's blocks.
 
     @classmethod
@@ -69,7 +66,7 @@ class CoarseFrames(Record, eq=False):
         mean."""
         good, scan = selection.good_taxels, selection.scan
         readout = selection.readout
-        weight, row, block, basis = _taxel_blocks(good)
+        weight, row, basis = _taxel_blocks(good)
         first = np.flatnonzero(np.diff(stretches(scan.frames.time_s[frames]), prepend=-1))
         pooled = np.empty((len(frames), weight.shape[1]))
         for part in chunks(len(frames), _CHUNK):
@@ -77,7 +74,7 @@ class CoarseFrames(Record, eq=False):
             pressure, valid = readout.pressure_kpa(readout.counts(scan.frames.counts[chosen]))
             pressure /= selection.level_kpa[chosen, None]
             pooled[part] = (pressure if valid is None else np.where(valid, pressure, 1.0)) @ weight
-        return cls(block_means(pooled, first), frames, first, weight, row, block, basis)
+        return cls(block_means(pooled, first), frames, first, weight, row, basis)
 
     def blocks(self, time_s: FloatArray) -> IndexArray:
         """(m,) which stretch of `SHARED_S` each averaged frame lies in, from the times of the scan's frames."""
@@ -101,8 +98,8 @@ class CoarseFrames(Record, eq=False):
         return np.asarray(np.einsum("mij,jk->mki", matrix, taxels) * projection.cell_mm)
 
 
-def _taxel_blocks(good: BoolArray) -> tuple[FloatArray, IndexArray, IndexArray, FloatArray]:
-    """Shares of the good taxels in blocks, each block's rows of the head, its number, and polynomials over them."""
+def _taxel_blocks(good: BoolArray) -> tuple[FloatArray, IndexArray, FloatArray]:
+    """Shares of the good taxels in blocks, each block's rows of the head, and polynomials over them."""
     row, column = np.nonzero(good)
     number = row // POOL_TAXELS * good.shape[1] + column // POOL_TAXELS
     blocks, member = np.unique(number, return_inverse=True)
@@ -110,7 +107,7 @@ def _taxel_blocks(good: BoolArray) -> tuple[FloatArray, IndexArray, IndexArray, 
     weight[np.arange(len(row)), member] = 1.0 / np.bincount(member)[member]
     s, t = ((place - place.mean()) / len(good) @ weight for place in (row.astype(float), column.astype(float)))
     terms = [np.ones_like(s), s, t, s * s, s * t, t * t][: len(blocks)]
-    return weight, blocks // good.shape[1], blocks, np.linalg.qr(np.stack(terms, axis=1))[0]
+    return weight, blocks // good.shape[1], np.linalg.qr(np.stack(terms, axis=1))[0]
 
 
 def numbered_on(blocks: Sequence[IndexArray]) -> IndexArray:
