@@ -55,7 +55,7 @@ class ShiftFit(Record, eq=False):
         levelled = map_fit(parts, pressure, cells)[1]
         gradient = cells.gradient(levelled)
         row = np.concatenate([np.tile(part.row, len(part.pressure)) for part in parts])
-        row_cell = row * (cells.number.max() + 1) + cells.number
+        row_cell = np.unique(row * (cells.number.max() + 1) + cells.number, return_inverse=True)[1]
         data = _fitted(parts, pressure - cells.within(gradient), row_cell)[0]
         return cls(tuple(parts), cells, row_cell, levelled, gradient, data)
 
@@ -148,24 +148,21 @@ def _fitted(
     """
     scale = 1 / np.sqrt(np.maximum(np.bincount(group), 1))
     rest = _by_part(parts, CoarseFrames.without_head, values)
-    left = scale * np.bincount(group, rest)
-    least = tolerance**2 * float(left @ left)
+    whole = scale * np.bincount(group, rest)
     if start is not None:
         rest = _by_part(parts, CoarseFrames.without_head, values - start)
-        left = scale * np.bincount(group, rest)
     found, step, square = np.zeros_like(scale), np.zeros_like(scale), np.inf
     for _ in range(_FIT_STEPS):
-        before, square = square, float(left @ left)
-        if square <= least:
+        left, before = scale * np.bincount(group, rest), square
+        square = float(left @ left)
+        if square <= tolerance**2 * float(whole @ whole):
             break
         step = left + square / before * step
-        pulled = scale * np.bincount(group, _by_part(parts, CoarseFrames.without_head, (scale * step)[group]))
-        length = square / float(step @ pulled)  # what takes off frames and taxels is a projection
-        left -= length * pulled
-        found += length * step
-    mapped = (scale * found)[group]
-    rest -= _by_part(parts, CoarseFrames.without_head, mapped)
-    return rest, mapped if start is None else start + mapped
+        change = _by_part(parts, CoarseFrames.without_head, (scale * step)[group])
+        length = square / float(change @ change)
+        rest -= length * change
+        found += length * scale * step
+    return rest, found[group] if start is None else start + found[group]
 
 
 def _by_part(
