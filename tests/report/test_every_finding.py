@@ -269,7 +269,7 @@ OUTPUTS: dict[str, Output] = {
 PRINTERS = {
     # behind the outputs above
     "actions/estimate", "api/maps", "api/sized", "exports/dicom",
-    "exports/fhir", "exports/run", "exports/redcap", "files/map_nc",
+    "exports/fhir", "exports/run", "exports/redcap", "files/posterior_nc",
     "report/campaign_page", "report/growth_page", "report/compare", "report/estimate_document",
     "report/estimate_figures", "report/estimate_text", "report/exam_page", "report/map",
     "report/pages", "report/pooled",
