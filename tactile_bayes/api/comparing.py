@@ -177,6 +177,7 @@ class Comparison(Told, eq=False):
         return f"<Comparison {' '.join([*cautions, f'of {len(self.report.visits)} visits: {words}'])}>"
 
 
+Visits = Sequence[Sequence[SizeEstimate]]
 Names = Sequence[Sequence[str]]  #: Of the maps of each visit, for the report.
 Files = Sequence[Sequence[Path]]  #: That the maps of each visit came from.
 
@@ -221,12 +222,7 @@ def compare_answers(
 
 
 def compare_estimates(
-    visits: Sequence[Sequence[SizeEstimate]],
-    settings: Settings,
-    comparing: Comparing,
-    *,
-    names: Names,
-    files: Files = (),
+    visits: Visits, settings: Settings, comparing: Comparing, *, names: Names, files: Files = ()
 ) -> Comparison:
     """Compare visits, maps estimated again where they are of another mass; see `compare_answers`."""
     every = iter(one_mass([one for visit in visits for one in visit]))

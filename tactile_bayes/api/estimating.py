@@ -15,7 +15,6 @@ from tactile_bayes.errors import NO_LUMP, BadDataError, TactileBayesError, in_fi
 from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.npz import CheckpointFile
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.reports import Place
 from tactile_bayes.files.size_json import SHIPPED, default_for, read_size_calibration, size_calibration_path
 from tactile_bayes.findings import by_weight
 from tactile_bayes.mapping.map import TactileMap, many_cells
@@ -170,15 +169,11 @@ def _with_place(
     here = [estimate_document.patient_mm(tactile_map, one.x_mm, one.y_mm) for one in estimate.masses if one.reported]
     side = estimate_document.side_findings(estimate_document.side_of(scans), here[0] if here else None)
     sized = [
-        estimate_document.SizedPlace(
-            number,
-            Place(one.x_mm, one.y_mm),
-            one.estimate.size.summarise("max_size_mm", probability=probability),
-        )
+        (number, (one.x_mm, one.y_mm), one.estimate.size.summarise("max_size_mm", probability=probability))
         for number, one in enumerate(estimate.masses, start=1)
         if one.estimate.size is not None
     ]
-    touching = estimate_document.touching_findings(estimate_document.touching_masses(sized)) if len(sized) > 1 else []
+    touching = estimate_document.touching_findings(estimate_document.touching_masses(sized))
     return replace(estimate, findings=by_weight((*side, *estimate.findings, *touching)))
 
 

@@ -9,7 +9,7 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, as_dict, rounded
+from tactile_bayes.declarations import as_dict, rounded
 from tactile_bayes.files import reports
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import EstimateReport, MassReport
@@ -126,32 +126,29 @@ def side_findings(side: str, patient_mm: tuple[float, float] | None) -> tuple[Fi
 # --- Masses of a map that may be one lump: whether they touch, and how long they are together.
 
 
-class SizedPlace(Record):
-    """A mass with its place and size, as far as it takes to tell whether it touches another."""
-
-    number: int
-    centre_mm: reports.Place
-    max_size_mm: Quantity | None
+SizedMass = tuple[int, tuple[float, float], Quantity]  #: Number, x and y in mm, and largest size.
 
 
-def touching_masses(masses: Sequence[MassReport | SizedPlace]) -> tuple[reports.Touching, ...]:
+def sized_masses(masses: Sequence[MassReport]) -> list[SizedMass]:
+    """Those of the masses that have a size."""
+    return [(one.number, one.centre_mm.median, one.max_size_mm) for one in masses if one.max_size_mm is not None]
+
+
+def touching_masses(masses: Sequence[SizedMass]) -> tuple[reports.Touching, ...]:
     """Pairs of sized masses whose outlines may touch.
 
     Both lie in one body, so their errors go together: ends of the length are made of the same ends of both sizes. A
     pair touches where the upper ends of its radii reach over the distance of the centres.
     """
     found = []
-    for one, other in combinations(masses, 2):
-        size, beside = one.max_size_mm, other.max_size_mm
-        if size is None or beside is None:
-            continue
-        apart = float(np.hypot(one.centre_mm.x - other.centre_mm.x, one.centre_mm.y - other.centre_mm.y))
+    for (one, here, size), (other, there, beside) in combinations(masses, 2):
+        apart = float(np.hypot(here[0] - there[0], here[1] - there[1]))
         if apart <= (size.high + beside.high) / 2:
             ends = zip((size.median, size.low, size.high), (beside.median, beside.low, beside.high), strict=True)
             # one may lie within the other's outline
             median, low, high = (max(apart + (a + b) / 2, a, b) for a, b in ends)
             length = reports.Interval(median, low, high, size.probability)
-            found.append(reports.Touching((one.number, other.number), apart, length))
+            found.append(reports.Touching((one, other), apart, length))
     return tuple(found)
 
 
@@ -427,7 +424,7 @@ def mass_words(mass: MassReport, here: MassReport | None) -> str:
         ends = f"{share_words(size)} interval {size.low:.1f} to {size.high:.1f} mm"
         told = f"largest size {size.median:.1f} mm ({ends})"
     if here is not None:
-        for pair in touching_masses([here, mass]):
+        for pair in touching_masses(sized_masses([here, mass])):
             told += f"; may be one lump with mass {here.number}, {together_words(pair)}"
     return f"{place}: {told}; probability of a lump {chance_text(mass.detected_probability)}"
 
@@ -482,7 +479,7 @@ def estimate_report(
         candidates=tuple(reports.PassedOver(*one.centre_mm, one.fault) for one in estimate.candidates),
         other_rises=tuple(rounded(reports.OtherRise(**as_dict(one)), 6) for one in estimate.other_rises),
         masses=masses,
-        touching=touching_masses(masses),
+        touching=touching_masses(sized_masses(masses)),
         left_out=tuple(estimate.left_out),
         prior=as_dict(prior),
         research_use=RESEARCH_USE,

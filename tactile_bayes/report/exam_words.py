@@ -35,15 +35,12 @@ class ExamMass(Record, eq=False):
 
     number: int  #: On the map, from 1.
     centre_mm: tuple[float, float]  #: x and y in `plane`.
-    axes_mm: tuple[float, float] | None = None
-    angle_deg: float = 0.0
-    """`axes_mm`, `angle_deg`: Diameters of the ellipse along its own axes, and the angle from x to the first; None
-    without a size."""
+    axes_mm: tuple[float, float] | None = None  #: Diameters along its own axes; None without a size.
+    angle_deg: float = 0.0  #: From x to the first of them.
     largest: Quantity | None = None  #: Largest size with the interval that leads; None without.
     probability: float | None = None  #: That it is a lump; None where it is not told.
     place: ClockPosition | None = None  #: About the nipple; None where that is not known.
-    patient_mm: tuple[float, float] | None = None
-    """From the xiphoid to the patient's right and up; None without landmarks."""
+    patient_mm: tuple[float, float] | None = None  #: Right of the xiphoid and up; None without landmarks.
     why: str = ""  #: Why there is no size; empty where there is one.
 
 

@@ -150,9 +150,8 @@ class Course(Record):
     patient: str = ""
     side: str = ""
     mass: str = ""
-    visits: tuple[str, ...] = ()
-    dates: tuple[str, ...] = ()
-    """`visits`, `dates`: A code and a date for each visit."""
+    visits: tuple[str, ...] = ()  #: A code for each.
+    dates: tuple[str, ...] = ()  #: Likewise.
 
     def of(self, visit: Visit) -> str:
         """A visit in words, with its date or its day."""

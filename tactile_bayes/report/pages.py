@@ -77,8 +77,7 @@ class PageFiles(Record):
     """Where a page goes."""
 
     html: Path
-    pdf: Path | None = None
-    """`html`, `pdf`: Files to write; no PDF where it is None."""
+    pdf: Path | None = None  #: None writes none.
     force: bool = False  #: Overwrite them.
 
     def check(self) -> None:

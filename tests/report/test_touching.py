@@ -6,7 +6,7 @@ import pytest
 
 from tactile_bayes.files.reports import Interval, MassReport, Place
 from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.report.estimate_document import mass_words, touching_findings, touching_masses
+from tactile_bayes.report.estimate_document import mass_words, sized_masses, touching_findings, touching_masses
 
 
 def mass(number: int, x: float, size: float | None, *, half: float = 1.0) -> MassReport:
@@ -31,26 +31,26 @@ def mass(number: int, x: float, size: float | None, *, half: float = 1.0) -> Mas
 
 def test_balls_in_a_row_are_as_long_as_their_distance_and_radii() -> None:
     """Two balls of 12 and 8 mm that touch are 20 mm long: geometry."""
-    (pair,) = touching_masses([mass(1, 0.0, 12.0), mass(2, 10.0, 8.0)])
+    (pair,) = touching_masses(sized_masses([mass(1, 0.0, 12.0), mass(2, 10.0, 8.0)]))
     assert pair.masses == (1, 2)
     assert pair.apart_mm == 10.0
     assert pair.together_mm == Interval(20.0, 19.0, 21.0, 0.95)
 
 
 def test_they_touch_where_the_upper_ends_of_the_intervals_meet() -> None:
-    assert touching_masses([mass(1, 0.0, 12.0), mass(2, 10.9, 8.0)])
+    assert touching_masses(sized_masses([mass(1, 0.0, 12.0), mass(2, 10.9, 8.0)]))
     # the controls: farther than that, or surer
-    assert not touching_masses([mass(1, 0.0, 12.0), mass(2, 11.1, 8.0)])
-    assert not touching_masses([mass(1, 0.0, 12.0, half=0.5), mass(2, 10.9, 8.0, half=0.5)])
+    assert not touching_masses(sized_masses([mass(1, 0.0, 12.0), mass(2, 11.1, 8.0)]))
+    assert not touching_masses(sized_masses([mass(1, 0.0, 12.0, half=0.5), mass(2, 10.9, 8.0, half=0.5)]))
 
 
 def test_a_small_one_within_the_outline_of_a_large_one_adds_nothing() -> None:
-    (pair,) = touching_masses([mass(1, 0.0, 20.0), mass(2, 3.0, 6.0)])
+    (pair,) = touching_masses(sized_masses([mass(1, 0.0, 20.0), mass(2, 3.0, 6.0)]))
     assert pair.together_mm.median == 20.0
 
 
 def test_a_mass_without_a_size_takes_no_part() -> None:
-    assert not touching_masses([mass(1, 0.0, 12.0), mass(2, 9.0, None)])
+    assert not touching_masses(sized_masses([mass(1, 0.0, 12.0), mass(2, 9.0, None)]))
 
 
 @pytest.mark.parametrize(("x", "told"), [(10.0, True), (30.0, False)])
@@ -58,7 +58,7 @@ def test_the_line_of_the_other_mass_tells_it(x: float, told: bool) -> None:
     first, second = mass(1, 0.0, 12.0), mass(2, x, 8.0)
     words = "may be one lump with mass 1, together 20.0 mm long (19.0 to 21.0)"
     assert (words in mass_words(second, first)) == told
-    found = touching_findings(touching_masses([first, second]))
+    found = touching_findings(touching_masses(sized_masses([first, second])))
     assert [one.text for one in found] == (
         ["masses 1 and 2 may be one lump: together 20.0 mm long (19.0 to 21.0)"] if told else []
     )
