@@ -44,6 +44,7 @@ class Sizes:
 
     def __init__(self, largest: np.ndarray, smallest: np.ndarray) -> None:
         self.max_size_mm, self.min_size_mm = largest, smallest
+        self.leading = self
 
     def summarise(self, name: str, *, probability: float) -> Quantity:
         return replace(INTERVALS[name], probability=probability)
