@@ -51,6 +51,8 @@ HEAD_PROFILE: Final = ("head_profile_x2", "head_profile_y2", "head_profile_y4")
 # frames with an error of their own felt a cell for each reading in it, see `mapping.profile`.
 POSE_NOISE: Final = ("pose_noise_x_mm", "pose_noise_y_mm", "frame_side_x_mm", "frame_side_y_mm", "frames_per_reading")
 
+RECORDING_KEYS: Final = "keys: n sternal notch, x xiphoid, p nipple, space start, q stop"
+
 Normalise = Literal["mean", "gain", "none"]
 NORMALISE: Final[tuple[Normalise, ...]] = get_args(Normalise)
 # See docs/decisions/0065; the paper divides by the mean.

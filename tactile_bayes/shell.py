@@ -67,6 +67,11 @@ def columns_of(stream: TextIO) -> int:
         return 0
 
 
+def can_redraw() -> bool:
+    """Whether the view has a terminal whose lines it can draw over; what others write there is lost."""
+    return sys.stderr.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "")
+
+
 def has_styles(environment: Mapping[str, str] = os.environ) -> bool:
     """Whether terminals get bold and colours: not with NO_COLOR (no-color.org), nor on one that cannot."""
     can = os.name == "posix" or "WT_SESSION" in environment

@@ -37,9 +37,9 @@ from tactile_bayes.mapping.places import Orientation, orientation_of
 from tactile_bayes.posterior.bump import candidate_centres
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.presets import FIELD_COSINES, INTERVAL, PRESSURE_WINDOW_KPA, RESEARCH_USE, VIRIDIS
+from tactile_bayes.presets import FIELD_COSINES, INTERVAL, PRESSURE_WINDOW_KPA, RECORDING_KEYS, RESEARCH_USE, VIRIDIS
 from tactile_bayes.scans import ElementCalibration, HeadGeometry
-from tactile_bayes.shell import has_styles
+from tactile_bayes.shell import can_redraw, has_styles
 
 DRAWINGS_PER_S = 10.0
 TAKEN_EVERY_S = 1 / DRAWINGS_PER_S / 2  #: Frames are added to the map some at a time, twice a drawing.
@@ -241,11 +241,6 @@ def _look(pipe: int, live: LiveMap, estimator: Estimator, showing: list[Callable
     return drawings
 
 
-def can_redraw() -> bool:
-    """Whether the view has a terminal whose lines it can draw over; what others write there is lost."""
-    return sys.stderr.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "")
-
-
 @contextlib.contextmanager
 def terminal_view(*, keys: bool = False) -> Iterator[Callable[[LiveState], None]]:
     """Draw on a terminal; one line per second where it cannot be redrawn."""
@@ -284,7 +279,6 @@ _SHADES: Final = " .:-=+*#%@"
 _FULL_BAR_KPA: Final = 20.0
 _SAID: Final = {"low": "press harder", "in": "in range", "high": "press less", "off": "waiting for the head"}
 _TINT: Final = {"low": "94", "in": "92", "high": "91", "off": "90"}
-KEYS: Final = "keys: n sternal notch, x xiphoid, p nipple, space start, q stop"
 _EDGE_WORDS: Final = {"H": "H (head)", "F": "F (feet)"}
 _LEGEND_LINES: Final = 3
 _LEAST_ROWS: Final = 6
@@ -301,7 +295,7 @@ def live_text(state: LiveState, *, columns: int, lines: int, colour: bool, keys:
     above = [_pressure(state, columns, colour=colour), _figures(state)[:columns], state.size_words[:columns]]
     below = [*textwrap.wrap(state.landmark_words, columns), RESEARCH_USE[:columns]]
     if keys:
-        below.insert(0, KEYS[:columns])
+        below.insert(0, RECORDING_KEYS[:columns])
     room = max(2, lines - len(above) - len(below) - 1)
     return "\n".join([*above, "", *_picture(state, columns, room, colour=colour), *below])
 

@@ -19,7 +19,6 @@ from typing import Any
 import click
 import numpy as np
 
-from tactile_bayes.actions.live_view import KEYS, can_redraw, live_view
 from tactile_bayes.api.arguments import PathLike, path_of, plain, takes
 from tactile_bayes.commands.options import also_read
 from tactile_bayes.declarations import as_dict, field
@@ -29,7 +28,6 @@ from tactile_bayes.files.documents import check_session, read_session
 from tactile_bayes.files.instrument import read_array_calibration, read_head_geometry, read_landmarks
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import RecordingWriter, create_exclusive, full_disk, read_scan
-from tactile_bayes.files.size_json import size_calibration_path
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.head import HeadParser
@@ -38,8 +36,9 @@ from tactile_bayes.hardware.readings import Follower, HelloReading, Parser
 from tactile_bayes.hardware.recorder import LandmarkTouch, Line, Observer, Recorder, Report
 from tactile_bayes.hardware.serial_trackers import TRACKERS, check_head, open_tracker
 from tactile_bayes.options import RecordOptions
-from tactile_bayes.presets import PRESSURE_RANGE_KPA, RESEARCH_USE
+from tactile_bayes.presets import PRESSURE_RANGE_KPA, RECORDING_KEYS, RESEARCH_USE
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks
+from tactile_bayes.shell import can_redraw
 
 _NOMINAL_FULL_SCALE = 4095
 _PATHS = ("like", "head_geometry", "array_calibration", "landmarks")
@@ -170,7 +169,7 @@ class Keys:
             self._settings = termios.tcgetattr(sys.stdin)
             tty.setcbreak(sys.stdin)
         if self.waiting:
-            self._say(KEYS)
+            self._say(RECORDING_KEYS)
             self._recorder.listen()
         return self
 
@@ -213,7 +212,6 @@ class Keys:
 def record_action(output: Path, **options: Any) -> int:
     """Record a scan head and a tracker."""
     request = Request(output=output, **options)
-    also_read(size_calibration_path(request.size_calibration))
     report, interrupted = make_recording(request)
     click.echo(record_text(report, output=str(output)), nl=False)
     if report.fault:
@@ -268,6 +266,11 @@ def make_recording(request: Request) -> tuple[Report, bool]:
         check_session(session, path=request.output)
         observer = Observer()
         if request.live or request.serve:
+            # it maps and estimates, which a recording alone does not pay for
+            from tactile_bayes.actions.live_view import live_view
+            from tactile_bayes.files.size_json import size_calibration_path
+
+            also_read(size_calibration_path(request.size_calibration))
             view = live_view(
                 head, calibration, terminal=request.live, serve=request.serve, size_calibration=request.size_calibration
             )
