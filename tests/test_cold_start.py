@@ -125,3 +125,8 @@ def test_the_laplace_estimate_imports_only_what_it_uses(run_python, estimate_inp
 def test_what_neither_draws_nor_samples_imports_no_plot_and_no_sampler(words, run_python, tmp_path):
     modules = imported_by(run_python("-c", RUN, *words, cwd=tmp_path))
     assert not modules & set(NOT_FOR_LAPLACE)
+
+
+def test_a_map_is_made_without_scipy_and_the_posterior(run_python, tmp_path):
+    modules = imported_by(run_python("-c", RUN, "map", DEMO / "scan.mcap", "-o", "map.nc", cwd=tmp_path))
+    assert not {name for name in modules if name.split(".")[0] == "scipy" or name.startswith("tactile_bayes.posterior")}

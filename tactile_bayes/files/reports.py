@@ -384,13 +384,6 @@ class EstimateReport(Report, kw_only=True):
         return self.diagnostics
 
 
-def ellipse_of(told: EstimateReport | MassReport) -> tuple[tuple[float, float] | None, float]:
-    """Diameters of a mass along its own axes, mm, None without a size, and the angle in degrees from x to the first."""
-    along, across = told.d_x_mm, told.d_y_mm
-    axes = None if along is None or across is None else (along.median, across.median)
-    return axes, 0.0 if told.angle_deg is None else told.angle_deg.median
-
-
 # --- One size from several maps of one mass.
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, UsageError
-from tactile_bayes.files.reports import EstimateReport, MassReport, Place, Point, PooledReport, centre_of, ellipse_of
+from tactile_bayes.files.reports import EstimateReport, MassReport, Place, Point, PooledReport, centre_of
 from tactile_bayes.findings import capital
 from tactile_bayes.geometry import apply
 from tactile_bayes.inference.draws import Quantity
@@ -22,6 +22,7 @@ from tactile_bayes.mapping.plausibility import WHY_NOT
 from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.report.estimate_document import from_xiphoid, others, patient_mm, share_words, size_words
 from tactile_bayes.report.estimate_text import shape_text, smallest_text
+from tactile_bayes.report.map import ellipse_of
 from tactile_bayes.size.pooling import DISAGREE
 
 _LONGEST: Final = {"title": 60, "name": 50}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from tactile_bayes.declarations import Record, replace
-from tactile_bayes.files.reports import EstimateReport, centre_of, ellipse_of
+from tactile_bayes.files.reports import EstimateReport, centre_of
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Quantity
@@ -27,7 +27,7 @@ from tactile_bayes.report.compare import (
     verdict_sentence,
 )
 from tactile_bayes.report.figure_file import figure_file, named_exam
-from tactile_bayes.report.map import draw_cells, draw_edges
+from tactile_bayes.report.map import draw_cells, draw_edges, ellipse_of
 from tactile_bayes.report.pages import cut, foot, page
 from tactile_bayes.size.visits import Compared, straight_line
 

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.reports import EstimateReport, PassedOver, ellipse_of
 from tactile_bayes.findings import Finding, finding_lines, verdict
 from tactile_bayes.mapping.accumulate import LEAST_SHARE
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap, advise_cell, skewed
@@ -23,6 +22,8 @@ from tactile_bayes.report.figure_file import figure_file, load_matplotlib
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from tactile_bayes.files.reports import EstimateReport, MassReport, PassedOver
 
 
 # --- Text report of a tactile map: its verdict in a few lines, or a table with units, then what was left out.
@@ -398,6 +399,13 @@ def draw_edges(axes: Axes, view: Orientation) -> None:
         across, up = aligned.get(side, ("center", "bottom"))
         looks: dict[str, Any] = {"ha": across, "va": up, "color": "white", "fontsize": 10}
         axes.text(*places[side], name, transform=axes.transAxes, path_effects=_outlined(2.5), **looks)
+
+
+def ellipse_of(told: EstimateReport | MassReport) -> tuple[tuple[float, float] | None, float]:
+    """Diameters of a mass along its own axes, mm, None without a size, and the angle in degrees from x to the first."""
+    along, across = told.d_x_mm, told.d_y_mm
+    axes = None if along is None or across is None else (along.median, across.median)
+    return axes, 0.0 if told.angle_deg is None else told.angle_deg.median
 
 
 def _draw_fit(axes: Axes, report: EstimateReport, view: Orientation) -> None:
