@@ -212,6 +212,7 @@ class Keys:
 def record_action(output: Path, **options: Any) -> int:
     """Record a scan head and a tracker."""
     request = Request(output=output, **options)
+    also_read(Path(request.size_calibration))
     report, interrupted = make_recording(request)
     click.echo(record_text(report, output=str(output)), nl=False)
     if report.fault:
@@ -268,9 +269,7 @@ def make_recording(request: Request) -> tuple[Report, bool]:
         if request.live or request.serve:
             # it maps and estimates, which a recording alone does not pay for
             from tactile_bayes.actions.live_view import live_view
-            from tactile_bayes.files.size_json import size_calibration_path
 
-            also_read(size_calibration_path(request.size_calibration))
             view = live_view(
                 head, calibration, terminal=request.live, serve=request.serve, size_calibration=request.size_calibration
             )
