@@ -76,7 +76,7 @@ def _ratio_share(masses: ModalitySizes, model: ErrorModel, method: str, given: a
     rng, hits = np.random.default_rng([given.seed, 1]), []
     for _ in range(given.trials):
         one = simulate(masses.patient, masses.ex_vivo_mm, tactile, rng=rng)
-        other = simulate(masses.patient, masses.ex_vivo_mm, model, rng=rng, name="other")
+        other = simulate(masses.patient, masses.ex_vivo_mm, model, rng=rng)
         ends = mape_ratio(other, one, intervals=chosen).interval
         if ends is not None:
             hits.append(math.log(ends[0]) <= truth <= math.log(ends[1]))

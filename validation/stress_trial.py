@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         single += [one for answer in answers for one in sized(d_mm, answer.document)]
         names = [f"exam {i + 1}" for i in range(len(answers))]
         whole = pool_answers(answers, Settings(), names=names).document if answers else None
-        warned = any(finding.severity == "caution" for one in answers for finding in one.findings)
+        warned = any(finding.severity == "caution" for one in answers for finding in one.report.findings)
         told = "".join(f"{median:.1f} ({low:.1f} to {high:.1f})" for _, median, low, high in sized(d_mm, whole))
         print(f"{name:20} true {d_mm:5.1f}  {told or 'no size'}{'  CAUTION' if warned else ''}", flush=True)
         pooled += sized(d_mm, whole)
