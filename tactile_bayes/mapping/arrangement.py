@@ -45,12 +45,10 @@ _LEVER: Final = ((), ("lever-inverse",), ("lever-none",))
 _ROTATIONS: Final = tuple(CONVENTIONS.values())
 
 Corrections = tuple[str, ...]
-Trial = tuple[Corrections, float]
-"""Corrections, and by how many ms poses are later."""
+Trial = tuple[Corrections, float]  #: Corrections, and by how many ms poses are later.
 
 MOST_CHANGES: Final = 3
-LIKELY_ODDS: Final = 10.0
-"""From these odds on another arrangement is a caution, and the one stated counts as shown."""
+LIKELY_ODDS: Final = 10.0  #: From these odds on another arrangement is a caution, and the one stated counts as shown.
 LEAST_EXPLAINED: Final = 0.3
 """Share of what varies over the skin that frames of other times predict in another arrangement, to be likely."""
 CLOCK_MS: Final = (30, 60, 100, 150, 200, 300, 400, 500)
@@ -60,10 +58,8 @@ MOST_EXPLAINED: Final = 0.25
 MOST_LASTING: Final = 0.5
 LEAST_CONTRADICTION: Final = 0.02
 """Frames that explain less than `MOST_EXPLAINED`, with larger errors that last longer, contradict each other."""
-LEAST_LASTING: Final = 0.15
-"""Below it there is nothing but noise to compare."""
-_ROUNDING: Final = 1e-12
-"""What varies no more, in readings over their frames' means, does not vary."""
+LEAST_LASTING: Final = 0.15  #: Below it there is nothing but noise to compare.
+_ROUNDING: Final = 1e-12  #: What varies no more, in readings over their frames' means, does not vary.
 MOST_FRAMES: Final = 250
 _ROUGH_FRAMES, _ROUGH_TOLERANCE, _ROUGH_BY = 60, 0.5, 0.15
 """What so many frames, fitted so far, gain is at most 0.05 too little where it matters (67 scans): 0.15 are allowed."""
@@ -82,8 +78,7 @@ _LEAST_SWAY_START: Final = 0.03
 """Of the squared errors, what the first step must take off for more: it does in 22 of 88 right scans whose errors last,
 and in all of 32 that breathe."""
 _SWAY_NUMBERS: Final = 5  # that are fitted: a rate, and cosine and sine along two axes
-_LEAST_OTHERS: Final = 2
-"""Readings of other times that predict one."""
+_LEAST_OTHERS: Final = 2  #: Readings of other times that predict one.
 NOTHING_SHOWN: Final = "too little stands out to show that array, lever arm and quaternions are as stated"
 NOT_CHECKED: Final = Finding(
     "arrangement_unknown",

@@ -458,8 +458,7 @@ class CollapsedTarget:
                     yield spanned.solution(fields)
                     continue
             for j in range(0, len(points), BLOCK):
-                projected, cross = self.linear.projected(self.scene.templates(points[j : j + BLOCK], self.window))
-                yield joined([self.linear.under(projected, cross, columns) for columns in fields])
+                yield self.linear.under_each(self.scene.templates(points[j : j + BLOCK], self.window), fields)
 
 
 def choose(evidence: FloatArray, rng: np.random.Generator) -> IndexArray:

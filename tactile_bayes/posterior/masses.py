@@ -41,8 +41,7 @@ LEAST_PROBABILITY = 0.95
 LEAST_BESIDE = 0.05
 """From this probability on a rise beside a measured lump is listed without a size, if its shape is `LIKELY` a lump's
 and it has `LEAST_SHARE` of the lump's amplitude."""
-WELL_READ = 0.5
-"""Share of the median count from which on a cell is read well."""
+WELL_READ = 0.5  #: Share of the median count from which on a cell is read well.
 LEAST_STANDING, STANDING_MM = 0.35, 2.5
 """Share of a rise's amplitude by which the map at its centre, so far about it, must stand above its level: a level that
 falls towards the rim on two sides is like a bump's flanks, and no lump."""
@@ -230,13 +229,11 @@ def _stands_out(rise: Rise, rest: TactileMap) -> bool:
 # window, is then estimated as if its place had been given: with the other lump in its scene where it lies in the
 # window. Where that finds no lump there, the map less the first lump decides.
 
-OF_A_LUMP = ("seat", "depth_mm", "stiffness_ratio")
-"""Known properties that are of one lump, not of the whole body."""
+OF_A_LUMP = ("seat", "depth_mm", "stiffness_ratio")  #: Known properties that are of one lump, not of the whole body.
 LEAST_SHARE = 0.15
 """Share of the first lump's amplitude, for a size from the map less that lump: of two with less, 21 mm from a lump 13
 times as high, one came out twice as large as it was, and what a lump leaves of itself is some per cent of it."""
-APART_IN_WIDTHS = 2.0
-"""Two equal Gaussians nearer than this many widths have one maximum."""
+APART_IN_WIDTHS = 2.0  #: Two equal Gaussians nearer than this many widths have one maximum.
 DOUBTFUL_SHARE = 0.3
 """Share of the highest mass's amplitude: a lower rise is in doubt, though the calibration may fit it alone."""
 BOTH = "scan again with more lines over both"
