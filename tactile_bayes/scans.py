@@ -244,7 +244,8 @@ class TrackerPoses(Record, eq=False):
         time = _check_times(self.time_s, name="pose_time_s")
         position = _check_finite(self.position_mm, name="position_mm", shape=(len(time), 3))
         quaternion = _check_finite(self.quaternion_wxyz, name="quaternion_wxyz", shape=(len(time), 4))
-        norm = np.linalg.norm(quaternion, axis=1)
+        with np.errstate(over="ignore"):
+            norm = np.linalg.norm(quaternion, axis=1)
         off = np.flatnonzero(np.abs(norm - 1.0) > 1e-2)
         if len(off):
             i = int(off[0])

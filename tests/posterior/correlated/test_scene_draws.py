@@ -123,14 +123,16 @@ def test_a_method_that_fails_hands_on(monkeypatch: pytest.MonkeyPatch) -> None:
         return replace(draws, diagnostics=dict(draws.diagnostics) | {"pareto_k": float("nan")})
 
     monkeypatch.setattr(FieldFit, "at_mode", untrusted)
-    draws, passed = draw_parameters(strong(), SamplerSettings(method="laplace"), rng=np.random.default_rng(1))
+    draws, passed = draw_parameters(
+        strong(), SamplerSettings(method="laplace", noise="field"), rng=np.random.default_rng(1)
+    )
     assert draws.method == "importance"
     assert passed[0].startswith("laplace: Pareto shape nan")
     monkeypatch.setattr(methods, "importance_draws", heavy)
     with pytest.raises(NotConvergedError, match=r"laplace: .*importance: Pareto shape 0.91$"):
-        draw_parameters(strong(), SamplerSettings(method="laplace"), rng=np.random.default_rng(1))
+        draw_parameters(strong(), SamplerSettings(method="laplace", noise="field"), rng=np.random.default_rng(1))
     with pytest.raises(NotConvergedError, match=r"importance: Pareto shape 0.91; ensemble: .*max_steps"):
-        draw_parameters(strong(), SamplerSettings(max_steps=150), rng=np.random.default_rng(1))
+        draw_parameters(strong(), SamplerSettings(max_steps=150, noise="field"), rng=np.random.default_rng(1))
 
 
 def test_accuracy_in_millimetres_is_accuracy_of_the_widths() -> None:
