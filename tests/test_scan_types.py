@@ -62,3 +62,8 @@ def test_saturated_readings_carry_no_pressure(count: int, expected: float) -> No
     pressure = calibration.to_kpa(np.full((1, 1, 1), count, dtype=np.uint16))
     # Beyond 34 kPa the element is at the end of its range, whatever the converter says.
     np.testing.assert_allclose(pressure[0, 0, 0], expected if expected < 34 else np.nan)
+
+
+def test_a_quaternion_beyond_all_squares_is_refused_without_a_warning() -> None:
+    with pytest.raises(BadDataError, match="quaternion_wxyz has norm inf at index 0"):
+        TrackerPoses(np.array([0.0, 1.0]), np.zeros((2, 3)), np.full((2, 4), 1e200))

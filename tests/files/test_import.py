@@ -71,11 +71,6 @@ FAULTS: list[tuple[str, Callable[[Arrays], object], str]] = [
     ("text", put("offset_kpa", lambda o: o.astype(str)), "offset_kpa is <U"),
     ("complex", put("offset_kpa", lambda o: o.astype(complex)), "offset_kpa is complex128"),
     ("quaternion", put("quaternion_wxyz", lambda q: 2 * q), "quaternion_wxyz has norm 2 at index 0"),
-    (
-        "quaternion beyond all squares",
-        put("quaternion_wxyz", lambda q: 1e200 * q),
-        "quaternion_wxyz has norm inf at index 0",
-    ),
     ("zero quaternion", spoil("quaternion_wxyz", 3, 0.0), "norm 0 at index 3"),
     ("time back", spoil("pose_time_s", 4, 0.0), "pose_time_s runs backwards at index 4"),
     ("gain NaN", spoil("gain_kpa_per_count", (2, 3), np.nan), r"gain_kpa_per_count.*\(2, 3\)"),
