@@ -170,6 +170,12 @@ def test_an_output_is_never_the_size_calibration(case: str, tmp_path: Path, monk
     assert (tmp_path / "s").read_text() == "{}"
 
 
+def test_a_recording_without_a_view_refuses_a_size_calibration_that_is_none(tmp_path: Path) -> None:
+    words = ["record", "-o", str(tmp_path / "s.mcap"), "--head", "/dev/nothing", "--size-calibration", "sold"]
+    with pytest.raises(UsageError, match="no calibration or file is called 'sold'"):
+        cli.main(words, standalone_mode=False)
+
+
 @pytest.mark.parametrize("option", ["-o", "--html"])
 def test_an_output_is_never_a_posterior_that_a_trial_table_names(option: str, plain: Path, tmp_path: Path) -> None:
     for name in ("trial.csv", "excision.csv"):
