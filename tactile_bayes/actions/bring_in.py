@@ -130,7 +130,9 @@ def _import(source: Path, output: Path, wanted: Wanted) -> list[str]:
 
 
 def _import_scan(source: Path, output: Path, wanted: Wanted) -> list[str]:
-    lost, truth, notes = tuple[str, ...](), None, list[str]()
+    lost: tuple[str, ...] = ()
+    notes: list[str] = []
+    truth = None
     if source.suffix.lower() == ".mcap":
         file = read_scan_report(source)
         scan, lost, truth = file.scan, file.lost, file.truth

@@ -215,10 +215,10 @@ def draw_with_size(work: Work, seen: Assessment) -> MapDraws:
     calibration = calibration.at_depth_or_fallback(*posterior.medians)
     if fault is None and (far := calibration.outside(*posterior.medians, far=True)):
         fault = terms.extrapolated(far)
-    size = (
-        draw_sizes(posterior, calibration=calibration, priors=options.size_priors, rng=work.rng) if not fault else None
-    )
-    return replace(made, calibration=calibration, size=size, fault=fault)
+    made = replace(made, calibration=calibration, fault=fault)
+    if fault is not None:
+        return made
+    return replace(made, size=draw_sizes(posterior, calibration=calibration, priors=options.size_priors, rng=work.rng))
 
 
 # --- The answer for one map: a size, widths, or the reason for neither.
@@ -318,13 +318,8 @@ def _measured(work: Work, seen: Assessment, candidates: tuple[Candidate, ...]) -
         elif options.method == "ensemble" or not options.correlated:
             raise
         return _none(why, candidates, detection, bump)
-    detection, posterior, size, fault, diagnostics = (
-        made.detection,
-        made.posterior,
-        made.size,
-        made.fault,
-        _diagnostics(made),
-    )
+    detection, posterior, size, fault = made.detection, made.posterior, made.size, made.fault
+    diagnostics = _diagnostics(made)
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
         reason = f"no positive size in {size.invalid} of {size.d_x_mm.size} draws: outside the calibration"
         advice = "learn a calibration whose table holds such lumps"
