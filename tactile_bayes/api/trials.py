@@ -31,7 +31,6 @@ from tactile_bayes.report.trial_html import plan_figure, trial_html
 from tactile_bayes.trial import planning
 from tactile_bayes.trial.figures import MIN_PATIENTS, Intervals, UndefinedError
 from tactile_bayes.trial.next_mass import next_mass
-from tactile_bayes.trial.planning import check_all
 from tactile_bayes.trial.readings import Trial, at_excision, readings_from_columns, unit_doubts
 from tactile_bayes.trial.summary import TrialReport, summarise
 
@@ -120,8 +119,6 @@ def analyse(
         trial, intervals=intervals, error_ratio=settings.error_ratio, seed=settings.seed, provenance=made.as_dict()
     )
     more: dict[str, Any] = {} if title is None else {"title": title}
-    if trials := settings.check_intervals:
-        more["interval_check"] = check_all(trial.sizes(), intervals=intervals, trials=trials, seed=settings.seed)
     if settings.bayes:
         rng = np.random.default_rng(settings.seed)
         more["next_mass"] = next_mass(trial, rng=rng)
