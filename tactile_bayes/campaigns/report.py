@@ -26,8 +26,9 @@ from tactile_bayes.files.tables import Table
 from tactile_bayes.findings import Finding, by_weight, capital, finding_lines, verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.report.campaign_page import ExamEntry, MassRow, VisitEntry, campaign_html, worst
-from tactile_bayes.report.compare import CompareReport, Growth, growth_line, growths
+from tactile_bayes.report.compare import CompareReport, growths
 from tactile_bayes.report.exam_words import reason_on_paper
+from tactile_bayes.report.pages import Growth, growth_line
 from tactile_bayes.trial.readings import at_excision
 
 # --- Tables: exams done, failures, and the trial table that `validate` takes.
