@@ -14,8 +14,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
-from tactile_bayes.batch import CLUSTER_LOST, run_batch
-from tactile_bayes.batch_store import BatchStore, open_store
+from tactile_bayes.batch import CLUSTER_LOST, BatchStore, open_store, run_batch
 from tactile_bayes.campaigns.exams import Breasts
 from tactile_bayes.campaigns.steps import FILES, STAGED, UNWRITTEN, WAITING, Result, put_in_place, stamp
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError

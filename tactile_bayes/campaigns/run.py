@@ -24,8 +24,7 @@ from typing import Any, Final, TypeVar
 
 from tactile_bayes.api.repeatability import ExamFolder
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_batch
-from tactile_bayes.batch_store import BatchStore
+from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, BatchStore, Outcome, run_batch
 from tactile_bayes.campaigns import steps
 from tactile_bayes.campaigns.exams import Breasts, Match, NamedPlace, Visits, grown_masses, visit_dates
 from tactile_bayes.campaigns.inputs import READ, Alike, StepResults, read_sources, unchanged
