@@ -30,12 +30,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from benchmarks.measure import environment
 from tactile_bayes.forward.contact import ContactStiffness, Head, solve_contact
-from tactile_bayes.forward.mesh import QuadMesh, body_mesh, disc_mesh
-from tactile_bayes.forward.plane import assemble, build_line, condense, head_positions, press, skin_average
+from tactile_bayes.forward.mesh import Elements, Mesh, body_mesh
+from tactile_bayes.forward.plane import (
+    build_line,
+    condense,
+    element_stiffness,
+    head_positions,
+    press,
+    skin_average,
+)
 from tactile_bayes.forward.tissue import Body
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import MEAN_KPA
@@ -100,34 +108,44 @@ def growth() -> list[dict[str, float]]:
     """Condensing at several finenesses, with the figures that the map then has."""
     rows = []
     for fineness in (1, 2, 3, 4, 6):
-        meshes = [body_mesh(BODY, fineness=fineness), disc_mesh(BODY, fineness=fineness, layered=True)]
+        mesh = body_mesh(BODY, fineness=fineness, layered=True)
         spent = seconds(lambda fineness=fineness: condense(BODY, fineness=fineness), runs=2)
         surface = condense(BODY, fineness=fineness)
         fit = fit_line(build_line(press(surface, HARD, head_positions())), 48.0)
-        dofs = 2 * sum(len(mesh.nodes) for mesh in meshes)
+        dofs = 2 * (len(mesh.nodes) + len(mesh.rim))
         rows.append(
             {"fineness": fineness, "dofs": dofs, "seconds": spent, "amplitude": fit.amplitude, "sigma_mm": fit.sigma_mm}
         )
     return rows
 
 
-def rectangle_mesh(x_mm: FloatArray, z_mm: FloatArray) -> QuadMesh:
+def rectangle_mesh(x_mm: FloatArray, z_mm: FloatArray) -> Mesh:
     """A grid of quadrilaterals with corners at `x_mm` and `z_mm`, all of them fat: for bodies without a lump."""
     x, z = (np.interp(np.arange(2 * len(one) - 1) / 2, np.arange(len(one)), one) for one in (x_mm, z_mm))
     number, (n, m) = np.arange(len(x) * len(z)).reshape(len(x), -1), (len(x), len(z))
     parts = [number[i : n - 2 + i : 2, j : m - 2 + j : 2].reshape(-1) for i in range(3) for j in range(3)]
     nodes = np.stack(np.meshgrid(x, z, indexing="ij"), axis=-1).reshape(-1, 2)
-    return QuadMesh(nodes, np.stack(parts, axis=1), np.zeros(len(parts[0]), dtype=bool))
+    none = np.zeros(len(parts[0]), dtype=bool)
+    return Mesh(nodes, np.stack(parts, axis=1), none, none)
 
 
-def joined(meshes: Sequence[QuadMesh], *, scale_mm: float) -> QuadMesh:
+def joined(meshes: Sequence[Mesh], *, scale_mm: float) -> Mesh:
     """Merge several meshes into one; nodes nearer than 1e-8 of `scale_mm` become one."""
     offsets = np.cumsum([0] + [len(mesh.nodes) for mesh in meshes])
     points = np.concatenate([mesh.nodes for mesh in meshes])
     key = np.round(points / (1e-8 * scale_mm)).astype(np.int64)
     _, first, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
     elements = [number.reshape(-1)[mesh.elements + offset] for mesh, offset in zip(meshes, offsets, strict=False)]
-    return QuadMesh(points[first], np.concatenate(elements), np.concatenate([mesh.gland for mesh in meshes]))
+    gland, lump = (np.concatenate([getattr(mesh, name) for mesh in meshes]) for name in ("gland", "lump"))
+    return Mesh(points[first], np.concatenate(elements), gland, lump)
+
+
+def assemble(mesh: Mesh, *, young_kpa: FloatArray, poisson: float) -> csc_array:
+    """Stiffness of a whole mesh in kPa, its unknowns ``x0, z0, x1, z1, ...``, none of them held."""
+    stiffness = element_stiffness(mesh.nodes[mesh.elements], poisson=poisson)
+    number = np.arange(2 * len(mesh.nodes)).reshape(-1, 2)
+    elements = Elements(mesh, stiffness, number, np.ones(number.shape), np.zeros(number.size, dtype=bool))
+    return elements.matrix(young_kpa, np.ones(len(mesh.elements), dtype=bool))[0]
 
 
 class PlainBody:
@@ -187,13 +205,10 @@ class ReusedBody:
     """The whole body on our mesh with one factorisation for all positions of the head."""
 
     def __init__(self, ratio: float) -> None:
-        half = [body_mesh(BODY, fineness=2), disc_mesh(BODY, fineness=2, layered=False)]
-        right = joined(half, scale_mm=BODY.d_mm)
-        left = QuadMesh(right.nodes * [-1.0, 1.0], right.elements, right.gland)
+        right = body_mesh(BODY, fineness=2, layered=False)
+        left = Mesh(right.nodes * [-1.0, 1.0], right.elements, right.gland, right.lump)
         mesh = joined([right, left], scale_mm=BODY.d_mm)
-        middle = mesh.nodes[mesh.elements].mean(axis=1)
-        lump = np.hypot(middle[:, 0], middle[:, 1] - BODY.centre_mm) < BODY.radius_mm
-        young = np.where(lump, 5.0 * ratio, np.where(mesh.gland, 50.0, 5.0))
+        young = np.where(mesh.lump, 5.0 * ratio, np.where(mesh.gland, 50.0, 5.0))
         x, z = mesh.nodes.T
         held = np.zeros((len(x), 2), dtype=bool)
         held[np.abs(x) > x.max() - 1e-6, 0] = True

@@ -72,7 +72,7 @@ def mesh_rows(name: str, geometry: LumpGeometry, runs: int) -> list[dict[str, An
     for mesh, size in MESHES.items():
         seconds = least_cpu(lambda size=size: condense_lump(geometry, size=size), runs)
         made[mesh] = condense_lump(geometry, size=size)
-        nodes = len(lump_mesh(geometry, size).node_mm)
+        nodes = len(lump_mesh(geometry, size).nodes)
         rows.append({"lump": name, "mesh": mesh, "unknowns": 3 * nodes, "orders": len(made[mesh].modes), "s": seconds})
     plain = over(head, [])
     frames = {mesh: over(head, [skin_perturbation(lump, 500.0)]) for mesh, lump in made.items()}

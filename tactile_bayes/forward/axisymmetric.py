@@ -8,30 +8,23 @@ from typing import Final
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.sparse import csc_array
 from scipy.special import j0
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.mesh import (
-    EXTERIOR_GLAND,
-    INTERIOR_FAT,
-    INTERIOR_GLAND,
     CondensedHole,
-    IntArray,
+    Elements,
     LumpGeometry,
-    LumpMesh,
+    Mesh,
     MeshSize,
-    condensed,
-    gathered,
     lagrange_points,
     lump_mesh,
-    moved,
     quadrature,
     stiffness_factor,
 )
 from tactile_bayes.forward.tissue import Layers
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import FloatArray, IndexArray
 
 # --- Sinking of a layered body's skin under normal loads: its exact Green's function, and means over taxels.
 #
@@ -230,12 +223,24 @@ def condense_lump(geometry: LumpGeometry, *, size: MeshSize | None = None, order
     Fourier orders where none is given (`orders_needed`).
     """
     mesh, layers = lump_mesh(geometry, size), geometry.layers
-    elements = element_stiffness(mesh, nu=layers.poisson)
-    gland = (mesh.region == EXTERIOR_GLAND) | (mesh.region == INTERIOR_GLAND)
-    modulus = np.where(gland, layers.fat_kpa * layers.gland_ratio, layers.fat_kpa)
-    count = orders_needed(geometry) if orders is None else orders
-    modes = [_condense(mesh, elements, modulus, order) for order in range(count)]
-    return CondensedLump(mesh.node_mm[_skin(mesh), 0], tuple(modes))
+    stiffness = element_stiffness(mesh, nu=layers.poisson)
+    modulus = np.where(mesh.gland, layers.fat_kpa * layers.gland_ratio, layers.fat_kpa)
+    within = modulus[mesh.lump]
+    # off the rim, which does not move, and off the axis: the ring that a node there stands for has no length, and its
+    # displacement is off by several per cent where its neighbours' are off by a few in a thousand
+    skin = mesh.skin[1:-1]
+    modes = []
+    for order in range(orders_needed(geometry) if orders is None else orders):
+        k = stiffness[0] + order * stiffness[1] + order**2 * stiffness[2]
+        number, sign = order_unknowns(mesh, order)
+        elements = Elements(mesh, k, number, sign, np.zeros(number.size, dtype=bool))
+        rim = np.unique(number[mesh.rim])
+        rim = rim[rim >= 0]
+        flexibility, lowered = elements.around(modulus, rim, number[skin, 2])
+        lump = elements.within(np.ones_like(modulus), rim)
+        original = within[0] * lump if (within == within[0]).all() else elements.within(modulus, rim)
+        modes.append(CondensedHole(flexibility, lowered, lump, original))
+    return CondensedLump(mesh.nodes[skin, 0], tuple(modes))
 
 
 def orders_needed(geometry: LumpGeometry) -> int:
@@ -256,13 +261,13 @@ def skin_spline(radius_mm: FloatArray, values: FloatArray, *, order: int) -> Cub
     return CubicSpline(np.concatenate([-radius_mm[::-1], radius_mm]), mirrored)
 
 
-def element_stiffness(mesh: LumpMesh, *, nu: float) -> FloatArray:
+def element_stiffness(mesh: Mesh, *, nu: float) -> FloatArray:
     """Stiffness of every element for a modulus of 1 kPa, as a polynomial in the order m: (3, e, 27, 27) of
     :math:`K = K_0 + m K_1 + m^2 K_2`, without the factor of the integral over the angle.
 
     Unknowns are (u_r, u_theta, u_z) of each of the nine nodes.
     """
-    gradient, point, area = quadrature(mesh.node_mm[mesh.element])
+    gradient, point, area = quadrature(mesh.nodes[mesh.elements])
     strain = _strains(lagrange_points()[0], gradient, point[..., 0])
     # K = (A + m B)^T (A + m B)
     a, b = stiffness_factor(strain, point, area * point[..., 0], normal=3, poisson=nu)
@@ -288,25 +293,14 @@ def _strains(shape: FloatArray, gradient: FloatArray, r_mm: FloatArray) -> Float
     return strain.reshape(2, *r_mm.shape, 6, 27)
 
 
-def _skin(mesh: LumpMesh) -> IntArray:
-    """Nodes of the skin off the axis and off the outer rim.
-
-    On the axis the ring that a node stands for has no length, and the displacement there is off by several per cent
-    where its neighbours' are off by a few in a thousand: symmetry gives the axis better.
-    """
-    return mesh.surface[1:-1]
-
-
-def order_unknowns(mesh: LumpMesh, order: int) -> tuple[IntArray, FloatArray]:
-    """Index (-1: fixed) and sign of the reduced unknown for each of the (n, 3) displacements of one order.
+def order_unknowns(mesh: Mesh, order: int) -> tuple[IndexArray, FloatArray]:
+    """Index (-1: fixed) and sign of the unknown for each of the (n, 3) displacements of one order.
 
     The base and the far rim do not move. On the axis, displacements must be single-valued: order 0 keeps u_z, order 1
     a sideways motion with u_theta = -u_r, higher orders nothing. Order 0 has no torsion.
     """
-    r, z = mesh.node_mm.T
-    free = np.ones((len(r), 3), dtype=bool)
-    free[(z == z.max()) | (r == r.max())] = False
-    axis = r == 0
+    axis, end, base = mesh.edges
+    free = np.repeat(~(base | end)[:, None], 3, axis=1)
     if order == 0:
         free[:, 1] = False
         free[axis, 0] = False
@@ -314,49 +308,9 @@ def order_unknowns(mesh: LumpMesh, order: int) -> tuple[IntArray, FloatArray]:
         free[axis, 2] = False
     else:
         free[axis] = False
-    sign = np.ones((len(r), 3))
-    tied = axis & free[:, 0] if order == 1 else np.zeros(len(r), dtype=bool)
+    tied = axis & free[:, 0] if order == 1 else np.zeros_like(axis)
     free[tied, 1] = False
-    number = np.full((len(r), 3), -1, dtype=np.int64)
+    number, sign = np.full(free.shape, -1), np.ones(free.shape)
     number[free] = np.arange(np.count_nonzero(free))
     number[tied, 1], sign[tied, 1] = number[tied, 0], -1.0
     return number, sign
-
-
-def _condense(mesh: LumpMesh, elements: FloatArray, modulus_kpa: FloatArray, order: int) -> CondensedHole:
-    number, sign = order_unknowns(mesh, order)
-    inside = mesh.region >= INTERIOR_FAT
-    stiffness = elements[0] + order * elements[1] + order**2 * elements[2]
-    boundary = np.unique(number[mesh.arc])
-    boundary = boundary[boundary >= 0]
-
-    outer, used = _assemble(mesh, stiffness, modulus_kpa, ~inside, number, sign)
-    at = np.searchsorted(used, boundary)
-    by_rim = moved(outer, at)
-    skin = by_rim[np.searchsorted(used, number[_skin(mesh), 2])]
-
-    def core(kpa: FloatArray) -> FloatArray:
-        matrix, used = _assemble(mesh, stiffness, kpa, inside, number, sign)
-        on = np.isin(used, boundary)
-        return condensed(matrix, np.flatnonzero(on), np.flatnonzero(~on))
-
-    lump, within = core(np.ones_like(modulus_kpa)), modulus_kpa[inside]
-    original = within[0] * lump if (within == within[0]).all() else core(modulus_kpa)
-    return CondensedHole(by_rim[at], skin, lump, original)
-
-
-def _assemble(
-    mesh: LumpMesh,
-    stiffness: FloatArray,
-    modulus_kpa: FloatArray,
-    chosen: np.ndarray[tuple[int, ...], np.dtype[np.bool_]],
-    number: IntArray,
-    sign: FloatArray,
-) -> tuple[csc_array, IntArray]:
-    """Sparse stiffness of the chosen elements, and the indices of its unknowns."""
-    element = mesh.element[chosen]
-    unknown = number[element].reshape(len(element), 27)
-    signs = sign[element].reshape(len(element), 27)
-    data = stiffness[chosen] * (modulus_kpa[chosen, None, None] * signs[:, :, None] * signs[:, None, :])
-    used = np.unique(unknown[unknown >= 0])
-    return gathered(data, np.where(unknown >= 0, np.searchsorted(used, unknown), -1), len(used)), used

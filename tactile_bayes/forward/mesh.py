@@ -1,29 +1,130 @@
-"""Meshes of a box with a lump, plane and solid, and the elements of both."""
+"""Meshes of half a body with a lump, in a plane and round an axis, and the elements of both."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
 from scipy.sparse.linalg import splu
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.tissue import Body, Layers
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 
-# --- Quadrilateral meshes of half the body, graded and with every material boundary on element edges.
+# --- Nine-node quadrilaterals of half a body, graded and with every material boundary on element edges.
 #
-# All meshes are of nine-node quadrilaterals on x >= 0 (the body is symmetric about the lump's axis); z is depth.
-# Around the lump runs a ring of rays from its circle to a box; beyond the box, rows and columns. Where rays meet in
-# a point (the centre of the disc, the point where a resting lump touches the gland) quadrilaterals collapse to
-# triangles. Under a lump that stands clear of the gland the box ends on the boundary of the two.
+# About the lump runs a ring of rays from its boundary to a box, and within it from a point to its boundary; beyond
+# the box, rows and columns. Where rays meet in a point (inside the lump, or where a resting lump touches the gland)
+# quadrilaterals collapse to triangles.
 
-IndexArray = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
+
+class Mesh(Record, eq=False):
+    """Half a section of a body with its lump; places are the distance from the lump's axis and the depth in mm."""
+
+    nodes: FloatArray  #: (n, 2) array.
+    elements: IndexArray
+    """(e, 9) int array: Node numbers in tensor order: ``elements[:, 3 * i + j]`` is the node at step i of the first
+    local direction and step j of the second."""
+    gland: BoolArray  #: (e,) bool array: Whether the element lies below the fat-gland boundary.
+    lump: BoolArray  #: (e,) bool array: Whether it lies in the lump.
+
+    @property
+    def rim(self) -> IndexArray:
+        """Nodes on the lump's boundary from its highest point to its lowest: alike in all meshes of a body."""
+        rim = np.intersect1d(self.elements[self.lump], self.elements[~self.lump])
+        return rim[np.argsort(self.nodes[rim, 1])]
+
+    @property
+    def skin(self) -> IndexArray:
+        """Nodes on the skin, by increasing distance from the axis."""
+        skin = np.flatnonzero(np.abs(self.nodes[:, 1]) < 1e-7)
+        return skin[np.argsort(self.nodes[skin, 0])]
+
+    @property
+    def edges(self) -> tuple[BoolArray, BoolArray, BoolArray]:
+        """(n,) each: whether a node lies on the lump's axis, at the mesh's end, on the chest wall."""
+        x, z = self.nodes.T
+        return x < 1e-9 * self.nodes.max(), x == x.max(), z == z.max()
+
+
+def _mesh(
+    arcs: Sequence[FloatArray],
+    rims: Sequence[FloatArray],
+    lattices: Iterable[FloatArray],
+    *,
+    middle_mm: float,
+    boundary_mm: float,
+    shares: tuple[FloatArray, FloatArray],
+    scale_mm: float,
+) -> Mesh:
+    """Mesh the lump from a point of its axis to the arcs of its boundary, around it from there to the rims of the box,
+    and beyond that the lattices of points; coinciding points become one node, elements without area are dropped.
+
+    `shares` are those of the way along the rays, around the lump and inside it.
+    """
+    outside, inside = shares
+    blocks: list[tuple[FloatArray, bool]] = []
+    for arc, rim in zip(arcs, rims, strict=True):
+        blocks.append((_blend(arc, rim, outside), False))
+        blocks.append((_blend(np.broadcast_to([0.0, middle_mm], arc.shape), arc, inside), True))
+    blocks += [(lattice, False) for lattice in lattices]
+    points = np.concatenate([block.reshape(-1, 2) for block, _ in blocks])
+    key = np.round(points / (1e-8 * scale_mm)).astype(np.int64)  # points that coincide
+    _, first, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    elements, lump, start = [], [], 0
+    for block, in_lump in blocks:
+        n, m, _ = block.shape
+        index = number.reshape(-1)[start : start + n * m].reshape(n, m)
+        start += n * m
+        parts = [index[i : n - 2 + i : 2, j : m - 2 + j : 2].reshape(-1) for i in range(3) for j in range(3)]
+        elements.append(np.stack(parts, axis=1))
+        lump.append(np.full(len(parts[0]), in_lump))
+    element, nodes = np.concatenate(elements), points[first]
+    corners = nodes[element[:, [0, 2, 8, 6]]]
+    x, z = corners[..., 0], corners[..., 1]
+    area = 0.5 * np.abs(np.sum(x * np.roll(z, -1, axis=1) - z * np.roll(x, -1, axis=1), axis=1))
+    kept = area > 1e-12 * scale_mm**2
+    used, numbers = np.unique(element[kept], return_inverse=True)
+    gland = corners[kept, :, 1].mean(axis=1) > boundary_mm
+    return Mesh(nodes[used], numbers.reshape(-1, 9), gland, np.concatenate(lump)[kept])
+
+
+def _grid(x_mm: FloatArray, z_mm: FloatArray) -> FloatArray:
+    """(len(x), len(z), 2) points."""
+    return np.stack(np.meshgrid(x_mm, z_mm, indexing="ij"), axis=-1)
+
+
+def _graded_share(count: int, ratio: float) -> FloatArray:
+    """(2 count + 1,) shares 0 to 1 whose elements grow by `ratio`, each with its mid-side node in the middle."""
+    ends = np.concatenate([[0.0], np.cumsum(ratio ** np.arange(count))])
+    ends /= ends[-1]
+    share = np.empty(2 * count + 1)
+    share[::2], share[1::2] = ends, 0.5 * (ends[1:] + ends[:-1])
+    return share
+
+
+def _blend(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:
+    """(len(share), len(start), 2) lattice between two lines of nodes, exact at both."""
+    s = share[:, None, None]
+    return np.asarray((1.0 - s) * start + s * end)
+
+
+def _graded_line(start: float, stop: float, *, first: float, grade: float, least: int = 1) -> FloatArray:
+    """Nodes of elements, `least` or more, whose length grows from about `first` by at most `grade` until `stop`."""
+    length = stop - start
+    count = max(least, int(np.ceil(np.log1p((grade - 1.0) * length / first) / np.log(grade))))
+    line = start + length * _graded_share(count, grade)
+    line[0], line[-1] = start, stop
+    return line
+
+
+# --- The mesh of a body in a plane with a circular lump.
+#
+# Under a lump that stands clear of the gland the box ends on the boundary of the two.
 
 _BOX = 0.75  #: Half width of the box about the lump, and how far it reaches above and below the centre, in diameters.
 _LEAST_ABOVE = 0.35  #: A box whose top would leave less than this many diameters of rows above it goes to the skin.
@@ -37,108 +138,54 @@ _TOP, _UP, _DOWN, _OUT, _IN = 8, 4, 2, 2, 2
 _GROWTH = 2.2
 
 
-class QuadMesh(Record, eq=False):
-    """Nine-node quadrilaterals."""
+def body_mesh(body: Body, *, fineness: int, layered: bool) -> Mesh:
+    """The body on x >= 0 with its lump; twice the fineness is half the element size everywhere.
 
-    nodes: FloatArray  #: (n, 2) array: x and depth z in mm.
-    elements: IndexArray
-    """(m, 9) int array: Node numbers in tensor order: ``elements[:, 3 * i + j]`` is the node at step i of the first
-    local direction and step j of the second."""
-    gland: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
-    """(m,) bool array: Whether the element lies below the fat-gland boundary."""
-
-
-def body_mesh(body: Body, *, fineness: int) -> QuadMesh:
-    """The body on x >= 0 with a hole where the lump is; twice the fineness is half the element size everywhere."""
-    box = _Box.around(body, fineness)
-    ring = _blend(_circle(body, box.angles_rad()), box.outline(), np.linspace(0.0, 1.0, 2 * _OUT * fineness + 1))
-    across = _graded(
-        box.half_width_mm,
-        REACH_MM + _BEYOND * body.layers.thickness_mm,
-        2 * float(box.side_up_mm[1] - box.side_up_mm[0]),
-        fineness,
-    )
-    rows = np.concatenate([box.above_mm[:-1], box.side_mm[:-1], box.below_mm])
-    blocks = [ring, _grid(across, rows), _grid(box.bottom_x_mm, box.below_mm)]
-    if len(box.above_mm) > 1:
-        blocks.append(_grid(box.top_x_mm, box.above_mm))
-    return _join(blocks, body)
-
-
-def disc_mesh(body: Body, *, fineness: int, layered: bool) -> QuadMesh:
-    """The lump on x >= 0 with the same nodes on its circle as `body_mesh`.
-
-    Layered, the fat-gland boundary runs along element edges through the disc; else the rays meet in its centre.
+    Layered, the fat-gland boundary runs along element edges through the lump; else the rays in it meet in its centre.
+    Around the lump both are the same mesh.
     """
-    circle = _circle(body, _Box.around(body, fineness).angles_rad())
-    depth = body.layers.fat_mm if layered else body.centre_mm
-    middle = np.broadcast_to([0.0, depth], circle.shape)
-    block = _blend(middle, circle, np.linspace(0.0, 1.0, 2 * _IN * fineness + 1))
-    return _join([block], body)
+    h, d, layers, clear = body.centre_mm, body.d_mm, body.layers, body.seat > 1.0
+    half, top = _BOX * d, h - _BOX * d if h > (_BOX + _LEAST_ABOVE) * d else 0.0
+    under = h + 0.5 * d
+    bottom = layers.fat_mm if clear else under + min((_BOX - 0.5) * d, 0.5 * (layers.thickness_mm - under))
+    middle, n_down = (0.5 * (top + layers.fat_mm), _UP) if clear else (layers.fat_mm, _DOWN)
+    # lines of nodes, with the elements' middles: up and down the box's side, along its lid and floor, above and below
+    up = np.linspace(top, middle, 2 * _UP * fineness + 1)
+    down = np.linspace(middle, bottom, 2 * n_down * fineness + 1)
+    lid = _projected(half, h - top, _TOP * fineness)
+    floor = np.linspace(0.0, half, 2 * _DOWN * fineness + 1)
+    if clear:
+        floor = _projected(half, bottom - h, _UP * fineness)
+    first, grade = 2 * float(up[1] - up[0]), _GROWTH ** (1.0 / fineness)
+    # rows between the skin and the box; the skin alone where the box reaches it
+    above = np.linspace(0.0, top, 2 * fineness * int(np.ceil(min(2 * top / d, 6.0))) + 1)
+    below = _graded_line(bottom, layers.thickness_mm, first=first, grade=grade, least=fineness)
+    end = REACH_MM + _BEYOND * layers.thickness_mm
+    across = _graded_line(half, end, first=first, grade=grade, least=fineness)
 
-
-class _Box(Record, eq=False):
-    """The rectangle about the lump and the rows above and below it; positions include the elements' middles."""
-
-    body: Body
-    half_width_mm: float
-    above_mm: FloatArray
-    side_up_mm: FloatArray
-    side_down_mm: FloatArray
-    below_mm: FloatArray
-    top_x_mm: FloatArray
-    bottom_x_mm: FloatArray
-
-    @classmethod
-    def around(cls, body: Body, fineness: int) -> _Box:
-        """The box of a lump; of one clear of the gland it ends on their boundary, so that its side lies in fat."""
-        h, d, layers, clear = body.centre_mm, body.d_mm, body.layers, body.seat > 1.0
-        top = h - _BOX * d if h > (_BOX + _LEAST_ABOVE) * d else 0.0
-        under = h + 0.5 * d
-        bottom = layers.fat_mm if clear else under + min((_BOX - 0.5) * d, 0.5 * (layers.thickness_mm - under))
-        middle, down = (0.5 * (top + layers.fat_mm), _UP) if clear else (layers.fat_mm, _DOWN)
-        side_up = np.linspace(top, middle, 2 * _UP * fineness + 1)
-        floor = np.linspace(0.0, _BOX * d, 2 * _DOWN * fineness + 1)
-        return cls(
-            body,
-            _BOX * d,
-            # rows between the skin and the box; the skin alone where the box reaches it
-            np.linspace(0.0, top, 2 * fineness * int(np.ceil(min(2 * top / d, 6.0))) + 1),
-            side_up,
-            np.linspace(middle, bottom, 2 * down * fineness + 1),
-            _graded(bottom, layers.thickness_mm, 2 * float(side_up[1] - side_up[0]), fineness),
-            _projected(_BOX * d, h - top, _TOP * fineness),
-            _projected(_BOX * d, bottom - h, _UP * fineness) if clear else floor,
-        )
-
-    @property
-    def side_mm(self) -> FloatArray:
-        """Depths along the whole side."""
-        return np.concatenate([self.side_up_mm[:-1], self.side_down_mm])
-
-    def outline(self) -> FloatArray:
-        """(k, 2) points from above the lump along top, side and bottom to below it."""
-        w = self.half_width_mm
-        top = np.stack([self.top_x_mm, np.full_like(self.top_x_mm, self.above_mm[-1])], axis=1)
-        side = np.stack([np.full_like(self.side_mm, w), self.side_mm], axis=1)
-        bottom = np.stack([self.bottom_x_mm[::-1], np.full_like(self.bottom_x_mm, self.side_mm[-1])], axis=1)
-        return np.concatenate([top[:-1], side[:-1], bottom])
-
-    def angles_rad(self) -> FloatArray:
-        """(k,) angles from the lump's highest point, one for each point of the outline."""
-        if self.body.seat > 1.0:
-            outline = self.outline()
-            return np.asarray(np.arctan2(outline[:, 0], self.body.centre_mm - outline[:, 1]))
-        corner = np.arctan2(self.half_width_mm, self.body.centre_mm - self.above_mm[-1])
-        boundary = 0.5 * np.pi + np.arcsin(self.body.seat)
-        n_top, n_up = len(self.top_x_mm), len(self.side_up_mm)
-        n_down = len(self.side_down_mm) + len(self.bottom_x_mm) - 1
-        parts = [
-            np.linspace(0.0, corner, n_top)[:-1],
-            np.linspace(corner, boundary, n_up)[:-1],
-            np.linspace(boundary, np.pi, n_down),
-        ]
-        return np.concatenate(parts)
+    side = np.concatenate([up[:-1], down])
+    x = np.concatenate([lid[:-1], np.full(len(side) - 1, half), floor[::-1]])
+    z = np.concatenate([np.full(len(lid) - 1, top), side[:-1], np.full(len(floor), bottom)])
+    rim = np.stack([x, z], axis=1)
+    if clear:
+        angle = np.arctan2(x, h - z)
+    else:
+        corner, boundary = np.arctan2(half, h - top), 0.5 * np.pi + np.arcsin(body.seat)
+        ends, counts = [0.0, corner, boundary, np.pi], [len(lid), len(up), len(down) + len(floor) - 1]
+        parts = [np.linspace(a, b, n)[:-1] for (a, b), n in zip(pairwise(ends), counts, strict=True)]
+        angle = np.concatenate([*parts, [np.pi]])
+    arc = np.stack([body.radius_mm * np.sin(angle), h - body.radius_mm * np.cos(angle)], axis=1)
+    lattices = [_grid(across, np.concatenate([above[:-1], side[:-1], below])), _grid(floor, below)]
+    lattices += [_grid(lid, above)] if len(above) > 1 else []
+    return _mesh(
+        [arc],
+        [rim],
+        lattices,
+        middle_mm=layers.fat_mm if layered else h,
+        boundary_mm=layers.fat_mm,
+        shares=(np.linspace(0.0, 1.0, 2 * _OUT * fineness + 1), np.linspace(0.0, 1.0, 2 * _IN * fineness + 1)),
+        scale_mm=d,
+    )
 
 
 def _projected(half_width_mm: float, distance_mm: float, count: int) -> FloatArray:
@@ -150,54 +197,8 @@ def _projected(half_width_mm: float, distance_mm: float, count: int) -> FloatArr
     return np.asarray(distance_mm * np.tan(np.linspace(0.0, corner, 2 * count + 1)))
 
 
-def _circle(body: Body, angles_rad: FloatArray) -> FloatArray:
-    """(k, 2) points of the lump's boundary."""
-    r = body.radius_mm
-    return np.stack([r * np.sin(angles_rad), body.centre_mm - r * np.cos(angles_rad)], axis=1)
+# --- The mesh of a layered body with a spheroid on its vertical axis, in the (r, z) half-plane.
 
-
-def _grid(x_mm: FloatArray, z_mm: FloatArray) -> FloatArray:
-    """(len(x), len(z), 2) points."""
-    return np.stack(np.meshgrid(x_mm, z_mm, indexing="ij"), axis=-1)
-
-
-def _graded(begin_mm: float, end_mm: float, first_mm: float, fineness: int) -> FloatArray:
-    """Corners and midpoints of elements that grow from `first_mm`, by a factor that shrinks with the fineness."""
-    return _graded_line(begin_mm, end_mm, first=first_mm, grade=_GROWTH ** (1.0 / fineness), least=fineness)
-
-
-def _join(blocks: Sequence[FloatArray], body: Body) -> QuadMesh:
-    """Merge blocks into one mesh; coinciding points become one node, elements without area are dropped."""
-    nodes, elements = _numbered(blocks, body.d_mm)
-    corners = nodes[elements[:, [0, 2, 8, 6]]]
-    x, z = corners[..., 0], corners[..., 1]
-    area = 0.5 * np.abs(np.sum(x * np.roll(z, -1, axis=1) - z * np.roll(x, -1, axis=1), axis=1))
-    kept = area > 1e-10 * body.d_mm**2
-    used, numbers = np.unique(elements[kept], return_inverse=True)
-    return QuadMesh(nodes[used], numbers.reshape(-1, 9), corners[kept, :, 1].mean(axis=1) > body.layers.fat_mm)
-
-
-def _numbered(blocks: Sequence[FloatArray], scale_mm: float) -> tuple[FloatArray, IndexArray]:
-    """Nodes, and (k, 9) their numbers in the elements of all (n, m, 2) blocks of points, n and m odd, in order."""
-    points = np.concatenate([block.reshape(-1, 2) for block in blocks])
-    key = np.round(points / (1e-8 * scale_mm)).astype(np.int64)  # points that coincide
-    _, first, number = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    elements, start = [], 0
-    for n, m, _ in (block.shape for block in blocks):
-        index = number.reshape(-1)[start : start + n * m].reshape(n, m)
-        start += n * m
-        parts = [index[i : n - 2 + i : 2, j : m - 2 + j : 2].reshape(-1) for i in range(3) for j in range(3)]
-        elements.append(np.stack(parts, axis=1))
-    return points[first], np.concatenate(elements)
-
-
-# --- Meshes of a layered body with a spheroid on its vertical axis: nine-node quadrilaterals in the (r, z) half-plane.
-#
-# Element edges follow the spheroid, the boundary of the layers and the base. About the lump the mesh is a fan of
-# rays to a box; beyond the box it is a graded lattice. z runs down from the skin.
-
-IntArray = NDArray[np.int64]
-EXTERIOR_FAT, EXTERIOR_GLAND, INTERIOR_FAT, INTERIOR_GLAND = range(4)
 # A layer boundary nearer than this to touching the spheroid (as a share of its vertical half axis) is moved away.
 LEAST_CAP: Final = 0.04
 
@@ -241,30 +242,21 @@ class MeshSize(Record):
     reach_mm: float = 300.0  #: Least radius of the mesh.
 
 
-class LumpMesh(Record, eq=False):
-    """Nodes and elements of a mesh."""
-
-    node_mm: FloatArray  #: (n, 2) array: (r, z) of each node.
-    element: IntArray  #: (e, 9) int array: Nodes of each element, row by row of its three by three lattice.
-    region: IntArray  #: (e,) int array: `EXTERIOR_FAT` and so on.
-    arc: IntArray  #: (a,) int array: Nodes on the lump's boundary from the top pole to the bottom pole.
-    surface: IntArray  #: (s,) int array: Nodes on the skin by increasing r.
-
-
-def lump_mesh(geometry: LumpGeometry, size: MeshSize | None = None) -> LumpMesh:
-    """Mesh a lump in its body; the module describes the layout."""
+def lump_mesh(geometry: LumpGeometry, size: MeshSize | None = None) -> Mesh:
+    """Mesh a lump in its body, finely near it and coarsely far away."""
     size = size or MeshSize()
     g, boundary = geometry, geometry.boundary_mm()
     cut = abs(boundary - g.depth_mm) < g.half_height_mm
-    centre, core = np.array([0.0, boundary if cut else g.depth_mm]), np.linspace(0.0, 1.0, 2 * size.core + 1)
     arcs, rims = _fan(g, boundary, cut=cut, elements=size.arc)
-    patches: list[tuple[FloatArray, int]] = []
-    for arc, rim in zip(arcs, rims, strict=True):
-        middle, fat = float(rim[len(rim) // 2, 1]), float(arc[len(arc) // 2, 1]) < boundary
-        patches.append((_blend(arc, rim, _graded_share(size.rings, 1.25)), int(middle > boundary)))
-        inside = _blend(np.broadcast_to(centre, arc.shape), arc, core)
-        patches.append((inside, INTERIOR_FAT if fat else INTERIOR_GLAND))
-    return _merge(patches + _beyond_box(rims, g, boundary, size))
+    return _mesh(
+        arcs,
+        rims,
+        _beyond_box(rims, g, boundary, size),
+        middle_mm=boundary if cut else g.depth_mm,
+        boundary_mm=boundary,
+        shares=(_graded_share(size.rings, 1.25), np.linspace(0.0, 1.0, 2 * size.core + 1)),
+        scale_mm=10.0,
+    )
 
 
 def _box(g: LumpGeometry, boundary: float) -> tuple[float, float, float]:
@@ -320,33 +312,7 @@ def _fan(g: LumpGeometry, boundary: float, *, cut: bool, elements: int) -> tuple
     return arcs, [lid(top, breaks[1], counts[0]), *rims, floor[::-1]]
 
 
-def _graded_share(count: int, ratio: float) -> FloatArray:
-    """(2 count + 1,) shares 0 to 1 whose elements grow by `ratio`, each with its mid-side node in the middle."""
-    ends = np.concatenate([[0.0], np.cumsum(ratio ** np.arange(count))])
-    ends /= ends[-1]
-    share = np.empty(2 * count + 1)
-    share[::2], share[1::2] = ends, 0.5 * (ends[1:] + ends[:-1])
-    return share
-
-
-def _blend(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:
-    """(len(share), len(start), 2) lattice between two lines of nodes, exact at both."""
-    s = share[:, None, None]
-    return np.asarray((1.0 - s) * start + s * end)
-
-
-def _graded_line(start: float, stop: float, *, first: float, grade: float, least: int = 1) -> FloatArray:
-    """Nodes of elements, `least` or more, whose length grows from about `first` by at most `grade` until `stop`."""
-    length = stop - start
-    count = max(least, int(np.ceil(np.log1p((grade - 1.0) * length / first) / np.log(grade))))
-    line = start + length * _graded_share(count, grade)
-    line[0], line[-1] = start, stop
-    return line
-
-
-def _beyond_box(
-    rims: list[FloatArray], g: LumpGeometry, boundary: float, size: MeshSize
-) -> list[tuple[FloatArray, int]]:
+def _beyond_box(rims: list[FloatArray], g: LumpGeometry, boundary: float, size: MeshSize) -> Iterator[FloatArray]:
     """The lattices outside, below and above the box, whose sides from the top to the bottom are given."""
     lid, *sides, floor = rims
     (corner_r, top), bottom = lid[-1].tolist(), float(floor[0, 1])
@@ -355,14 +321,11 @@ def _beyond_box(
     right = _graded_line(corner_r, reach, first=float(corner_r - lid[-3, 0]), grade=size.grade)
     below = _down_from(bottom, g.layers.thickness_mm, boundary, first=float(side[-1] - side[-3]), grade=size.grade)
     above = _down_from(0.0, top, boundary, first=float(side[2] - side[0]), grade=1.0 + 1e-9)
-    patches: list[tuple[FloatArray, int]] = []
     for r, z in ((right, above), (right, side), (right, below), (floor[::-1, 0], below), (lid[:, 0], above)):
         # split at the layer boundary
         for a, b in pairwise([0, *np.flatnonzero(z == boundary), len(z) - 1]):
             if b > a:
-                part = z[a : b + 1]
-                patches.append((_grid(r, part), int(part[len(part) // 2] > boundary)))
-    return patches
+                yield _grid(r, z[a : b + 1])
 
 
 def _down_from(start: float, stop: float, boundary: float, *, first: float, grade: float) -> FloatArray:
@@ -374,23 +337,6 @@ def _down_from(start: float, stop: float, boundary: float, *, first: float, grad
     upper = _graded_line(start, boundary, first=first, grade=grade)
     lower = _graded_line(boundary, stop, first=float(upper[-1] - upper[-3]), grade=grade)
     return np.concatenate([upper, lower[1:]])
-
-
-def _merge(patches: list[tuple[FloatArray, int]]) -> LumpMesh:
-    node, element = _numbered([lattice for lattice, _ in patches], 10.0)
-    region_of = np.repeat(
-        [region for _, region in patches], [(len(one) // 2) * (one.shape[1] // 2) for one, _ in patches]
-    )
-    surface = np.flatnonzero(np.abs(node[:, 1]) < 1e-7)
-    inside, outside = (element[mask] for mask in (region_of >= INTERIOR_FAT, region_of < INTERIOR_FAT))
-    arc = np.intersect1d(inside, outside)
-    return LumpMesh(
-        node_mm=node,
-        element=element,
-        region=region_of,
-        arc=arc[np.argsort(node[arc, 1])],
-        surface=surface[np.argsort(node[surface, 0])],
-    )
 
 
 # --- Nine-node elements, for sections and for bodies round an axis: shape functions, stiffness, condensation.
@@ -442,33 +388,53 @@ def stiffness_factor(
     return np.concatenate([scaled, np.sqrt(bulk) * (root @ volume)], axis=-2)
 
 
-def gathered(blocks: FloatArray, unknown: IndexArray, size: int) -> csc_array:
-    """Sparse matrix of the elements' (e, k, k) blocks by their (e, k) unknowns; those of -1 are fixed."""
-    row, column = np.broadcast_arrays(unknown[:, :, None], unknown[:, None, :])
-    kept = (row >= 0) & (column >= 0)
-    return coo_array((blocks[kept], (row[kept], column[kept])), shape=(size, size)).tocsc()
+class Elements(Record, eq=False):
+    """The finite elements of a mesh with the unknowns of one symmetry."""
+
+    mesh: Mesh
+    stiffness: FloatArray  #: (e, k, k) array: Of each element for a modulus of 1 kPa.
+    number: IndexArray  #: (n, c) int array: Which unknown each of a node's displacements is; -1 for none.
+    sign: FloatArray  #: (n, c) array: -1 where it is the unknown turned over.
+    held: BoolArray  #: (u,) bool array: Unknowns that stay 0.
+
+    def matrix(self, modulus_kpa: FloatArray, chosen: BoolArray) -> tuple[csc_array, IndexArray]:
+        """Sparse stiffness of the chosen elements, and which unknowns are in it."""
+        element = self.mesh.elements[chosen]
+        unknown = self.number[element].reshape(len(element), -1)
+        signs = self.sign[element].reshape(len(element), -1)
+        data = self.stiffness[chosen] * (modulus_kpa[chosen, None, None] * signs[:, :, None] * signs[:, None, :])
+        used = np.unique(unknown[unknown >= 0])
+        place = np.where(unknown >= 0, np.searchsorted(used, unknown), -1)
+        row, column = np.broadcast_arrays(place[:, :, None], place[:, None, :])
+        kept = (row >= 0) & (column >= 0)
+        free = ~self.held[used]
+        matrix = coo_array((data[kept], (row[kept], column[kept])), shape=(len(used), len(used))).tocsc()
+        return matrix[free][:, free], used[free]
+
+    def around(self, modulus_kpa: FloatArray, rim: IndexArray, skin: IndexArray) -> tuple[FloatArray, FloatArray]:
+        """Displacements (b, b) of the lump's boundary, by its unknowns `rim`, and (s, b) of the skin, for unit forces
+        on that boundary with nothing inside."""
+        matrix, used = self.matrix(modulus_kpa, ~self.mesh.lump)
+        on = np.searchsorted(used, rim)
+        force = np.zeros((len(used), len(on)))
+        force[on, np.arange(len(on))] = 1.0
+        found = _solved(matrix, force)
+        found[on] = 0.5 * (found[on] + found[on].T)
+        return found[on], np.where(self.held[skin, None], 0.0, found[np.searchsorted(used, skin)])
+
+    def within(self, modulus_kpa: FloatArray, rim: IndexArray) -> FloatArray:
+        """(b, b) stiffness of the lump condensed onto its boundary (Guyan 1965: exact in statics)."""
+        matrix, used = self.matrix(modulus_kpa, self.mesh.lump)
+        on, inner = np.searchsorted(used, rim), np.flatnonzero(~np.isin(used, rim))
+        coupling = matrix[inner][:, on].toarray()
+        kept = matrix[on][:, on].toarray() - coupling.T @ _solved(matrix[inner][:, inner], coupling)
+        return np.asarray(0.5 * (kept + kept.T))
 
 
-def solved(matrix: csc_array, sides: FloatArray) -> FloatArray:
+def _solved(matrix: csc_array, sides: FloatArray) -> FloatArray:
     """Solution of a symmetric positive definite system for many right-hand sides: one factorisation."""
     factor = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     return np.asarray(factor.solve(sides))
-
-
-def moved(matrix: csc_array, on: IndexArray) -> FloatArray:
-    """(n, b) displacements by a unit force on each of the unknowns `on`; symmetric between those."""
-    force = np.zeros((matrix.shape[0], len(on)))
-    force[on, np.arange(len(on))] = 1.0
-    found = solved(matrix, force)
-    found[on] = 0.5 * (found[on] + found[on].T)
-    return found
-
-
-def condensed(matrix: csc_array, on: IndexArray, inner: IndexArray) -> FloatArray:
-    """Stiffness condensed onto the unknowns `on`, the inner ones free (Guyan 1965: exact in statics)."""
-    coupling = matrix[inner][:, on].toarray()
-    kept = matrix[on][:, on].toarray() - coupling.T @ solved(matrix[inner][:, inner], coupling)
-    return np.asarray(0.5 * (kept + kept.T))
 
 
 class CondensedHole(Record, eq=False):

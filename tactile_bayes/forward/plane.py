@@ -8,41 +8,32 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.linalg import toeplitz
 from scipy.optimize import minimize_scalar
-from scipy.sparse import csc_array
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.axisymmetric import surface_flexibility
 from tactile_bayes.forward.contact import ContactStiffness, Head, solve_contact
-from tactile_bayes.forward.mesh import (
-    CondensedHole,
-    IndexArray,
-    QuadMesh,
-    body_mesh,
-    condensed,
-    disc_mesh,
-    gathered,
-    moved,
-    quadrature,
-    stiffness_factor,
-)
+from tactile_bayes.forward.mesh import CondensedHole, Elements, Mesh, body_mesh, quadrature, stiffness_factor
 from tactile_bayes.forward.tissue import Body, Layers
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import MEAN_KPA
 
-# --- Nearly incompressible plane strain: stiffness of nine-node quadrilaterals.
+# --- Nearly incompressible plane strain: the elements and their unknowns.
 
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
-def assemble(mesh: QuadMesh, *, young_kpa: FloatArray, poisson: float) -> csc_array:
-    """Assemble the stiffness matrix (kPa, (2n, 2n)) of a mesh of unit thickness from each element's Young's modulus.
+def plane_elements(mesh: Mesh, *, poisson: float, even: bool) -> Elements:
+    """Elements with the unknowns (x, z) of each node for loads symmetric in x, or antisymmetric.
 
-    Unknowns are ordered ``x0, z0, x1, z1, ...``; times displacement in mm it gives force in N/m.
+    The chest wall does not move, the body's end not along x; symmetry fixes u_x on the axis when even, u_z when odd.
     """
-    blocks = element_stiffness(mesh.nodes[mesh.elements], poisson=poisson) * young_kpa[:, None, None]
-    unknowns = (2 * mesh.elements[:, :, None] + np.arange(2)).reshape(len(mesh.elements), 18)
-    return gathered(blocks, unknowns, 2 * len(mesh.nodes))
+    axis, end, base = mesh.edges
+    held = np.repeat(base[:, None], 2, axis=1)
+    held[end, 0] = True
+    held[axis, 0 if even else 1] = True
+    stiffness = element_stiffness(mesh.nodes[mesh.elements], poisson=poisson)
+    return Elements(mesh, stiffness, np.arange(held.size).reshape(-1, 2), np.ones(held.shape), held.ravel())
 
 
 def element_stiffness(corners: FloatArray, *, poisson: float) -> FloatArray:
@@ -170,78 +161,26 @@ def condense(
     count = int(np.ceil(reach_mm / cell_mm - 1e-9))
     half: FloatArray = cell_mm * np.arange(count + 1.0)
     row = surface_compliance(2 * half[-1] * np.arange(2 * count) / (2 * count), cell_mm=cell_mm, layers=body.layers)
-    hole = body_mesh(body, fineness=fineness)
-    disc = disc_mesh(body, fineness=fineness, layered=False)
     cut = body.seat < 1.0 and body.gland_ratio != 1.0  # the lump, by the fat-gland boundary
-    filling = disc_mesh(body, fineness=fineness, layered=True) if cut else disc
-    stiffness = [
-        assemble(mesh, young_kpa=np.where(mesh.gland, body.gland_ratio, 1.0) * body.fat_kpa, poisson=body.poisson)
-        for mesh in (hole, filling)
-    ]
-    unit = assemble(disc, young_kpa=np.ones(len(disc.elements)), poisson=body.poisson)
-    even, odd = (
-        CondensedHole(
-            *_hole_compliance(hole, stiffness[0], body, edges_mm=half, even=even),
-            _boundary_stiffness(disc, unit, body, even=even),
-            _boundary_stiffness(filling, stiffness[1], body, even=even),
-        )
-        for even in (True, False)
-    )
+    mesh = body_mesh(body, fineness=fineness, layered=cut)
+    plain = body_mesh(body, fineness=fineness, layered=False) if cut else mesh
+    even, odd = (_hole(mesh, plain, body, edges_mm=half, even=even) for even in (True, False))
     return SurfaceCompliance(body, np.concatenate([-half[:0:-1], half]), row, even, odd)
 
 
-def rim_nodes(body: Body, *, fineness: int) -> int:
-    """Number of nodes on the lump's half circle, mid-side nodes included."""
-    return len(_rim(disc_mesh(body, fineness=fineness, layered=False), body))
-
-
-def _rim(mesh: QuadMesh, body: Body) -> IndexArray:
-    """Nodes on the lump's circle, from its highest point to its lowest: the same order in every mesh of a body."""
-    x, z = mesh.nodes[:, 0], mesh.nodes[:, 1] - body.centre_mm
-    rim = np.flatnonzero(np.abs(np.hypot(x, z) - body.radius_mm) < 1e-6 * body.d_mm)
-    return rim[np.argsort(np.arctan2(x[rim], -z[rim]))]
-
-
-def _held_on_axis(mesh: QuadMesh, *, even: bool) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """(2n,) True for the unknowns that symmetry fixes at 0: u_x on the axis when even, u_z when odd."""
-    axis = mesh.nodes[:, 0] < 1e-9 * np.abs(mesh.nodes).max()
-    held = np.zeros((len(mesh.nodes), 2), dtype=bool)
-    held[axis, 0 if even else 1] = True
-    return held.reshape(-1)
-
-
-def _hole_compliance(
-    mesh: QuadMesh, stiffness: csc_array, body: Body, *, edges_mm: FloatArray, even: bool
-) -> tuple[FloatArray, FloatArray]:
-    """Displacements of rim (g, g) and of skin cells (c, g) per unit force on the rim's free unknowns."""
-    held = _held_on_axis(mesh, even=even)
-    x, z = mesh.nodes[:, 0], mesh.nodes[:, 1]
-    held[0::2] |= x > x.max() * (1 - 1e-9)
-    held |= np.repeat(z > body.layers.thickness_mm * (1 - 1e-9), 2)
-    free = np.flatnonzero(~held)
-    place = np.full(len(held), -1)
-    place[free] = np.arange(len(free))
-    rim = _rim_unknowns(mesh, body, held)
-    solution = moved(stiffness[free][:, free], place[rim])
-    skin = np.flatnonzero(z < 1e-9 * body.layers.thickness_mm)
-    skin = skin[np.argsort(x[skin])]
-    vertical = place[2 * skin + 1]
-    lowered = np.where(vertical[:, None] >= 0, solution[vertical], 0.0)
-    return solution[place[rim]], skin_average(x[skin], edges_mm=edges_mm, even=even) @ lowered
-
-
-def _rim_unknowns(mesh: QuadMesh, body: Body, held: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> IndexArray:
-    unknowns = (2 * _rim(mesh, body)[:, None] + np.arange(2)).reshape(-1)
-    return np.asarray(unknowns[~held[unknowns]])
-
-
-def _boundary_stiffness(mesh: QuadMesh, stiffness: csc_array, body: Body, *, even: bool) -> FloatArray:
-    """(g, g) stiffness of a disc, condensed onto its rim."""
-    held = _held_on_axis(mesh, even=even)
-    rim = _rim_unknowns(mesh, body, held)
-    inside = ~held
-    inside[rim] = False
-    return condensed(stiffness, rim, np.flatnonzero(inside))
+def _hole(mesh: Mesh, plain: Mesh, body: Body, *, edges_mm: FloatArray, even: bool) -> CondensedHole:
+    """Condense half a body; in the `plain` mesh the lump is meshed without the fat-gland boundary."""
+    own, lump = (plane_elements(one, poisson=body.poisson, even=even) for one in (mesh, plain))
+    rim, lump_rim = (one.number[one.mesh.rim].ravel() for one in (own, lump))
+    rim, lump_rim = rim[~own.held[rim]], lump_rim[~lump.held[lump_rim]]
+    modulus = np.where(mesh.gland, body.gland_ratio, 1.0) * body.fat_kpa
+    flexibility, lowered = own.around(modulus, rim, own.number[mesh.skin, 1])
+    return CondensedHole(
+        flexibility,
+        skin_average(mesh.nodes[mesh.skin, 0], edges_mm=edges_mm, even=even) @ lowered,
+        lump.within(np.ones(len(plain.elements)), lump_rim),
+        own.within(modulus, rim),
+    )
 
 
 # --- Frames of a head that slides over the lump in two dimensions, and the map they average to.

@@ -9,8 +9,8 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, as_dict, field, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.mesh import lump_mesh
-from tactile_bayes.forward.plane import TactileLine, build_line, head_positions, rim_nodes
+from tactile_bayes.forward.mesh import body_mesh, lump_mesh
+from tactile_bayes.forward.plane import TactileLine, build_line, head_positions
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import Body
 from tactile_bayes.mapping.build import build_map
@@ -175,10 +175,10 @@ def measure_forward(case: LumpCase, setting: Setting, *, clock: Clock, runs: int
         times.append((middle - begun, clock() - middle))
     lump, one_map = np.min(times, axis=0)
     if isinstance(settings, SolidSettings):
-        nodes = len(lump_mesh(settings.geometry(case.body), settings.mesh_size).arc)
+        mesh = lump_mesh(settings.geometry(case.body), settings.mesh_size)
     else:
-        nodes = rim_nodes(case.body, fineness=settings.fineness)
-    element = float(np.pi * case.body.radius_mm / ((nodes - 1) / 2))  # half the circumference over its elements
+        mesh = body_mesh(case.body, fineness=settings.fineness, layered=False)
+    element = float(np.pi * case.body.radius_mm / ((len(mesh.rim) - 1) / 2))  # half the circumference over its elements
     return Measured(setting, element, float(lump), float(one_map), found.amplitude, *found.widths_mm)
 
 

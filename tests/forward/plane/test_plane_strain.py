@@ -13,19 +13,13 @@ import pytest
 from scipy.linalg import expm
 from scipy.sparse.linalg import spsolve
 
-from benchmarks.forward import joined, rectangle_mesh
+from benchmarks.forward import assemble, rectangle_mesh
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.axisymmetric import surface_flexibility
-from tactile_bayes.forward.mesh import (
-    QuadMesh,
-    body_mesh,
-    disc_mesh,
-    lagrange_points,
-    quadrature,
-)
+from tactile_bayes.forward.mesh import Mesh, body_mesh, lagrange_points, quadrature
 from tactile_bayes.forward.plane import (
     SurfaceCompliance,
-    assemble,
     build_line,
     condense,
     skin_average,
@@ -43,7 +37,7 @@ def lame(young, poisson: float) -> tuple:
     return young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson))
 
 
-def on_the_edge(mesh: QuadMesh) -> np.ndarray:
+def on_the_edge(mesh: Mesh) -> np.ndarray:
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
     return (np.isclose(mesh.nodes, low) | np.isclose(mesh.nodes, high)).any(axis=1)
 
@@ -61,14 +55,14 @@ def test_a_constant_strain_is_exact_on_distorted_elements(poisson: float) -> Non
     mesh = rectangle_mesh(np.linspace(0, 3, 4), np.linspace(0, 2, 4))
     edge = on_the_edge(mesh)
     moved = mesh.nodes + np.where(edge[:, None], 0.0, np.random.default_rng(1).uniform(-0.06, 0.06, mesh.nodes.shape))
-    mesh = QuadMesh(moved, mesh.elements, mesh.gland)
+    mesh = replace(mesh, nodes=moved)
     matrix = assemble(mesh, young_kpa=np.full(len(mesh.elements), 5.0), poisson=poisson)
     exact = (mesh.nodes @ np.array([[0.01, -0.02], [0.03, 0.015]])).reshape(-1)
     u = solve_held(matrix, np.zeros(len(exact)), np.repeat(edge, 2), exact)
     np.testing.assert_allclose(u, exact, atol=1e-12)
 
 
-def body_force(mesh: QuadMesh, force: np.ndarray) -> np.ndarray:
+def body_force(mesh: Mesh, force: np.ndarray) -> np.ndarray:
     """(2n,) nodal forces of a force density given at the points of `quadrature_points`, (m, 9, 2)."""
     _, _, weight = quadrature(mesh.nodes[mesh.elements])
     values, _, _ = lagrange_points()
@@ -78,13 +72,13 @@ def body_force(mesh: QuadMesh, force: np.ndarray) -> np.ndarray:
     return load.reshape(-1)
 
 
-def quadrature_points(mesh: QuadMesh) -> tuple[np.ndarray, np.ndarray]:
+def quadrature_points(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """Positions (m, 9, 2) and weights (m, 9) in mm^2 of the integration points."""
     _, place, weight = quadrature(mesh.nodes[mesh.elements])
     return place, weight
 
 
-def interpolate(mesh: QuadMesh, values: np.ndarray) -> np.ndarray:
+def interpolate(mesh: Mesh, values: np.ndarray) -> np.ndarray:
     """(m, 9, ...) values at the integration points of (n, ...) values at the nodes."""
     shape, _, _ = lagrange_points()
     return np.einsum("qa,ea...->eq...", shape, values[mesh.elements])
@@ -181,21 +175,17 @@ def test_condensing_changes_nothing(body: Body) -> None:
     ratio, press = 30.0, np.zeros(len(surface.row))
     press[300:330] = np.linspace(1.0, 2.0, 30)
     change = (surface.with_lump(ratio) - surface.without_lump()) @ press
-    whole = joined(
-        [body_mesh(body, fineness=1), disc_mesh(body, fineness=1, layered=body.seat < 1)], scale_mm=body.d_mm
-    )
+    whole = body_mesh(body, fineness=1, layered=body.seat < 1)
     tissue = np.where(whole.gland, 50.0, 5.0)
     own = skin_response(whole, tissue, body, surface, press)
-    whole = joined([body_mesh(body, fineness=1), disc_mesh(body, fineness=1, layered=False)], scale_mm=body.d_mm)
-    middle = whole.nodes[whole.elements].mean(axis=1)
-    inside = np.hypot(middle[:, 0], middle[:, 1] - body.centre_mm) < body.radius_mm
-    tissue = np.where(inside, ratio * 5.0, np.where(whole.gland, 50.0, 5.0))
+    whole = body_mesh(body, fineness=1, layered=False)
+    tissue = np.where(whole.lump, ratio * 5.0, np.where(whole.gland, 50.0, 5.0))
     lump = skin_response(whole, tissue, body, surface, press)
     np.testing.assert_allclose(change, lump - own, atol=1e-9 * np.abs(lump).max())
 
 
 def skin_response(
-    mesh: QuadMesh, young: np.ndarray, body: Body, surface: SurfaceCompliance, press: np.ndarray
+    mesh: Mesh, young: np.ndarray, body: Body, surface: SurfaceCompliance, press: np.ndarray
 ) -> np.ndarray:
     """Mean displacements of the cells under pressures on them, from symmetric and antisymmetric halves."""
     matrix = assemble(mesh, young_kpa=young, poisson=body.poisson)
@@ -348,7 +338,7 @@ def test_impossible_bodies_are_named(name: str) -> None:
     assert all(word in str(caught.value) for word in words), str(caught.value)
 
 
-def calculix_deck(mesh: QuadMesh, young: np.ndarray, held: np.ndarray, load: np.ndarray, poisson: float) -> str:
+def calculix_deck(mesh: Mesh, young: np.ndarray, held: np.ndarray, load: np.ndarray, poisson: float) -> str:
     """The same body with another program's elements: eight nodes, reduced integration; six in triangles."""
     quads, triangles = [], []
     for number, element in enumerate(mesh.elements, start=1):
@@ -383,14 +373,14 @@ def calculix_deck(mesh: QuadMesh, young: np.ndarray, held: np.ndarray, load: np.
 OUTPUT = ["*NODE PRINT,NSET=ALL", "U", "*END STEP"]
 
 
-def middle_of(mesh: QuadMesh, element: np.ndarray, first: int, second: int) -> int:
+def middle_of(mesh: Mesh, element: np.ndarray, first: int, second: int) -> int:
     """The node of an element nearest to the middle of two of its corners."""
     middle = 0.5 * (mesh.nodes[first] + mesh.nodes[second])
     others = [node for node in dict.fromkeys(element[[1, 3, 5, 7]]) if node not in (first, second)]
     return int(min(others, key=lambda node: float(np.hypot(*(mesh.nodes[node] - middle)))))
 
 
-def ring_order(mesh: QuadMesh, nodes: list[int]) -> list[int]:
+def ring_order(mesh: Mesh, nodes: list[int]) -> list[int]:
     """Corners then middles, turned so that they run anticlockwise when depth is down."""
     n = len(nodes) // 2
     x, y = mesh.nodes[nodes[:n], 0], -mesh.nodes[nodes[:n], 1]
@@ -404,9 +394,8 @@ def ring_order(mesh: QuadMesh, nodes: list[int]) -> list[int]:
 @pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX (ccx) is not installed")
 @pytest.mark.parametrize("body", [Body(15, 0.9, 0.0), Body(10, 1.2, 1.0), Body(12, 0.8, 1.2)], ids=repr)
 def test_another_program_finds_the_same_displacements(body: Body, tmp_path: Path) -> None:
-    hole, disc = body_mesh(body, fineness=3), disc_mesh(body, fineness=3, layered=False)
-    mesh = joined([hole, disc], scale_mm=body.d_mm)
-    young = np.concatenate([np.where(hole.gland, 50.0, 5.0), np.full(len(disc.elements), 500.0)])
+    mesh = body_mesh(body, fineness=3, layered=False)
+    young = np.where(mesh.lump, 500.0, np.where(mesh.gland, 50.0, 5.0))
     x, z = mesh.nodes.T
     held = np.zeros((len(x), 2), dtype=bool)
     held[(x < 1e-9) | (x > x.max() - 1e-6), 0] = True

@@ -13,7 +13,6 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.axisymmetric import (
     CondensedLump,
-    _assemble,
     condense_lump,
     element_stiffness,
     layering_compliance,
@@ -21,7 +20,7 @@ from tactile_bayes.forward.axisymmetric import (
     orders_needed,
     skin_spline,
 )
-from tactile_bayes.forward.mesh import EXTERIOR_GLAND, INTERIOR_FAT, LumpGeometry, LumpMesh, MeshSize, lump_mesh
+from tactile_bayes.forward.mesh import Elements, LumpGeometry, Mesh, MeshSize, lump_mesh
 from tactile_bayes.forward.tissue import Layers
 
 CENTRED = LumpGeometry(7.5, 7.5, 15.0, Layers(15.0))
@@ -60,23 +59,23 @@ def test_a_mesh_fills_the_body_without_gap_or_overlap(name: str) -> None:
     mesh = lump_mesh(geometry)
     area = cell_areas(mesh)
     assert (area > 0).all()
-    assert area.sum() == pytest.approx(mesh.node_mm[:, 0].max() * geometry.layers.thickness_mm, rel=1e-9)
-    inside = area[mesh.region >= INTERIOR_FAT].sum()
+    assert area.sum() == pytest.approx(mesh.nodes[:, 0].max() * geometry.layers.thickness_mm, rel=1e-9)
+    inside = area[mesh.lump].sum()
     assert inside == pytest.approx(np.pi / 2 * geometry.radius_mm * geometry.half_height_mm, rel=1e-4)
     # every edge is shared by two elements or lies on the rim: a crack would show as an edge with one
-    edges = np.sort(mesh.element[:, [[0, 2], [2, 8], [8, 6], [6, 0]]].reshape(-1, 2), axis=1)
+    edges = np.sort(mesh.elements[:, [[0, 2], [2, 8], [8, 6], [6, 0]]].reshape(-1, 2), axis=1)
     edges = edges[edges[:, 0] != edges[:, 1]]
     found, times = np.unique(edges, axis=0, return_counts=True)
     assert times.max() == 2
-    alone = mesh.node_mm[found[times == 1]]
+    alone = mesh.nodes[found[times == 1]]
     low, high = alone.min(axis=1), alone.max(axis=1)
-    on_rim = (high[:, 0] == 0) | (low[:, 0] == mesh.node_mm[:, 0].max())
+    on_rim = (high[:, 0] == 0) | (low[:, 0] == mesh.nodes[:, 0].max())
     assert (on_rim | (high[:, 1] == 0) | (low[:, 1] == geometry.layers.thickness_mm)).all()
 
 
-def cell_areas(mesh: LumpMesh) -> np.ndarray:
+def cell_areas(mesh: Mesh) -> np.ndarray:
     """Areas by Green's theorem over the eight nodes of each rim, edges as parabolas (Simpson)."""
-    ring = mesh.node_mm[mesh.element[:, [0, 1, 2, 5, 8, 7, 6, 3]]]
+    ring = mesh.nodes[mesh.elements[:, [0, 1, 2, 5, 8, 7, 6, 3]]]
     total = np.zeros(len(ring))
     for i in range(0, 8, 2):
         a, b, c = ring[:, i], ring[:, i + 1], ring[:, (i + 2) % 8]
@@ -106,8 +105,8 @@ STRAINED = {
 def test_moving_as_a_whole_costs_nothing(name: str) -> None:
     order, field = RIGID[name]
     mesh = lump_mesh(CENTRED)
-    r, z = mesh.node_mm.T
-    motion = np.stack(field(r, z), axis=-1)[mesh.element].reshape(-1, 27)
+    r, z = mesh.nodes.T
+    motion = np.stack(field(r, z), axis=-1)[mesh.elements].reshape(-1, 27)
     k = element_stiffness(mesh, nu=0.495)
     stiffness = k[0] + order * k[1] + order**2 * k[2]
     forces = np.einsum("eij,ej->ei", stiffness, motion)
@@ -120,9 +119,9 @@ def test_an_even_strain_costs_its_exact_energy(name: str, nu: float) -> None:
     """Patch test in energy: uniform strain over the lump, an integral known in closed form for each angular order."""
     order, field = STRAINED[name]
     mesh = lump_mesh(CENTRED)
-    inside = mesh.region >= INTERIOR_FAT
-    r, z = mesh.node_mm.T
-    motion = np.stack(field(r, z), axis=-1)[mesh.element[inside]].reshape(-1, 27)
+    inside = mesh.lump
+    r, z = mesh.nodes.T
+    motion = np.stack(field(r, z), axis=-1)[mesh.elements[inside]].reshape(-1, 27)
     k = element_stiffness(mesh, nu=nu)[:, inside]
     energy = np.einsum("ei,eij,ej->", motion, k[0] + order * k[1] + order**2 * k[2], motion)
     shear, bulk = 0.5 / (1 + nu), nu / ((1 + nu) * (1 - 2 * nu))
@@ -174,17 +173,18 @@ def test_without_a_lump_the_elements_sink_as_the_exact_layers() -> None:
     mesh = lump_mesh(CENTRED, fine)
     number, sign = order_unknowns(mesh, 0)
     k = element_stiffness(mesh, nu=0.495)[0]
-    everywhere = np.ones(len(mesh.region), dtype=bool)
+    everywhere = np.ones(len(mesh.elements), dtype=bool)
+    elements = Elements(mesh, k, number, sign, np.zeros(number.size, dtype=bool))
     sinkings = []
     for gland in (50.0, 5.0):
-        modulus = np.where(mesh.region % 2 == EXTERIOR_GLAND, gland, 5.0)
-        matrix, used = _assemble(mesh, k, modulus, everywhere, number, sign)
-        skin = np.searchsorted(used, number[mesh.surface[:-1], 2])
+        modulus = np.where(mesh.gland, gland, 5.0)
+        matrix, used = elements.matrix(modulus, everywhere)
+        skin = np.searchsorted(used, number[mesh.skin[:-1], 2])
         force = np.zeros(len(used))
         force[skin[0]] = 1 / (2 * np.pi)
         sinkings.append(splu(matrix).solve(force)[skin])
     r = np.array([0.0, 5.0, 15.0, 40.0])
-    by_elements = CubicSpline(mesh.node_mm[mesh.surface[:-1], 0], sinkings[0] - sinkings[1])(r)
+    by_elements = CubicSpline(mesh.nodes[mesh.skin[:-1], 0], sinkings[0] - sinkings[1])(r)
     stiff, even = (Layers(15.0, gland_ratio=ratio) for ratio in (10.0, 1.0))
     exact = layering_compliance(r, stiff) - layering_compliance(r, even)
     np.testing.assert_allclose(by_elements, exact, atol=0.002 * np.abs(exact).max())
