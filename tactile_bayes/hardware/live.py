@@ -8,10 +8,10 @@ import os
 import select
 import struct
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
@@ -36,30 +36,9 @@ _SIZES: Final = struct.Struct("<II")
 _TOLD: Final = ("frames", "frames_lost", "poses", "duration_s", "unseen")  #: Of the recorder's account.
 
 
-class SeenFrame(NamedTuple):
-    """One frame, with the device's and the host's time of its recording."""
-
-    counts: CountArray
-    device_ns: int
-    host_ns: int
-
-
-class SeenPose(NamedTuple):
-    """One pose on the head's clock."""
-
-    device_ns: int
-    position_mm: tuple[float, ...]
-    quaternion_wxyz: tuple[float, ...]
-
-
-class SeenLandmark(NamedTuple):
-    """One landmark, ``sternal_notch``, ``xiphoid`` or ``nipple``, in `base`."""
-
-    name: str
-    position_mm: tuple[float, ...]
-
-
-Seen = SeenFrame | SeenPose | SeenLandmark | dict[str, Any]
+Seen = tuple[Any, ...]
+"""``"frame"``, device time, host time, counts; ``"pose"``, device time, place, quaternion; ``"landmark"``, name, place;
+or ``"report"`` and some of the account."""
 
 
 class Feed(Observer):
@@ -74,7 +53,7 @@ class Feed(Observer):
 
     def frame(self, counts: CountArray, device_ns: int) -> None:
         """Send a recorded frame."""
-        self._send("frame", counts.shape, device_ns, time.monotonic_ns(), counts=counts.astype("<u2").tobytes())
+        self._send("frame", device_ns, time.monotonic_ns(), counts.shape, counts=counts.astype("<u2").tobytes())
 
     def pose(self, pose: PoseReading, device_ns: int) -> None:
         """Send a recorded pose."""
@@ -127,15 +106,10 @@ def _messages(data: bytes) -> Iterator[Seen]:
         text, size = _SIZES.unpack_from(data, place)
         start = place + _SIZES.size + text
         place = start + size
-        match json.loads(data[start - text : start]):
-            case "frame", shape, device_ns, host_ns:
-                yield SeenFrame(np.frombuffer(data[start:place], dtype="<u2").reshape(shape), device_ns, host_ns)
-            case "pose", device_ns, position_mm, quaternion_wxyz:
-                yield SeenPose(device_ns, tuple(position_mm), tuple(quaternion_wxyz))
-            case "landmark", name, position_mm:
-                yield SeenLandmark(name, tuple(position_mm))
-            case _, report:
-                yield report
+        told = json.loads(data[start - text : start])
+        if told[0] == "frame":
+            told[-1] = np.frombuffer(data[start:place], dtype="<u2").reshape(told[-1])
+        yield tuple(told)
 
 
 # --- The growing map and the pressure during a recording, for a live view.
@@ -225,8 +199,9 @@ class LiveMap:
 
     head: HeadGeometry
     calibration: ElementCalibration
-    _frames: list[SeenFrame] = field(default_factory=list)
-    _poses: list[SeenPose] = field(default_factory=list)
+    _frames: list[tuple[int, CountArray]] = field(default_factory=list)
+    _poses: list[tuple[int, Sequence[float], Sequence[float]]] = field(default_factory=list)
+    """`_frames`, `_poses`: Those not mapped yet, and the last ones, each with its device time."""
     _report: dict[str, Any] = field(default_factory=dict)
     _landmarks: dict[str, FloatArray] = field(default_factory=dict)
     _map: MapAccumulator | None = None
@@ -241,19 +216,18 @@ class LiveMap:
         youngest = None
         for one in seen:
             match one:
-                case SeenFrame():
-                    self._frames.append(one)
-                    youngest = one
-                case SeenPose():
-                    self._poses.append(one)
-                case SeenLandmark():
-                    self._landmarks[one.name] = np.array(one.position_mm)
-                case dict():
-                    self._report = one
+                case "frame", device_ns, host_ns, counts:
+                    self._frames.append((device_ns, counts))
+                    youngest, self._host_ns = counts, host_ns
+                case "pose", *pose:
+                    self._poses.append(tuple(pose))
+                case "landmark", name, position_mm:
+                    self._landmarks[name] = np.array(position_mm)
+                case _, report:
+                    self._report = report
         if youngest is not None:
-            pressure = self.calibration.to_kpa(youngest.counts[None])
+            pressure = self.calibration.to_kpa(youngest[None])
             self._pressure_kpa = float(np.nanmean(pressure)) if np.isfinite(pressure).any() else float("nan")
-            self._host_ns = youngest.host_ns
         self._map_ready_frames()
         del self._poses[:-_KEPT_POSES]
 
@@ -261,23 +235,19 @@ class LiveMap:
         if not self._frames or len(self._poses) < 2:
             del self._frames[:-_KEPT_POSES]
             return
-        last_ns = self._poses[-1].device_ns
-        overdue_ns = self._frames[-1].device_ns - _PATIENCE_NS
-        ready = [one for one in self._frames if one.device_ns <= max(last_ns, overdue_ns)]
+        times_ns, places, turns = zip(*self._poses, strict=True)
+        overdue_ns = self._frames[-1][0] - _PATIENCE_NS
+        ready = [one for one in self._frames if one[0] <= max(times_ns[-1], overdue_ns)]
         if not ready:
             return
         del self._frames[: len(ready)]
-        poses = TrackerPoses(
-            np.array([max(0, one.device_ns) / 1e9 for one in self._poses]),
-            np.array([one.position_mm for one in self._poses]),
-            np.array([one.quaternion_wxyz for one in self._poses]),
-        )
-        found = poses_at(distinct_poses(poses), np.array([one.device_ns / 1e9 for one in ready]))
+        poses = TrackerPoses(np.array([max(0, ns) / 1e9 for ns in times_ns]), np.array(places), np.array(turns))
+        found = poses_at(distinct_poses(poses), np.array([device_ns / 1e9 for device_ns, _ in ready]))
         if self._map is None:
             if not found.known.any():
                 return
             self._map = self._map_on(head_moments(self.head, found).plane())
-        counts = np.stack([one.counts for one in ready])
+        counts = np.stack([counts for _, counts in ready])
         used = self._map.add(counts, found)
         if self._refits < len(REFIT_AT):
             self._fed.append((counts, found, used))

@@ -25,9 +25,6 @@ from tactile_bayes.hardware.live import (
     Feed,
     LiveMap,
     LiveState,
-    SeenFrame,
-    SeenLandmark,
-    SeenPose,
     fed,
     grey_levels,
 )
@@ -58,11 +55,11 @@ def pose_of(scan, index: int) -> PoseReading:
 def seen_of(scan) -> list:
     """A scan as a view would see it, in order of time."""
     frames = [
-        SeenFrame(counts, round(time * 1e9), 1)
+        ("frame", round(time * 1e9), 1, counts)
         for counts, time in zip(scan.frames.counts, scan.frames.time_s, strict=True)
     ]
-    poses = [SeenPose(round(scan.poses.time_s[i] * 1e9), *pose_of(scan, i)[:2]) for i in range(len(scan.poses))]
-    return sorted([*frames, *poses], key=lambda one: one.device_ns)
+    poses = [("pose", round(scan.poses.time_s[i] * 1e9), *pose_of(scan, i)[:2]) for i in range(len(scan.poses))]
+    return sorted([*frames, *poses], key=lambda one: one[1])
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +68,7 @@ def state(scan) -> LiveState:
     seen = seen_of(scan)
     for start in range(0, len(seen), 25):
         live.take(seen[start : start + 25])
-    live.take([{"frames": 200, "frames_lost": 3, "poses": 120, "duration_s": 0.995}])
+    live.take([("report", {"frames": 200, "frames_lost": 3, "poses": 120, "duration_s": 0.995})])
     return live.state(size="largest size 15.0 mm")
 
 
@@ -82,11 +79,11 @@ def test_what_is_fed_is_seen(scan, pipe):
     feed.landmark("xiphoid", np.array([1.0, -2.5, 3.0]))
     feed.told(Report(frames=4, unseen="out of volume", other_tools="x" * 9999))
     frame, pose, landmark, report = next(reader)
-    assert landmark == SeenLandmark("xiphoid", (1.0, -2.5, 3.0))
-    np.testing.assert_array_equal(frame.counts, scan.frames.counts[3])
-    assert (frame.device_ns, pose.device_ns) == (15_000_000, 16_666_667)
-    assert pose.position_mm == pose_of(scan, 2).position_mm
-    assert (report["frames"], report["unseen"]) == (4, "out of volume")
+    assert landmark == ("landmark", "xiphoid", [1.0, -2.5, 3.0])
+    np.testing.assert_array_equal(frame[-1], scan.frames.counts[3])
+    assert (frame[1], pose[1]) == (15_000_000, 16_666_667)
+    assert tuple(pose[2]) == pose_of(scan, 2).position_mm
+    assert (report[1]["frames"], report[1]["unseen"]) == (4, "out of volume")
     feed.close()
     assert list(reader) == [[]]
 
@@ -98,7 +95,7 @@ def test_a_view_that_does_not_look_costs_nothing_but_its_own_frames(scan, pipe):
     assert feed.missed > 0
     seen = [one for _ in range(100) for one in next(reader)]
     assert len(seen) == 3000 - feed.missed
-    assert [one.device_ns for one in seen] == list(range(len(seen)))
+    assert [one[1] for one in seen] == list(range(len(seen)))
 
 
 def test_a_view_that_has_gone_does_not_stop_the_recording(scan):
@@ -156,10 +153,10 @@ def test_a_screen_names_its_keys_colours_scale_and_the_lump(state):
 def test_a_screen_tells_of_the_landmarks(scan):
     live = LiveMap(scan.head, scan.element_calibration)
     assert live.state().landmark_words == ""
-    live.take([SeenLandmark("sternal_notch", (1.0, 2.0, 3.0))])  # of a file
+    live.take([("landmark", "sternal_notch", (1.0, 2.0, 3.0))])  # of a file
     assert live.state().landmark_words == "landmarks: sternal notch"
     touched = "xiphoid at 1.0 2.0 3.0 mm, spread 3.10 mm over 60 samples; the head moved, touch it again"
-    live.take([SeenLandmark("xiphoid", (1.0, 2.0, 3.0)), {"touched": touched}])
+    live.take([("landmark", "xiphoid", (1.0, 2.0, 3.0)), ("report", {"touched": touched})])
     text = live_text(live.state(), columns=60, lines=24, colour=False, keys=True)
     assert max(map(len, text.splitlines())) <= 60
     assert f"landmarks: sternal notch, xiphoid; {touched}" in " ".join(text.split())
@@ -167,7 +164,7 @@ def test_a_screen_tells_of_the_landmarks(scan):
 
 def test_landmarks_in_one_place_give_a_view_no_patient_axes(scan):
     live = LiveMap(scan.head, scan.element_calibration)
-    live.take([SeenLandmark(name, (1.0, 2.0, 3.0)) for name in ("sternal_notch", "xiphoid")])
+    live.take([("landmark", name, (1.0, 2.0, 3.0)) for name in ("sternal_notch", "xiphoid")])
     live.take(seen_of(scan))
     assert live.state().tactile_map.patient_from_plane is None
 

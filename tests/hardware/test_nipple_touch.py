@@ -10,7 +10,7 @@ import pytest
 from test_orientation import scan_of
 
 from tactile_bayes.actions.record import Keys, calibration_age
-from tactile_bayes.hardware.live import LiveMap, SeenFrame, SeenLandmark, SeenPose
+from tactile_bayes.hardware.live import LiveMap
 
 
 @pytest.mark.parametrize(("key", "name"), [("n", "sternal_notch"), ("x", "xiphoid"), ("p", "nipple")])
@@ -28,10 +28,10 @@ def test_the_live_view_has_the_patients_axes_from_notch_and_xiphoid_alone(names:
     scan = scan_of(70)
     live = LiveMap(scan.head, scan.element_calibration)
     points = {**scan.landmarks.points(), "nipple": np.array([1.0, 2.0, 3.0])}
-    seen: list = [SeenLandmark(name, tuple(points[name])) for name in names]
+    seen: list = [("landmark", name, tuple(points[name])) for name in names]
     for i, (counts, time) in enumerate(zip(scan.frames.counts, scan.frames.time_s, strict=True)):
         turn, place = scan.poses.quaternion_wxyz[i], scan.poses.position_mm[i]
-        seen += [SeenPose(round(time * 1e9), tuple(place), tuple(turn)), SeenFrame(counts, round(time * 1e9), 1)]
+        seen += [("pose", round(time * 1e9), place, turn), ("frame", round(time * 1e9), 1, counts)]
     live.take(seen)
     assert (live.state().tactile_map.patient_from_plane is not None) is axes
 

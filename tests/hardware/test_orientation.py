@@ -11,7 +11,7 @@ from mapping_scans import gaussian, make_scan, strokes
 
 from tactile_bayes.actions.live_view import live_text
 from tactile_bayes.declarations import replace
-from tactile_bayes.hardware.live import LiveMap, LiveState, SeenFrame, SeenLandmark, SeenPose
+from tactile_bayes.hardware.live import LiveMap, LiveState
 from tactile_bayes.hardware.serve import document
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
@@ -53,11 +53,11 @@ def live_state(head_deg: float | None) -> LiveState:
     live = LiveMap(scan.head, scan.element_calibration)
     if scan.landmarks is not None:
         for name in ("sternal_notch", "xiphoid"):
-            live.take([SeenLandmark(name, tuple(getattr(scan.landmarks, f"{name}_mm")))])
+            live.take([("landmark", name, tuple(getattr(scan.landmarks, f"{name}_mm")))])
     seen: list = []
     for i, (counts, time) in enumerate(zip(scan.frames.counts, scan.frames.time_s, strict=True)):
         turn, place = scan.poses.quaternion_wxyz[i], scan.poses.position_mm[i]
-        seen += [SeenPose(round(time * 1e9), tuple(place), tuple(turn)), SeenFrame(counts, round(time * 1e9), 1)]
+        seen += [("pose", round(time * 1e9), place, turn), ("frame", round(time * 1e9), 1, counts)]
     live.take(seen)
     return live.state()
 
