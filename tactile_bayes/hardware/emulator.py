@@ -10,6 +10,7 @@ import socket
 import termios
 import time
 import tty
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Final
 
 import numpy as np
@@ -168,6 +169,7 @@ class Stage:
         return number, None if begun is None else (time.monotonic() - begun) * self.speed
 
 
+@dataclass
 class Emulator:
     """Runs an emulated device on a link, with the given faults; records keep their device times.
 
@@ -175,25 +177,22 @@ class Emulator:
     while it streams and the scan has not begun, as a tracker does whose sensor is held still.
     """
 
-    def __init__(
-        self,
-        device: Device,
-        link: Link,
-        *,
-        faults: Faults,
-        rng: np.random.Generator,
-        stage: Stage | None = None,
-        leads: bool = True,
-    ) -> None:
-        self._device, self._link = device, link
-        self._faults, self._rng = faults, rng
-        self._stage, self._leads = stage or Stage(), leads
+    device: Device
+    link: Link
+    _: KW_ONLY
+    faults: Faults
+    rng: np.random.Generator
+    stage: Stage = field(default_factory=Stage)
+    leads: bool = True
+
+    sent = dropped = faulty = 0  #: Records sent, dropped and changed by faults since a START.
+    unplugged = False
+
+    def __post_init__(self) -> None:
         self._waiting = bytearray()
-        self._starts = device.starts
+        self._starts = self.device.starts
         self._round, self._next, self._finished_at = 0, 0, 0.0
         self._hold_at = time.monotonic() + _SETTLE_S
-        self.sent = self.dropped = self.faulty = 0  #: Records sent, dropped and changed by faults since a START.
-        self.unplugged = False
 
     def run(self, *, once: bool = False) -> None:
         """Serve until the link breaks, or, with `once`, until a scan has been sent and read."""
@@ -201,85 +200,85 @@ class Emulator:
             self._step()
             if once and self._finished_at and not self._waiting:
                 waited = time.monotonic() - self._finished_at > LINGER_S
-                if self._device.said_end or self._device.stopped or waited:
-                    self._link.finish(LINGER_S)
+                if self.device.said_end or self.device.stopped or waited:
+                    self.link.finish(LINGER_S)
                     self.unplugged = True
 
     def _step(self) -> None:
         """Wait for the next event and handle it."""
-        writable = [self._link] if self._waiting else []
-        readable, _, _ = select.select([self._link], writable, [], self._patience_s())
+        writable = [self.link] if self._waiting else []
+        readable, _, _ = select.select([self.link], writable, [], self._patience_s())
         if readable:
             self._hear()
         self._follow_commands()
-        number, elapsed_s = self._stage.now()
-        if self._device.streaming and self._link.connected():
+        number, elapsed_s = self.stage.now()
+        if self.device.streaming and self.link.connected():
             if number != self._round and elapsed_s is not None:
                 self._round, self._next, self._finished_at = number, 0, 0.0
                 self.sent = self.dropped = self.faulty = 0
             if elapsed_s is not None:
                 self._send_due(elapsed_s)
-            elif not self._leads and time.monotonic() > self._hold_at:
+            elif not self.leads and time.monotonic() > self._hold_at:
                 self._hold_at = time.monotonic() + _HOLD_S
-                self._waiting += self._device.record(0)
+                self._waiting += self.device.record(0)
         self._pass_on()
 
     def _pass_on(self) -> None:
         if self._waiting and not self.unplugged:
-            del self._waiting[: self._link.write(bytes(self._waiting))]
+            del self._waiting[: self.link.write(bytes(self._waiting))]
 
     def _patience_s(self) -> float:
-        times = self._device.times_s
-        if not self._device.streaming or self._next >= len(times):
+        times = self.device.times_s
+        if not self.device.streaming or self._next >= len(times):
             return _IDLE_S
-        _, elapsed_s = self._stage.now()
+        _, elapsed_s = self.stage.now()
         if elapsed_s is None:
             return _HOLD_S
-        return max(0.0, min((float(times[self._next] - times[0]) - elapsed_s) / self._stage.speed, _IDLE_S))
+        return max(0.0, min((float(times[self._next] - times[0]) - elapsed_s) / self.stage.speed, _IDLE_S))
 
     def _hear(self) -> None:
-        was_there = self._link.connected()
-        self._waiting += self._device.hear(self._link.read())
-        if self._link.connected() and not was_there:
-            self._device.greet()
-        elif was_there and not self._link.connected():
+        was_there = self.link.connected()
+        self._waiting += self.device.hear(self.link.read())
+        if self.link.connected() and not was_there:
+            self.device.greet()
+        elif was_there and not self.link.connected():
             self._waiting.clear()
 
     def _follow_commands(self) -> None:
         """Begin anew at each START, also while streaming; a device that leads starts the others too."""
-        if self._device.starts != self._starts:
-            self._starts, self._hold_at = self._device.starts, time.monotonic() + _SETTLE_S
-            if self._leads:
-                self._stage.begin()
-        elif self._leads and (self._device.stopped or not self._link.connected()):
-            self._stage.end()
+        if self.device.starts != self._starts:
+            self._starts, self._hold_at = self.device.starts, time.monotonic() + _SETTLE_S
+            if self.leads:
+                self.stage.begin()
+        elif self.leads and (self.device.stopped or not self.link.connected()):
+            self.stage.end()
 
     def _send_due(self, elapsed_s: float) -> None:
-        times = self._device.times_s
+        times = self.device.times_s
         if self._next >= len(times):
             return
         while self._next < len(times) and times[self._next] - times[0] <= elapsed_s:
             moment = float(times[self._next] - times[0])
-            if self._faults.disconnect_s is not None and moment >= self._faults.disconnect_s:
+            if self.faults.disconnect_s is not None and moment >= self.faults.disconnect_s:
                 with contextlib.suppress(OSError):
-                    self._link.write(bytes(self._waiting))
+                    self.link.write(bytes(self._waiting))
                 self.unplugged = True
-                self._link.close()
+                self.link.close()
                 return
-            self._send(self._device.record(self._next), moment)
+            self._send(self.device.record(self._next), moment)
             self._next += 1
             self._pass_on()  # at once: when this process was late, many are due and must not meet in the buffer
         if self._next >= len(times):
-            self._waiting += self._device.end(self.sent, self.dropped)
+            self._waiting += self.device.end(self.sent, self.dropped)
             self._finished_at = time.monotonic()
 
     def _send(self, record: bytes, moment_s: float) -> None:
         if not record:
             return
-        if within(self._faults.stall, moment_s) or len(self._waiting) + len(record) > BUFFER_BYTES:
+        if within(self.faults.stall, moment_s) or len(self._waiting) + len(record) > BUFFER_BYTES:
             self.dropped += 1
             return
-        disturbed = self._faults.disturb(record, self._rng)
+        disturbed = self.faults.disturb(record, self.rng)
         self.faulty += disturbed != record
         self.sent += bool(disturbed)
         self._waiting += disturbed

@@ -7,7 +7,7 @@ import select
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import Final, Protocol
 
 import numpy as np
@@ -197,81 +197,73 @@ class Line:
     finished: bool = False
 
 
+@dataclass
 class Recorder:
     """Runs one recording of devices that were checked and do not stream yet; without a tracker it has no poses.
 
-    The sink gets everything in order of arrival, of the tracker's tools the one that `follower` follows. `duration_s`
-    is by the head's clock made continuous, and at most `OVERTIME_S` longer by the host's; None goes on until it is
-    stopped. The head promised `rate_hz`, or nothing when that is 0. `clock_ns` is the host time that the reading
-    processes stamp with.
+    The sink gets everything in order of arrival.
     """
 
-    def __init__(
-        self,
-        head: Line,
-        tracker: Line | None,
-        sink: Sink,
-        *,
-        shared_clock: bool = False,
-        follower: readings.Follower | None = None,
-        duration_s: float | None = None,
-        rate_hz: float = 0.0,
-        observer: Observer | None = None,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
+    head: Line
+    tracker: Line | None
+    sink: Sink
+    _: KW_ONLY
+    shared_clock: bool = False  #: True when both devices count from one zero.
+    follower: readings.Follower = field(default_factory=readings.Follower)  #: Of which of the tracker's tools.
+    duration_s: float | None = None
+    """By the head's clock made continuous, and at most `OVERTIME_S` longer by the host's; None goes on until it is
+    stopped."""
+    rate_hz: float = 0.0  #: What the head promised; 0 for nothing.
+    observer: Observer = field(default_factory=Observer)
+    clock_ns: Callable[[], int] = time.monotonic_ns  #: The host time that the reading processes stamp with.
+    touch: LandmarkTouch | None = None  #: The landmark for which the next poses are averaged.
+    recording: bool = False
+
+    def __post_init__(self) -> None:
         self.report = Report()
-        self._head, self._tracker, self._sink = head, tracker, sink
-        self._lines = [line for line in (head, tracker) if line is not None]
-        self._clock = readings.PoseClock(shared=shared_clock)
-        self._follower = follower or readings.Follower()
+        self._lines = [line for line in (self.head, self.tracker) if line is not None]
+        self._clock = readings.PoseClock(shared=self.shared_clock)
         self._why_missing: Counter[str] = Counter()
         self._why_flagged: Counter[str] = Counter()
-        self._jumps = Jumps()
-        self._duration_ns = None if duration_s is None else round(duration_s * 1e9)
-        self._rate_hz = rate_hz
-        self._frame_span, self._pose_span = Span(), Span()
+        self._jumps, self._frame_span, self._pose_span = Jumps(), Span(), Span()
+        self._zero_ns = self.clock_ns()
         self._begun_ns = self._heard_ns = 0
-        self._observer = observer or Observer()
-        self._now_ns = clock_ns
-        self._zero_ns = clock_ns()
-        self.touch: LandmarkTouch | None = None  #: The landmark for which the next poses are averaged.
         self._last_pose: readings.PoseReading | None = None
         self._pose_ns = -1
         self._drain_until_ns: int | None = None
-        self.recording = False
 
     def start(self) -> None:
         """Start the devices and record them."""
         for line in reversed(self._lines):  # the tracker first, so that no frame is without a pose
             line.port.write(line.start)
-            line.heard_ns = self._now_ns()
+            line.heard_ns = self.clock_ns()
         self.recording = True
 
     def listen(self) -> None:
         """Start the tracker alone, for landmarks before the scan."""
-        if self._tracker is not None:
-            self._tracker.port.write(self._tracker.start)
+        if self.tracker is not None:
+            self.tracker.port.write(self.tracker.start)
 
     def stop(self, why: str) -> None:
         """End the recording once data on their way have arrived."""
         if not self.report.ended_by:
             self.report.ended_by = why
-            self._drain_until_ns = self._now_ns() + round(DRAIN_S * 1e9)
+            self._drain_until_ns = self.clock_ns() + round(DRAIN_S * 1e9)
 
     def run(self, each_tick: Callable[[], None] = lambda: None) -> Report:
         """Record until the end; `each_tick`, called many times a second, may call `stop` and `start` and set `touch`.
 
         Whatever happens, the devices are told to stop and the account is complete.
         """
-        flushed_ns = self._now_ns()
+        flushed_ns = self.clock_ns()
         try:
             while not self._done():
                 self._take()
                 each_tick()
-                now = self._now_ns()
+                now = self.clock_ns()
                 if now - flushed_ns > FLUSH_S * 1e9:
                     flushed_ns = now
-                    self._sink.flush()
+                    self.sink.flush()
                     self._account()
                 self._look_for_silence(now)
                 self._look_at_host_time(now)
@@ -290,7 +282,7 @@ class Recorder:
         for line in self._lines:
             if line.stream not in ready:
                 continue
-            for host_ns, data in line.stream.read() if line is self._head else line.stream.read(_TRACKER_BYTES):
+            for host_ns, data in line.stream.read() if line is self.head else line.stream.read(_TRACKER_BYTES):
                 line.heard_ns = host_ns
                 for reading in line.parser.feed(data):
                     self._read(line, reading, host_ns)
@@ -302,14 +294,14 @@ class Recorder:
             case readings.FrameReading():
                 self._frame(reading, host_ns)
             case readings.PoseReading() | readings.MissingReading():
-                for one, came_ns in self._follower.take(reading, host_ns):
+                for one, came_ns in self.follower.take(reading, host_ns):
                     if isinstance(one, readings.PoseReading):
                         self._pose(one, came_ns)
                     else:
                         self._missing(one, came_ns)
             case readings.EndReading() if self.recording:
                 line.finished = True
-                if line is self._head:
+                if line is self.head:
                     self.report.head_dropped = reading.dropped
                     self.stop("the head stopped")
             case _:
@@ -322,7 +314,7 @@ class Recorder:
         device_ns, event = self._clock.head.read(reading.device_ns, host_ns)
         if not report.frames:
             report.first_ns, self._begun_ns = device_ns, host_ns
-        elif self._duration_ns is not None and device_ns - report.first_ns >= self._duration_ns:
+        elif self.duration_s is not None and device_ns - report.first_ns >= round(self.duration_s * 1e9):
             self.stop("duration")
             return
         remarks = (
@@ -335,12 +327,12 @@ class Recorder:
             self._note(text, "head", device_ns, host_ns)
         report.frames_lost += reading.lost
         report.frame_counter_restarts += reading.restarted
-        self._sink.add_frame(reading.counts, device_ns=device_ns, host_ns=max(0, host_ns))
+        self.sink.add_frame(reading.counts, device_ns=device_ns, host_ns=max(0, host_ns))
         self._frame_span.add(device_ns / 1e9)
         report.frames += 1
         report.last_ns, self._heard_ns = device_ns, host_ns
-        report.longest_wait_ms = max(report.longest_wait_ms, (self._now_ns() - self._zero_ns - host_ns) / 1e6)
-        self._observer.frame(reading.counts, device_ns)
+        report.longest_wait_ms = max(report.longest_wait_ms, (self.clock_ns() - self._zero_ns - host_ns) / 1e6)
+        self.observer.frame(reading.counts, device_ns)
 
     def _pose(self, reading: readings.PoseReading, host_ns: int) -> None:
         host_ns -= self._zero_ns
@@ -357,7 +349,7 @@ class Recorder:
         device_ns, event = moment
         flags = self._flags(reading)
         position, turn = np.array(reading.position_mm), np.array(reading.quaternion_wxyz)
-        self._sink.add_pose(position, turn, device_ns=device_ns, host_ns=max(0, host_ns))
+        self.sink.add_pose(position, turn, device_ns=device_ns, host_ns=max(0, host_ns))
         self.report.poses += 1
         self._pose_ns = device_ns
         self._pose_span.add(device_ns / 1e9)
@@ -370,7 +362,7 @@ class Recorder:
         if flags:
             serious = flags != ("repeated",)
             self._note(", ".join(flags), "tracker", device_ns, host_ns, serious=serious)
-        self._observer.pose(reading, device_ns)
+        self.observer.pose(reading, device_ns)
 
     def _missing(self, reading: readings.MissingReading, host_ns: int) -> None:
         """Count a pose that the tracker does not have, once frames come; the log has where a gap begins and ends."""
@@ -383,7 +375,7 @@ class Recorder:
     def _unseen(self, why: str, host_ns: int) -> None:
         """Keep why there is no pose now; the file's log has where that begins."""
         if not self.report.unseen:
-            text = f"no pose of {self._follower.tool or 'the tool'} from here on: {why}"
+            text = f"no pose of {self.follower.tool or 'the tool'} from here on: {why}"
             self._note(text, "tracker", max(0, self._pose_ns), host_ns)
         self.report.unseen = why
 
@@ -405,12 +397,12 @@ class Recorder:
         self.touch = None
         self.report.landmarks.append(str(touch))
         device_ns = max(0, self._pose_ns)
-        self._sink.add_landmark(touch.name, touch.position_mm, device_ns=device_ns, host_ns=max(0, host_ns))
-        self._observer.landmark(touch.name, touch.position_mm)
+        self.sink.add_landmark(touch.name, touch.position_mm, device_ns=device_ns, host_ns=max(0, host_ns))
+        self.observer.landmark(touch.name, touch.position_mm)
         self._note(str(touch), "tracker", device_ns, host_ns, serious=not touch.steady)
 
     def _note(self, text: str, device: str, device_ns: int, host_ns: int, *, serious: bool = True) -> None:
-        self._sink.add_note(text, device=device, device_ns=device_ns, host_ns=max(0, host_ns), serious=serious)
+        self.sink.add_note(text, device=device, device_ns=device_ns, host_ns=max(0, host_ns), serious=serious)
 
     def _gone(self, line: Line) -> None:
         """Handle a device that disappeared: cable pulled, or its program ended."""
@@ -436,10 +428,10 @@ class Recorder:
 
     def _look_at_host_time(self, now_ns: int) -> None:
         """End a recording of limited duration by the host's clock when the head's is behind."""
-        if self._duration_ns is None or not self.report.frames:
+        if self.duration_s is None or not self.report.frames:
             return
         passed_ns = now_ns - self._zero_ns - self._begun_ns
-        if passed_ns > self._duration_ns + OVERTIME_S * 1e9:
+        if passed_ns > (self.duration_s + OVERTIME_S) * 1e9:
             self.stop("duration, by this computer's clock")
 
     def _judge(self) -> None:
@@ -448,35 +440,35 @@ class Recorder:
         report.head_clock_steps, report.head_clock_wraps = clock.head.steps, clock.head.wraps
         report.tracker_clock_steps, report.tracker_clock_wraps = clock.tracker.steps, clock.tracker.wraps
         report.missing_why, report.flagged_why = _numbers(self._why_missing), _numbers(self._why_flagged)
-        report.other_tools = _numbers(self._follower.others)
-        report.tracker_remark = self._tracker.parser.remark if self._tracker else ""
+        report.other_tools = _numbers(self.follower.others)
+        report.tracker_remark = self.tracker.parser.remark if self.tracker else ""
         passed_s = (self._heard_ns - self._begun_ns) / 1e9
         spans = self._frame_span, self._pose_span
-        report.cautions = [*overlap_cautions(*spans), *_cautions(report, passed_s, self._rate_hz)]
+        report.cautions = [*overlap_cautions(*spans), *_cautions(report, passed_s, self.rate_hz)]
         report.cautions += self._jumps.cautions()
-        if self._head.parser.fault:
-            report.cautions.append(f"the head's line: {self._head.parser.fault}")
-        if self._tracker is not None and report.frames and not report.fault and apart(*spans):
+        if self.head.parser.fault:
+            report.cautions.append(f"the head's line: {self.head.parser.fault}")
+        if self.tracker is not None and report.frames and not report.fault and apart(*spans):
             missing = f" ({report.poses_missing:,} missing: {report.missing_why})" if report.poses_missing else ""
             none = f"none of its {report.poses} poses was measured while frames came"
-            report.fault = f"{self._tracker.port.name}: {none}{missing}"
+            report.fault = f"{self.tracker.port.name}: {none}{missing}"
 
     def _done(self) -> bool:
         """True when all data of the recording have arrived."""
         if self._drain_until_ns is None:
             return False
-        tracker = self._tracker
+        tracker = self.tracker
         behind = tracker is not None and not tracker.finished and self._pose_ns < self.report.last_ns
-        return not behind or self._now_ns() > self._drain_until_ns
+        return not behind or self.clock_ns() > self._drain_until_ns
 
     def _account(self) -> None:
         report = self.report
-        report.head_garbage_bytes = self._head.parser.garbage_bytes
-        report.tracker_garbage_bytes = self._tracker.parser.garbage_bytes if self._tracker else 0
+        report.head_garbage_bytes = self.head.parser.garbage_bytes
+        report.tracker_garbage_bytes = self.tracker.parser.garbage_bytes if self.tracker else 0
         report.overrun_bytes = sum(line.stream.overrun_bytes for line in self._lines)
-        if self.recording and self._tracker is not None and report.last_ns - self._pose_ns > _HIDDEN_NS:
+        if self.recording and self.tracker is not None and report.last_ns - self._pose_ns > _HIDDEN_NS:
             self._unseen(report.unseen or "nothing is sent", self._heard_ns)
-        self._observer.told(report)
+        self.observer.told(report)
 
     def _hush(self) -> None:
         """Send stop commands to the devices that are still there."""

@@ -80,7 +80,7 @@ def test_ports_are_listed(run_cli):
 
 def test_a_head_is_found_by_asking(run_cli):
     with serving(EmulatedHead(short_scan(0.3)), PtyLink()) as emulator:
-        done = run_cli("devices", "--probe", emulator._link.url)
+        done = run_cli("devices", "--probe", emulator.link.url)
     assert done.returncode == 0, done.stderr
     assert "scan head 'emulated', 16 x 26 taxels, 200 Hz" in done.stdout
 
@@ -89,7 +89,7 @@ def test_a_head_is_found_by_asking(run_cli):
 @pytest.mark.parametrize("protocol", ["fastrak", "liberty", "bird"])
 def test_a_tracker_is_found_by_asking(run_cli, protocol):
     with serving(EmulatedTracker(short_scan(0.3).poses, protocol=protocol), PtyLink()) as emulator:
-        done = run_cli("devices", "--probe", emulator._link.url)
+        done = run_cli("devices", "--probe", emulator.link.url)
     assert done.returncode == 0, done.stderr
     assert f"--tracker-protocol {protocol}" in done.stdout
 
@@ -97,7 +97,7 @@ def test_a_tracker_is_found_by_asking(run_cli, protocol):
 @pytest.mark.long
 def test_a_pivot_is_measured_on_the_tracker_itself(run_cli):
     with serving(EmulatedTracker(pivoting(), protocol="bird"), PtyLink()) as emulator:
-        words = ["--pivot", emulator._link.url, "--tracker-protocol", "bird", "--duration", 0.5]
+        words = ["--pivot", emulator.link.url, "--tracker-protocol", "bird", "--duration", 0.5]
         done = run_cli("devices", *words)
     assert done.returncode == 0, done.stderr
     assert "record as it is" in done.stdout

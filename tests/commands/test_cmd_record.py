@@ -364,8 +364,8 @@ def test_a_port_that_cannot_be_opened_is_told_in_the_systems_words(record, url, 
 
 def test_a_port_in_use_is_refused(record, scan):
     with serving(EmulatedHead(scan), PtyLink()) as emulator:
-        other = Port(emulator._link.url, baud=9600, role="head")
-        done = record("--head", emulator._link.url)
+        other = Port(emulator.link.url, baud=9600, role="head")
+        done = record("--head", emulator.link.url)
         other.close()
     assert done.returncode == 4
     assert "cannot be opened" in done.stderr
@@ -375,7 +375,7 @@ def test_a_port_in_use_is_refused(record, scan):
 def test_another_device_on_the_port_is_told_by_what_it_says(record, scan, monkeypatch):
     monkeypatch.setattr("tactile_bayes.hardware.serial_trackers.ANSWER_S", 0.3)
     with serving(EmulatedTracker(scan.poses, protocol="bird"), PtyLink()) as emulator:
-        done = record("--head", emulator._link.url)
+        done = record("--head", emulator.link.url)
     assert done.returncode == 4
     assert "a HELLO packet was expected, " in done.stderr
     assert done.stderr.count("\n") == 1

@@ -137,7 +137,7 @@ def test_the_command_writes_what_record_attaches(run_cli, tmp_path, steps):
     like = tmp_path / "like.mcap"
     write_scan(like, short_scan(), provenance=Provenance("test", {}))
     with serving(EmulatedHead(short_scan(0.3)), PtyLink()) as emulator:
-        words = ["--head", emulator._link.url, "--like", like, "--array-calibration", "array.json"]
+        words = ["--head", emulator.link.url, "--like", like, "--array-calibration", "array.json"]
         done = run_cli("record", "-o", "a.mcap", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     recorded = read_scan(tmp_path / "a.mcap")
@@ -157,7 +157,7 @@ def test_record_refuses_a_calibration_that_is_stale_or_another_heads(run_cli, tm
     document = json.loads((tmp_path / "array.json").read_text()) | change
     (tmp_path / "array.json").write_text(json.dumps(document))
     with serving(EmulatedHead(short_scan(0.3)), PtyLink()) as emulator:
-        given = ["--head", emulator._link.url, "--like", steps[0], "--array-calibration", "array.json"]
+        given = ["--head", emulator.link.url, "--like", steps[0], "--array-calibration", "array.json"]
         refused = run_cli("record", "-o", "a.mcap", *given, cwd=tmp_path)
         taken = run_cli("record", "-o", "b.mcap", *given, "--accept-calibration", cwd=tmp_path)
     assert refused.returncode == 2

@@ -55,7 +55,7 @@ def is_last(pose: PoseReading) -> bool:
 @pytest.mark.parametrize("link_of", [PtyLink, lambda: TcpLink("127.0.0.1", 0)], ids=["pty", "tcp"])
 def test_a_head_that_has_sent_everything_can_be_started_again(link_of):
     with serving(EmulatedHead(SCAN), link_of()) as emulator:
-        port = Port(emulator._link.url, baud=9600, role="head")
+        port = Port(emulator.link.url, baud=9600, role="head")
         for _ in range(3):
             port.write(START)
             found = read_until(port, HeadParser(), ended)
@@ -67,7 +67,7 @@ def test_a_head_that_has_sent_everything_can_be_started_again(link_of):
 def test_a_tracker_plays_from_each_start(protocol):
     driver, number = TRACKERS[protocol], len(SCAN.poses)
     with serving(EmulatedTracker(SCAN.poses, protocol=protocol), PtyLink()) as emulator:
-        port = Port(emulator._link.url, baud=9600, role="tracker")
+        port = Port(emulator.link.url, baud=9600, role="tracker")
         for _ in range(2):
             port.write(driver.start)
             # the first play's END may still be in the line when the second starts
@@ -81,7 +81,7 @@ def test_a_tracker_plays_from_each_start(protocol):
 def test_a_server_plays_for_each_host_that_connects():
     with serving(EmulatedTracker(SCAN.poses, protocol="igtlink"), TcpLink("127.0.0.1", 0)) as emulator:
         for _ in range(2):
-            port = Port(emulator._link.url, baud=9600, role="tracker")
+            port = Port(emulator.link.url, baud=9600, role="tracker")
             # opening a port throws away what has come by then
             found = read_until(port, TRACKERS["igtlink"].parser(), lambda found: found and is_last(found[-1]))
             assert len(found) > 1
@@ -116,7 +116,7 @@ def test_a_tracker_waits_for_the_head_with_its_first_pose(monkeypatch):
         serving(EmulatedHead(SCAN), PtyLink(), stage=stage) as leader,
         serving(tracker, PtyLink(), stage=stage, leads=False) as follower,
     ):
-        poses, frames = (Port(one._link.url, baud=9600, role="x") for one in (follower, leader))
+        poses, frames = (Port(one.link.url, baud=9600, role="x") for one in (follower, leader))
         poses.write(driver.start)
         parser = driver.parser()
         held = read_until(poses, parser, lambda found: len(found) >= 5)

@@ -231,7 +231,7 @@ def test_a_tracker_on_the_heads_port_is_told(tmp_path, run_cli):
     write_scan(tmp_path / "scan.mcap", short_scan(0.1), provenance=Provenance("test", {}))
     tracker = EmulatedTracker(short_scan(0.1).poses, protocol="open")
     with serving(tracker, PtyLink()) as emulator:
-        url = emulator._link.url
+        url = emulator.link.url
         done = run_cli("record", "-o", "a.mcap", "--head", url, "--like", "scan.mcap", cwd=tmp_path)
     assert done.returncode == 4
     assert done.stderr == f"error: head {url}: 'emulated tracker' is a device without taxels; give a head's port\n"

@@ -330,7 +330,7 @@ def test_a_name_may_leave_out_the_frame_but_not_part_of_the_name():
 def test_a_flock_in_group_mode_is_noticed_by_what_it_sends():
     poses = short_scan(0.2).poses
     with serving(EmulatedTracker(poses, protocol="bird"), PtyLink()) as emulator:
-        port = open_tracker("bird", emulator._link.url)
+        port = open_tracker("bird", emulator.link.url)
         answer = TRACKERS["bird"].check(port)
         assert answer.tools == {"": ""}
         assert answer.parser().record_bytes == BirdParser().record_bytes
@@ -340,7 +340,7 @@ def test_a_flock_in_group_mode_is_noticed_by_what_it_sends():
 @pytest.mark.long
 def test_records_of_another_tracker_are_named():
     with serving(EmulatedTracker(short_scan(0.5).poses, protocol="liberty"), PtyLink()) as emulator:
-        port = Port(emulator._link.url, baud=115_200, role="tracker")
+        port = Port(emulator.link.url, baud=115_200, role="tracker")
         port.write(b"C\r")
         with pytest.raises(DeviceError, match=r"records of a Polhemus LIBERTY .*give --tracker-protocol liberty"):
             replace(TRACKERS["fastrak"], stop=b"", configure=(), single=b"").check(port)
@@ -373,7 +373,7 @@ def test_a_server_that_sends_only_on_request_is_asked():
 
 def test_a_reference_alone_is_no_tool():
     with serving(EmulatedTracker(short_scan(0.5).poses, protocol="fastrak"), PtyLink()) as emulator:
-        port = open_tracker("fastrak", emulator._link.url)
+        port = open_tracker("fastrak", emulator.link.url)
         with pytest.raises(UsageError, match=r"sends only the reference, '1'; is the tool on the head in sight\?"):
             TRACKERS["fastrak"].check(port, reference="1")
         port.close()
@@ -556,7 +556,7 @@ def test_a_tracker_that_floods_costs_no_frame(tmp_path, monkeypatch):
     monkeypatch.setattr(head, "start", lambda start=head.start: (start(), recording.set()))
     monkeypatch.setattr("tactile_bayes.hardware.recorder.OVERTIME_S", 60.0)  # a busy computer may lag behind the head
     with serving(head, PtyLink()) as emulator, contextlib.suppress(DeviceError):
-        tb.record(tmp_path / "a.mcap", head=emulator._link.url, **given)
+        tb.record(tmp_path / "a.mcap", head=emulator.link.url, **given)
     listener.close()
     found = describe(tmp_path / "a.mcap")
     assert (found["frames_missing"], found["complete"]) == (0, True)

@@ -30,7 +30,7 @@ def serving(
 ) -> Iterator[Emulator]:
     """Serve a device until the block ends; the emulator's link says where."""
     rng = np.random.default_rng(1)
-    emulator = Emulator(device, link, faults=faults or Faults(), rng=rng, stage=stage, leads=leads)
+    emulator = Emulator(device, link, faults=faults or Faults(), rng=rng, stage=stage or Stage(), leads=leads)
     thread = threading.Thread(target=emulator.run, daemon=True)
     thread.start()
     try:
