@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import pairwise
 from typing import Final
 
@@ -166,27 +165,15 @@ def taxel_compliance(layers: Layers, *, rows: int, columns: int, pitch_mm: float
     by_offset = np.einsum("rcij,ij->rc", half_space, share)
     r = np.linspace(0.0, np.hypot(dx[-1] + 2 * pitch_mm, dy[-1] + 2 * pitch_mm), 400)
     smooth = CubicSpline(r, layering_compliance(r, layers), bc_type=("clamped", "not-a-knot"))
-    by_offset += pitch_mm**2 * _mean_over_two_squares(smooth, dx, dy, pitch_mm)
+    # The difference of two points of a square has a triangular density along each axis; three Gauss points are exact
+    # for its first five moments: of 1 - |s| on (-1, 1) they are 0 and +-sqrt(2/5), from its moments 1, 1/6 and 1/15.
+    apart, weight = pitch_mm * np.sqrt(0.4) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 14.0, 5.0]) / 24.0
+    between = smooth(np.hypot(dx[:, None, None, None] + apart[:, None], dy[None, :, None, None] + apart[None, :]))
+    by_offset += pitch_mm**2 * np.einsum("rcij,i,j->rc", between, weight, weight)
     row, column = np.divmod(np.arange(rows * columns), columns)
     return np.asarray(
         by_offset[np.abs(row[:, None] - row[None, :]), np.abs(column[:, None] - column[None, :])], dtype=np.float64
     )
-
-
-def _mean_over_two_squares(
-    function: Callable[[FloatArray], FloatArray], dx: FloatArray, dy: FloatArray, side: float
-) -> FloatArray:
-    """(rows, columns) mean of a smooth function of distance over a load square and a displacement square.
-
-    The difference of two points of a square has a triangular density along each axis; three Gauss points are exact
-    for its first five moments.
-    """
-    # Gauss rule of the density 1 - |s| on (-1, 1): nodes 0 and +-sqrt(2/5), from its moments 1, 1/6 and 1/15.
-    node = side * np.sqrt(0.4) * np.array([-1.0, 0.0, 1.0])
-    weight = np.array([5.0, 14.0, 5.0]) / 24.0
-    x = dx[:, None, None, None] + node[:, None]
-    y = dy[None, :, None, None] + node[None, :]
-    return np.asarray(np.einsum("rcij,i,j->rc", function(np.hypot(x, y)), weight, weight))
 
 
 # --- Change of the skin's compliance by a spheroidal lump in a layered body: finite elements in Fourier modes.
@@ -268,18 +255,10 @@ def element_stiffness(mesh: Mesh, *, nu: float) -> FloatArray:
     Unknowns are (u_r, u_theta, u_z) of each of the nine nodes.
     """
     gradient, point, area = quadrature(mesh.nodes[mesh.elements])
-    strain = _strains(lagrange_points()[0], gradient, point[..., 0])
-    # K = (A + m B)^T (A + m B)
-    a, b = stiffness_factor(strain, point, area * point[..., 0], normal=3, poisson=nu)
-    cross = a.transpose(0, 2, 1) @ b
-    return np.stack([a.transpose(0, 2, 1) @ a, cross + cross.transpose(0, 2, 1), b.transpose(0, 2, 1) @ b])
-
-
-def _strains(shape: FloatArray, gradient: FloatArray, r_mm: FloatArray) -> FloatArray:
-    """(2, e, 9, 6, 27) strains (rr, tt, zz, rz, rt, zt) of unit unknowns: the part without m, and the factor of m."""
-    strain = np.zeros((2, *r_mm.shape, 6, 9, 3))
+    r = point[..., 0]
+    strain = np.zeros((2, *r.shape, 6, 9, 3))  # rr, tt, zz, rz, rt, zt: the part without m, and the factor of m
     plain, order = strain
-    over_r = shape / r_mm[..., None]
+    over_r = lagrange_points()[0] / r[..., None]
     plain[..., 0, :, 0] = gradient[..., 0]
     plain[..., 1, :, 0] = over_r
     order[..., 1, :, 1] = over_r
@@ -290,7 +269,10 @@ def _strains(shape: FloatArray, gradient: FloatArray, r_mm: FloatArray) -> Float
     plain[..., 4, :, 1] = gradient[..., 0] - over_r
     plain[..., 5, :, 1] = gradient[..., 1]
     order[..., 5, :, 2] = -over_r
-    return strain.reshape(2, *r_mm.shape, 6, 27)
+    # K = (A + m B)^T (A + m B)
+    a, b = stiffness_factor(strain.reshape(2, *r.shape, 6, 27), point, area * r, normal=3, poisson=nu)
+    cross = a.transpose(0, 2, 1) @ b
+    return np.stack([a.transpose(0, 2, 1) @ a, cross + cross.transpose(0, 2, 1), b.transpose(0, 2, 1) @ b])
 
 
 def order_unknowns(mesh: Mesh, order: int) -> tuple[IndexArray, FloatArray]:

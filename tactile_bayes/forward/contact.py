@@ -195,8 +195,25 @@ def solve_contact(
     start = touching is not None and (touching & (share > 0)).any()
     now = touching.copy() if start and touching is not None else np.ones(count, dtype=bool)
     fewest, patience = count + 1, _PATIENCE
+
+    def solved(touching: BoolArray) -> tuple[Contact, BoolArray]:
+        """The contact of exactly the `touching` squares, and where pressure or gap has the wrong sign."""
+        off = np.flatnonzero(~touching)
+        # one column for a unit of depth, one for the head's shape
+        pressure, gap = np.stack([level, -shaped], axis=-1), np.zeros((count, 2))
+        if len(off):
+            columns = stiffness.columns(off)
+            gap[off] = -np.linalg.solve(columns[off], pressure[off])
+            pressure = pressure + columns @ gap[off]
+            pressure[off] = 0.0
+        by_depth, by_shape = share @ pressure
+        depth = (mean_kpa - by_shape) / by_depth
+        kpa, mm = (depth * both[:, 0] + both[:, 1] for both in (pressure, gap))
+        wrong = np.where(touching, kpa < -_TOLERANCE * mean_kpa, mm < -_TOLERANCE * max(abs(depth), 1e-300))
+        return Contact(kpa, mm, float(depth), touching), wrong
+
     for _ in range(_MOST_STEPS):
-        contact, wrong = _solve(stiffness, level, shaped, now, share=share, mean_kpa=mean_kpa)
+        contact, wrong = solved(now)
         bad = int(np.count_nonzero(wrong))
         if bad == 0:
             return contact
@@ -215,30 +232,3 @@ def solve_contact(
     raise NotConvergedError(
         "the contact between head and skin did not converge", diagnostics={"wrong_signs": float(fewest)}
     )
-
-
-def _solve(
-    stiffness: ContactStiffness,
-    level: FloatArray,
-    shaped: FloatArray,
-    touching: BoolArray,
-    *,
-    share: FloatArray,
-    mean_kpa: float,
-) -> tuple[Contact, BoolArray]:
-    """Solve the contact for exactly the `touching` squares, and find where pressure or gap has the wrong sign."""
-    off = np.flatnonzero(~touching)
-    # one column for a unit of depth, one for the head's shape
-    pressure = np.stack([level, -shaped], axis=-1)
-    gap = np.zeros((len(level), 2))
-    if len(off):
-        columns = stiffness.columns(off)
-        gap[off] = -np.linalg.solve(columns[off], pressure[off])
-        pressure = pressure + columns @ gap[off]
-        pressure[off] = 0.0
-    by_depth, by_shape = share @ pressure
-    depth = (mean_kpa - by_shape) / by_depth
-    kpa = depth * pressure[:, 0] + pressure[:, 1]
-    mm = depth * gap[:, 0] + gap[:, 1]
-    wrong = np.where(touching, kpa < -_TOLERANCE * mean_kpa, mm < -_TOLERANCE * max(abs(depth), 1e-300))
-    return Contact(kpa, mm, float(depth), touching), wrong

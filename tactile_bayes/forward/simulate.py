@@ -468,26 +468,20 @@ class SolidHead(Record, eq=False):
         ``p_plane = rotation @ p_scanhead + (*at_mm[:2], contact.depth_mm)``: z = 0 is the undisturbed skin. The head
         keeps its rotation; only the depth adapts. `touching` is where to start: that of a neighbouring frame's contact.
         """
-        place = self.face.surface_mm.reshape(-1, 3) @ rotation.T
-        stiffness = self.plain
-        parts = [self._vectors(lump, place[:, 0] + at_mm[0], place[:, 1] + at_mm[1]) for lump in lumps]
-        vectors = np.concatenate([np.zeros((len(place), 0)), *[vector for vector, _ in parts]], axis=1)
-        if vectors.shape[1]:
-            stiffness = stiffness.changed(vectors, np.concatenate([sign for _, sign in parts]))
-        contact = solve_contact(
-            stiffness, -place[:, 2], mean_kpa=mean_kpa, counted=self.face.sensing.ravel(), touching=touching
-        )
-        sensing = self.face.sensing
+        place, sensing = self.face.surface_mm.reshape(-1, 3) @ rotation.T, self.face.sensing
+        parts, signs = [np.zeros((len(place), 0))], []
+        for lump in lumps:
+            values, sign = lump.vectors(place[:, 0] + at_mm[0], place[:, 1] + at_mm[1])
+            values = values * self.face.pitch_mm  # a pressure of 1 kPa on a square is a force of pitch^2
+            weight = np.einsum("nk,nk->k", values, values)
+            kept = weight > _LEAST_WEIGHT * float(np.diag(self.plain.plain).mean()) ** -1
+            parts.append(values[:, kept])
+            signs.append(sign[kept])
+        vectors = np.concatenate(parts, axis=1)
+        stiffness = self.plain.changed(vectors, np.concatenate(signs)) if vectors.shape[1] else self.plain
+        contact = solve_contact(stiffness, -place[:, 2], mean_kpa=mean_kpa, counted=sensing.ravel(), touching=touching)
         shape = int(sensing.any(axis=1).sum()), -1
         return contact.pressure_kpa[sensing.ravel()].reshape(shape), contact
-
-    def _vectors(self, lump: SkinPerturbation, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Change by one lump under the face, per unit pressure on a square; negligible parts are dropped."""
-        values, signs = lump.vectors(x_mm, y_mm)
-        values = values * self.face.pitch_mm  # a pressure of 1 kPa on a square is a force of pitch^2
-        weight = np.einsum("nk,nk->k", values, values)
-        kept = weight > _LEAST_WEIGHT * float(np.diag(self.plain.plain).mean()) ** -1
-        return values[:, kept], signs[kept]
 
 
 def solid_head(head: Head, layers: Layers) -> SolidHead:
