@@ -128,8 +128,7 @@ def _graded_line(start: float, stop: float, *, first: float, grade: float, least
 
 _BOX = 0.75  #: Half width of the box about the lump, and how far it reaches above and below the centre, in diameters.
 _LEAST_ABOVE = 0.35  #: A box whose top would leave less than this many diameters of rows above it goes to the skin.
-# Beyond the outermost head position (72 mm) the body goes on for this many thicknesses.
-_BEYOND = 3.0
+_BEYOND = 3.0  #: Beyond the outermost head position (72 mm) the body goes on for this many thicknesses.
 REACH_MM = 72.0
 # Elements per unit of fineness: along the arc below the skin (where the bump's shape is made), from there down to the
 # fat-gland boundary, on either part below it, and along the rays outside and inside the lump.
@@ -207,8 +206,7 @@ class LumpGeometry(Record):
     """A spheroid on the vertical axis of a body of two layers on a rigid base."""
 
     radius_mm: float
-    half_height_mm: float
-    """`radius_mm`, `half_height_mm`: Half axes of the spheroid, across and along the vertical."""
+    half_height_mm: float  #: `radius_mm`, `half_height_mm`: Half axes of the spheroid, across and along the vertical.
     depth_mm: float  #: Of its centre below the skin.
     layers: Layers  #: The body without it.
 
@@ -236,8 +234,7 @@ class MeshSize(Record):
 
     arc: int = 18  #: Elements along the half circle of the lump.
     rings: int = 6
-    core: int = 3
-    """`rings`, `core`: Rings of elements outside and inside it."""
+    core: int = 3  #: `rings`, `core`: Rings of elements outside and inside it.
     grade: float = 1.45  #: Ratio of neighbouring elements beyond the box.
     reach_mm: float = 300.0  #: Least radius of the mesh.
 

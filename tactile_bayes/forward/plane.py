@@ -130,8 +130,7 @@ class SurfaceCompliance(Record, eq=False):
     edges_mm: FloatArray  #: (n + 1,) array, symmetric about the lump's axis.
     row: FloatArray  #: (n,) array: first row of the (Toeplitz) matrix of the body without the lump, mm per kPa.
     even: CondensedHole
-    odd: CondensedHole
-    """`even`, `odd`: The body on x > 0, for loads symmetric and antisymmetric in x."""
+    odd: CondensedHole  #: `even`, `odd`: The body on x > 0, for loads symmetric and antisymmetric in x.
 
     @property
     def cell_mm(self) -> float:
@@ -383,8 +382,7 @@ class EmpiricalModel(Record):
     """`peak_kpa`, `curvature_per_mm2`: :math:`P_o(t)` and :math:`1/a(t)^2` of the homogeneous profile (Eq 1): positive
     for a profile that falls off to the sides, negative for one that rises."""
     height_kpa: float
-    width_mm: float
-    """`height_kpa`, `width_mm`: g and sigma of Eq 2."""
+    width_mm: float  #: `height_kpa`, `width_mm`: g and sigma of Eq 2.
     d_mm: float  #: Diameter of the lump.
     half_width_mm: float  #: Of the head.
 

@@ -344,8 +344,7 @@ class SkinPerturbation(Record, eq=False):
     order: NDArray[np.int64]  #: (k,) array: angular order of each.
     sign: FloatArray  #: (k,) array: -1 where the lump stiffens.
     x_mm: float = 0.0
-    y_mm: float = 0.0
-    """`x_mm`, `y_mm`: Place of the lump's axis in the scene's `plane`."""
+    y_mm: float = 0.0  #: `x_mm`, `y_mm`: Place of the lump's axis in the scene's `plane`.
 
     def vectors(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(n, c) values at points of the plane, and (c,) signs: the change is ``values diag(signs) values^T``.
@@ -529,7 +528,6 @@ def condensed_lump(lump: SolidLump, layers: Layers) -> CondensedLump:
     return _condensed(mesh.LumpGeometry(lump.d_mm / 2, lump.vertical_mm / 2, lump.depth_mm, layers))
 
 
-# Exams of one body, and lumps of one size and depth in it, share these; a scene has few.
-_BODIES_KEPT = 8
+_BODIES_KEPT = 8  #: Exams of one body, and lumps of one size and depth in it, share these; a scene has few.
 _condensed = lru_cache(maxsize=_BODIES_KEPT)(condense_lump)
 _head = lru_cache(maxsize=_BODIES_KEPT)(solid_head)

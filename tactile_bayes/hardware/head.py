@@ -295,8 +295,7 @@ class ArrayFit(Record, eq=False):
     tells how far the straight line is from enough.
     """
     dead: tuple[tuple[int, int], ...]
-    hot: tuple[tuple[int, int], ...]
-    """`dead`, `hot`: (row, column) of taxels that hardly answer, or far too much."""
+    hot: tuple[tuple[int, int], ...]  #: `dead`, `hot`: (row, column) of taxels that hardly answer, or far too much.
     nonuniformity: FloatArray
     """(steps,) array: SD of the calibrated pressure over the good taxels, as a share of the step's (NaN at 0)."""
     curved_nonuniformity: FloatArray  #: (steps,) array: The same with the parabolas.
@@ -392,8 +391,7 @@ class RotationSense(Record):
     """Fit of a fixed point under each sense of rotation, and the angle that the sensor was turned by."""
 
     as_given_mm: float
-    inverted_mm: float
-    """`as_given_mm`, `inverted_mm`: Root mean square distance of the point from its mean."""
+    inverted_mm: float  #: `as_given_mm`, `inverted_mm`: Root mean square distance of the point from its mean.
     turn_deg: float  #: Largest rotation between two poses.
 
     def __str__(self) -> str:

@@ -29,8 +29,7 @@ from tactile_bayes.hardware import reading
 # A `DeviceError` from here is one line: which port, what was expected, what came, what to try.
 
 ANSWER_S = 2.5  #: How long a device may take to answer.
-# Without a byte for so long a device has gone.
-SILENT_S: Final = 3.0
+SILENT_S: Final = 3.0  #: Without a byte for so long a device has gone.
 _SHOWN_BYTES: Final = 12
 _SOCKET_BYTES: Final = 65536
 _MOST_DRAINED: Final = 4096
@@ -185,8 +184,7 @@ def shown(data: bytes) -> str:
 
 # --- The system's serial ports, and a guess at the devices on them.
 
-# USB vendors, by what they make.
-_TRACKER_MAKERS: Final = {0x0F44: "Polhemus"}
+_TRACKER_MAKERS: Final = {0x0F44: "Polhemus"}  #: USB vendors, by what they make.
 _CONTROLLERS: Final = {
     0x2341: "Arduino",
     0x16C0: "Teensy",

@@ -125,8 +125,7 @@ def printable(data: bytes) -> str:
 
 # Between a tool's pose and the reference's; a patient breathes 1 mm in this time at most.
 REFERENCE_NS: Final = 50_000_000
-# Words that are told apart, of tools and of reasons; a device may make up more.
-_MOST_WORDS: Final = 16
+_MOST_WORDS: Final = 16  #: Words that are told apart, of tools and of reasons; a device may make up more.
 ToolReading = PoseReading | MissingReading
 
 
@@ -226,8 +225,7 @@ _S: Final = 1_000_000_000
 LATEST_NS: Final = 1 << 62
 AHEAD_NS: Final = 2 * _S  #: A record cannot be measured this much later than it arrives: its clock has stepped forward.
 _SLIP_NS: Final = _S // 4  #: How well a wrap must agree with the time that passed on this computer.
-# After so many steps a clock is not believed any more.
-MOST_STEPS: Final = 20
+MOST_STEPS: Final = 20  #: After so many steps a clock is not believed any more.
 STILL_NS: Final = _S // 10
 # Counters that start again: 2^16 ms, 2^31 and 2^32 of ns, us and ms, 2^24 us, and clocks of a minute to a day.
 WRAPS_NS: Final = tuple(

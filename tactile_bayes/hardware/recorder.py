@@ -45,8 +45,7 @@ class Report:
     poses_missing: int = 0
     unseen: str = ""  #: Why there is no pose just now; empty while there are.
     missing_why: str = ""
-    flagged_why: str = ""
-    """`missing_why`, `flagged_why`: The tracker's reasons, each with its number."""
+    flagged_why: str = ""  #: `missing_why`, `flagged_why`: The tracker's reasons, each with its number.
     other_tools: str = ""  #: Tools that were not followed, each with the number of its records.
     tracker_remark: str = ""
     poses_without_time: int = 0

@@ -221,8 +221,7 @@ def encoded(protocol: str, pose: ToolReading, number: int) -> bytes:
 
 _BETWEEN_COMMANDS_S: Final = 0.02
 _ASK_AGAIN_S: Final = 0.5
-# After the first record, for those of other tools.
-_LISTEN_S: Final = 0.25
+_LISTEN_S: Final = 0.25  #: After the first record, for those of other tools.
 _MOST_TOOLS: Final = 64
 _MOST_KEPT: Final = 65536
 # A board may restart when its port is opened: so long it is waited for, and so long while it says things.
@@ -271,8 +270,7 @@ class TrackerDriver(Record):
     configure: tuple[bytes, ...] = ()  #: Commands that set records and units, sent one by one.
     single: bytes = b""
     start: bytes = b""
-    stop: bytes = b""
-    """`single`, `start`, `stop`: Commands for one record, for a stream of them, and for its end."""
+    stop: bytes = b""  #: `single`, `start`, `stop`: Commands for one record, for a stream of them, and for its end.
     late: bytes = b""  #: What to ask for where nothing comes by itself.
     several: tuple[bytes, ...] = ()  #: Commands after which records say whose they are, where a tool is named.
     other_parser: Callable[[], Parser] | None = None  #: Of records in the other form that the device may be set to.

@@ -28,8 +28,7 @@ from tactile_bayes.mapping.places import orientation_of
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA
 
 _PAGE: Final = Path(__file__).with_name("live_page.html")
-# How long a page may take to ask, and to say goodbye: the view's process waits for all of them.
-OPEN_S: Final = 4.0
+OPEN_S: Final = 4.0  #: How long a page may take to ask, and to say goodbye: the view's process waits for all of them.
 CLOSE_S: Final = 0.5
 MOST_OPEN: Final = 24  #: Connections at a time; nobody has as many pages open.
 WAIT_S: Final = 0.1

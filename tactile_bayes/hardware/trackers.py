@@ -302,20 +302,17 @@ def encode_transform(pose: ToolReading) -> bytes:
 # new frame and speaks the open framing to this program, so that to everybody else it is a tracker like any other.
 # The library holds the interpreter while it waits for the line, which is one more reason for a process.
 
-# The module that the package ``ndicapi`` installs.
-MODULE: Final = "ndicapy"
+MODULE: Final = "ndicapy"  #: The module that the package ``ndicapi`` installs.
 NETWORK_PORT: Final = 8765
 # From the start of the process: a reset, the change of the line rate and a tool's description take seconds.
 READY_S: Final = 30.0
 _ASK_EVERY_S: Final = 0.002
 _LOOK_S: Final = 0.01
-# A reply may be spoilt on the line; so many in a row are a tracker that has gone.
-_PATIENCE: Final = 5
+_PATIENCE: Final = 5  #: A reply may be spoilt on the line; so many in a row are a tracker that has gone.
 _WIRELESS: Final = "PHRQ:*********1****"
 _TRANSFORMS: Final = 0x0001  # without 0x0800: a tool outside the volume that was characterised is missing
 _PART_NUMBER: Final = 0x0004
-# Of a port's status.
-_OUT_OF_VOLUME: Final = 0x40
+_OUT_OF_VOLUME: Final = 0x40  #: Of a port's status.
 _PARTLY_OUT: Final = 0x80
 
 

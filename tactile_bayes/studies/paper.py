@@ -143,8 +143,7 @@ class LineFit(Record):
     """The fit of Eq 5 to a line."""
 
     amplitude: float
-    sigma_mm: float
-    """`amplitude`, `sigma_mm`: a and sigma of Eq 5."""
+    sigma_mm: float  #: `amplitude`, `sigma_mm`: a and sigma of Eq 5.
     rms: float  #: Root mean square of what the Gaussian leaves, in units of the background.
     resolved: bool = True  #: True when the width lies within what the fit looks at, and not at an end of it.
 
@@ -231,11 +230,9 @@ class PrintedEq6(Record):
     """Eq 6 learned in two stages as in the paper, without uncertainty."""
 
     m: float
-    b_mm: float
-    """`m`, `b_mm`: Line of d on sigma at one diameter depth."""
+    b_mm: float  #: `m`, `b_mm`: Line of d on sigma at one diameter depth.
     e: float
-    f: float
-    """`e`, `f`: Power law of the width change on the amplitude."""
+    f: float  #: `e`, `f`: Power law of the width change on the amplitude.
     cases: int  #: Hard, detectable cases that e and f were learned from.
 
 

@@ -80,22 +80,19 @@ class ExamPrior(_Ranges):
     """Ranges of an examiner's technique and of the instrument's errors, drawn anew for each scan."""
 
     mean_kpa: tuple[Pressure, Pressure] = (7.0, 12.0)  #: Mean pressure of a scan, kPa.
-    drift_kpa: tuple[To10, To10] = (0.2, 1.5)
-    """Amplitude of its drift, kPa; below the lowest mean_kpa."""
+    drift_kpa: tuple[To10, To10] = (0.2, 1.5)  #: Amplitude of its drift, kPa; below the lowest mean_kpa.
     yaw_deg: tuple[Yaw, Yaw] = (-30.0, 30.0)  #: Turn of the head about the normal, degrees.
     tilt_deg: tuple[Tilt, Tilt] = (0.5, 4.0)  #: Amplitude of its rocking, degrees.
     wander_mm: tuple[To10, To10] = (0.2, 1.5)  #: Departure from the line, mm.
     lines: tuple[Lines, Lines] = (4, 7)  #: Parallel lines.
     spacing_mm: tuple[Length, Length] = (4.0, 7.0)  #: Distance between them, mm.
-    half_length_mm: tuple[Length, Length] = (28.0, 38.0)
-    """Reach of a line either side of the middle, mm."""
+    half_length_mm: tuple[Length, Length] = (28.0, 38.0)  #: Reach of a line either side of the middle, mm.
     off_centre_mm: tuple[Shift, Shift] = (-6.0, 6.0)  #: Distance of the strokes' middle from the lump, each way, mm.
     line_s: tuple[Seconds, Seconds] = (1.0, 1.8)  #: Time for a line, s.
     element_kpa: tuple[To10, To10] = (0.02, 0.3)  #: SD of a reading, kPa.
     tracker_mm: tuple[To10, To10] = (0.05, 0.6)  #: SD of the tracker's position, mm.
     tracker_deg: tuple[To10, To10] = (0.02, 0.3)  #: SD of its attitude, degrees.
-    gain_share: tuple[Share, Share] = (0.002, 0.02)
-    """Error of the array's calibration, as a share of the gain."""
+    gain_share: tuple[Share, Share] = (0.002, 0.02)  #: Error of the array's calibration, as a share of the gain.
     latency_ms: tuple[Latency, Latency] = (0.0, 12.0)  #: By how much the stamp of a pose is late, ms.
 
     def __post_init__(self) -> None:

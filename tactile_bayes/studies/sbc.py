@@ -177,8 +177,7 @@ class Truth(Record):
     sigma_x_mm: float
     sigma_y_mm: float
     x_mm: float
-    y_mm: float
-    """`amplitude`, `sigma_x_mm`, `sigma_y_mm`, `x_mm`, `y_mm`: Of the bump."""
+    y_mm: float  #: `amplitude`, `sigma_x_mm`, `sigma_y_mm`, `x_mm`, `y_mm`: Of the bump.
     length_mm: float
     share: float
     """`length_mm`, `share`: Of the noise field: correlation length, and its variance over the mean independent variance
