@@ -21,8 +21,18 @@ from tactile_bayes.actions.show import describe_scan
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, refuse_recording, write_scan
-from tactile_bayes.hardware.emulated import Device, EmulatedHead, EmulatedNdi, EmulatedTracker, Faults
-from tactile_bayes.hardware.emulator import Emulator, Link, PtyLink, Stage, TcpLink
+from tactile_bayes.hardware.emulated import (
+    Device,
+    EmulatedHead,
+    EmulatedNdi,
+    EmulatedTracker,
+    Emulator,
+    Faults,
+    Link,
+    PtyLink,
+    Stage,
+    TcpLink,
+)
 from tactile_bayes.hardware.head import rotation_sense
 from tactile_bayes.hardware.ports import list_ports
 from tactile_bayes.hardware.reading import ask_for_priority

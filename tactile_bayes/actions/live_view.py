@@ -30,8 +30,16 @@ from tactile_bayes.files.instrument import calibration_document, head_document
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.findings import finding_summary
 from tactile_bayes.geometry import FloatArray, apply, inverse
-from tactile_bayes.hardware.live import Feed, LiveMap, LiveState, colour_limits, fed, grey_levels
-from tactile_bayes.hardware.serve import LiveServer, address_of
+from tactile_bayes.hardware.live import (
+    Feed,
+    LiveMap,
+    LiveServer,
+    LiveState,
+    address_of,
+    colour_limits,
+    fed,
+    grey_levels,
+)
 from tactile_bayes.mapping.map import TactileMap, block_sums
 from tactile_bayes.mapping.places import Orientation, orientation_of
 from tactile_bayes.posterior.bump import candidate_centres

@@ -17,8 +17,7 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.forward.scene import rotation_from_vector
 from tactile_bayes.geometry import quaternion_from_rotation
-from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker
-from tactile_bayes.hardware.emulator import PtyLink
+from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker, PtyLink
 from tactile_bayes.hardware.head import rotation_sense
 from tactile_bayes.hardware.ports import guess
 from tactile_bayes.scans import TrackerPoses

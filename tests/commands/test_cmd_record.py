@@ -26,8 +26,7 @@ from tactile_bayes.cli import cli
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, write_scan
-from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker, Faults
-from tactile_bayes.hardware.emulator import PtyLink
+from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker, Faults, PtyLink
 from tactile_bayes.hardware.ports import Port
 from tactile_bayes.hardware.readings import MM_PER_INCH
 from tactile_bayes.mapping.build import build_map

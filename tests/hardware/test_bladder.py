@@ -14,8 +14,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.instrument import read_array_calibration
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
-from tactile_bayes.hardware.emulated import EmulatedHead
-from tactile_bayes.hardware.emulator import PtyLink
+from tactile_bayes.hardware.emulated import EmulatedHead, PtyLink
 from tactile_bayes.hardware.head import BladderStep, fit_array
 from tactile_bayes.scans import PressureFrames, Scan, TrackerPoses
 

@@ -16,8 +16,7 @@ from test_live import seen_of
 from test_orientation import UPPER_RIGHT, corner, live_state, lump_in_base
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.hardware.live import LiveMap
-from tactile_bayes.hardware.serve import LiveServer, document
+from tactile_bayes.hardware.live import LiveMap, LiveServer, document
 
 pytestmark = [
     pytest.mark.slow,

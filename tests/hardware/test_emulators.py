@@ -18,8 +18,7 @@ from tactile_bayes.actions.devices import _link
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.hardware import head
-from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker, Faults
-from tactile_bayes.hardware.emulator import Emulator, PtyLink, Stage, TcpLink
+from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker, Emulator, Faults, PtyLink, Stage, TcpLink
 from tactile_bayes.hardware.head import HeadParser, encode_command
 from tactile_bayes.hardware.ports import Port
 from tactile_bayes.hardware.readings import EndReading, FrameReading, PoseReading
@@ -109,7 +108,7 @@ def test_once_ends_when_a_slow_host_has_read_the_last_frame(link_of):
 
 
 def test_a_tracker_waits_for_the_head_with_its_first_pose(monkeypatch):
-    monkeypatch.setattr("tactile_bayes.hardware.emulator._SETTLE_S", 0.05)
+    monkeypatch.setattr("tactile_bayes.hardware.emulated._SETTLE_S", 0.05)
     stage, driver = Stage(), TRACKERS["liberty"]
     tracker = EmulatedTracker(SCAN.poses, protocol="liberty")
     with (

@@ -20,11 +20,9 @@ from emulated_devices import head_and_tracker, serving, short_scan
 from tactile_bayes.errors import DeviceError, UsageError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import create_exclusive, read_scan_report, write_scan
-from tactile_bayes.hardware.emulated import EmulatedTracker
-from tactile_bayes.hardware.emulator import PtyLink
-from tactile_bayes.hardware.live import LiveState
+from tactile_bayes.hardware.emulated import EmulatedTracker, PtyLink
+from tactile_bayes.hardware.live import LiveServer, LiveState
 from tactile_bayes.hardware.ports import Port
-from tactile_bayes.hardware.serve import LiveServer
 
 WARM_ESTIMATOR = """
 import multiprocessing, sys, time

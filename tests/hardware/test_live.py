@@ -24,13 +24,15 @@ from tactile_bayes.errors import UsageError
 from tactile_bayes.hardware.live import (
     Feed,
     LiveMap,
+    LiveServer,
     LiveState,
+    address_of,
+    document,
     fed,
     grey_levels,
 )
 from tactile_bayes.hardware.readings import PoseReading
 from tactile_bayes.hardware.recorder import Report
-from tactile_bayes.hardware.serve import LiveServer, address_of, document
 from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.cells import distinct_poses, poses_at
 from tactile_bayes.shell import has_styles

@@ -12,8 +12,7 @@ from emulated_devices import serving, short_scan
 
 from tactile_bayes.errors import DeviceError, UsageError
 from tactile_bayes.hardware import trackers as ndi
-from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedNdi, Faults, crc16
-from tactile_bayes.hardware.emulator import PtyLink, TcpLink
+from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedNdi, Faults, PtyLink, TcpLink, crc16
 from tactile_bayes.hardware.readings import Follower, HelloReading, MissingReading, PoseReading
 from tactile_bayes.hardware.serial_trackers import TRACKERS, open_tracker
 from tactile_bayes.hardware.trackers import NdiTracker

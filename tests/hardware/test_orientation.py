@@ -11,8 +11,7 @@ from mapping_scans import gaussian, make_scan, strokes
 
 from tactile_bayes.actions.live_view import live_text
 from tactile_bayes.declarations import replace
-from tactile_bayes.hardware.live import LiveMap, LiveState
-from tactile_bayes.hardware.serve import document
+from tactile_bayes.hardware.live import LiveMap, LiveState, document
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.mapping.places import orientation_of

@@ -13,8 +13,7 @@ from rfc2217_server import rfc2217
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
-from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker
-from tactile_bayes.hardware.emulator import PtyLink
+from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker, PtyLink
 from tactile_bayes.hardware.serial_trackers import TRACKERS, open_tracker
 
 # pyserial 3.5 starts its thread in an old way.

@@ -27,8 +27,7 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.geometry import rotation_from_quaternion
 from tactile_bayes.hardware import serial_trackers
-from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedNdi, EmulatedTracker, Faults
-from tactile_bayes.hardware.emulator import PtyLink, TcpLink
+from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedNdi, EmulatedTracker, Faults, PtyLink, TcpLink
 from tactile_bayes.hardware.head import HeadParser, encode_hello, encode_pose
 from tactile_bayes.hardware.ports import Port
 from tactile_bayes.hardware.readings import (

@@ -12,8 +12,17 @@ import numpy as np
 
 from tactile_bayes.forward.scene import Lump, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate
-from tactile_bayes.hardware.emulated import Device, EmulatedHead, EmulatedTracker, Faults
-from tactile_bayes.hardware.emulator import Emulator, Link, PtyLink, Stage, TcpLink
+from tactile_bayes.hardware.emulated import (
+    Device,
+    EmulatedHead,
+    EmulatedTracker,
+    Emulator,
+    Faults,
+    Link,
+    PtyLink,
+    Stage,
+    TcpLink,
+)
 from tactile_bayes.scans import Scan
 
 
