@@ -114,7 +114,13 @@ def growth() -> list[dict[str, float]]:
         fit = fit_line(build_line(press(surface, HARD, head_positions())), 48.0)
         dofs = 2 * (len(mesh.nodes) + len(mesh.rim))
         rows.append(
-            {"fineness": fineness, "dofs": dofs, "seconds": spent, "amplitude": fit.amplitude, "sigma_mm": fit.sigma_mm}
+            {
+                "fineness": fineness,
+                "dofs": dofs,
+                "seconds": spent,
+                "amplitude": fit.amplitude,
+                "sigma_mm": fit.widths_mm[0],
+            }
         )
     return rows
 

@@ -170,7 +170,7 @@ def tables_text(
     lines += [f"{'lump':<22}{'a':>13}{'sigma, mm':>14}{'frame %':>11}{'map %':>9}{'strict %':>11}"]
     for one in [*found, *phantoms]:
         amplitudes = f"{one.elastic.amplitude:.3f} {one.empirical.amplitude:.3f}"
-        widths = f"{one.elastic.sigma_mm:.2f} {one.empirical.sigma_mm:.2f}"
+        widths = f"{one.elastic.widths_mm[0]:.2f} {one.empirical.widths_mm[0]:.2f}"
         shares = f"{100 * one.centred_frame:>11.1f}{100 * one.map:>9.1f}{100 * one.map_strict:>11.1f}"
         lines.append(f"{one.scene.name:<22}{amplitudes:>13}{widths:>14}{shares}")
     outside = [one.scene.name for one in [*found, *phantoms] if outside_range(one.scene.d_mm, one.scene.depth_ratio)]

@@ -21,7 +21,7 @@ from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import BumpFit, fit_bump, fitted_candidates
 from tactile_bayes.progress import Progress, untold
 from tactile_bayes.scans import ElementCalibration, PressureFrames, Scan
-from tactile_bayes.studies.paper import HARD_RATIO, PAPER_DIAMETERS_MM, LineFit, StudySettings, centre_line, fit_line
+from tactile_bayes.studies.paper import HARD_RATIO, PAPER_DIAMETERS_MM, MapFit, StudySettings, centre_line, fit_line
 
 # --- Tables 1 and 2 of the paper and the phantoms of its section 2.3: the empirical model against the elastic one.
 #
@@ -95,8 +95,8 @@ class Agreement(Record):
     """`centred_frame`, `all_frames`, `map`, `map_strict`: Mean squared differences: of the frame centred on the lump
     (Table 1), of all frames of the map, of the map within the fit's radius (Table 2), and of the map relative to map -
     1."""
-    elastic: LineFit
-    empirical: LineFit
+    elastic: MapFit
+    empirical: MapFit
     """`elastic`, `empirical`: Eq 5 fitted to both maps."""
     normalised_frame: float  #: As `centred_frame`, of frames divided by their means.
     others: tuple[tuple[float, float, float], ...]

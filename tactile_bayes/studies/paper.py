@@ -39,6 +39,10 @@ class CaseSettings(CaseOptions, kw_only=True):
 
     head: Any = None
 
+    def as_dict(self) -> dict[str, object]:
+        """Plain data for a store's header and for a report."""
+        return as_dict(self)
+
     def body(self, d_mm: float, depth_ratio: float, *, seat: float) -> Body:
         """The body of a case."""
         return Body(d_mm, depth_ratio, seat, self.thickness_mm, self.fat_kpa, self.gland_ratio, self.poisson)
@@ -47,7 +51,7 @@ class CaseSettings(CaseOptions, kw_only=True):
         """From a stiffness ratio of the body's lump to its map; what all ratios share is computed here."""
         raise NotImplementedError
 
-    def fitted(self, made: Any) -> Any:
+    def fitted(self, made: Any) -> MapFit:
         """The Gaussian of a map."""
         raise NotImplementedError
 
@@ -58,15 +62,14 @@ class CaseSettings(CaseOptions, kw_only=True):
     def rows(self, geometry: Geometry) -> list[StudyRow]:
         """The rows of one geometry: the body is condensed once for all stiffnesses of its lump."""
         body = self.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
-        maps, rows = self.maps(body), []
+        case = seat_name(geometry.seat), geometry.d_mm, geometry.depth_ratio
         setting = body.layers.thickness_mm, self.head.radius_mm, self.head.shoulders
+        maps, rows, recipe = self.maps(body), [], {"normalise": "mean", "noise": "independent", **self.recipe()}
         for ratio in geometry.stiffness_ratios:
             found = self.fitted(maps(ratio))
-            case = seat_name(geometry.seat), geometry.d_mm, geometry.depth_ratio, ratio
-            sigma_x, sigma_y = found.widths_mm
-            detectable = bool(found.amplitude >= DETECTABLE and found.resolved)
-            seen = found.amplitude, sigma_x, found.rms, detectable, sigma_y
-            rows.append(StudyRow(*case, *seen, *setting, normalise="mean", noise="independent", **self.recipe()))
+            a, (sigma_x, sigma_y) = found.amplitude, found.widths_mm
+            detectable = bool(a >= DETECTABLE and found.resolved)
+            rows.append(StudyRow(*case, ratio, a, sigma_x, found.rms, detectable, sigma_y, *setting, **recipe))
         return rows
 
 
@@ -79,10 +82,6 @@ class StudySettings(CaseSettings, kw_only=True):
     fit_radius_mm: float = FIT_RADIUS_MM  #: Eq 5 is fitted where abs(x) is at most this.
     cell_mm: float = plane.CELL_MM  #: Of the contact, see `plane.condense`.
 
-    def as_dict(self) -> dict[str, object]:
-        """Plain data for a store's header and for a report."""
-        return as_dict(self)
-
     def recipe(self) -> dict[str, Any]:
         return {"background": "fixed", "fit_radius_mm": self.fit_radius_mm}
 
@@ -90,7 +89,7 @@ class StudySettings(CaseSettings, kw_only=True):
         surface = self.surface(body)
         return lambda ratio: plane.build_line(self.frames(surface, ratio))
 
-    def fitted(self, made: plane.TactileLine) -> LineFit:
+    def fitted(self, made: plane.TactileLine) -> MapFit:
         return fit_line(made, self.fit_radius_mm)
 
     def surface(self, body: Body) -> plane.SurfaceCompliance:
@@ -139,21 +138,16 @@ class Geometry(Record):
         return f"seat {self.seat:g}, d {self.d_mm:g} mm, h/d {self.depth_ratio:g}, E2/E1 {ratios}"
 
 
-class LineFit(Record):
-    """The fit of Eq 5 to a line."""
+class MapFit(Record):
+    """The fit of Eq 5 to a line, or of Eq 7 to a map."""
 
-    amplitude: float
-    sigma_mm: float  #: `amplitude`, `sigma_mm`: a and sigma of Eq 5.
+    amplitude: float  #: a: height above the level, in units of the map.
+    widths_mm: tuple[float, float | None]  #: Sigma across and along the head; a line has no width along it.
     rms: float  #: Root mean square of what the Gaussian leaves, in units of the background.
-    resolved: bool = True  #: True when the width lies within what the fit looks at, and not at an end of it.
-
-    @property
-    def widths_mm(self) -> tuple[float, None]:
-        """Across the head; a line has no width along it."""
-        return self.sigma_mm, None
+    resolved: bool = True  #: True when the widths are ones that array and window can tell, and not at an end of them.
 
 
-def fit_line(line: plane.TactileLine, radius_mm: float) -> LineFit:
+def fit_line(line: plane.TactileLine, radius_mm: float) -> MapFit:
     """Fit Eq 5 with background 1 and the bump on the lump's axis, averaged over cells as for a patient's map.
 
     Only widths from half a cell to three quarters of the radius count, also as for a patient's map. A bump that runs to
@@ -169,7 +163,8 @@ def fit_line(line: plane.TactileLine, radius_mm: float) -> LineFit:
     ends = np.log([LEAST_WIDTH_IN_CELLS * line.cell_mm, WIDEST_IN_RADII * radius_mm])
     found = plane.fit_shape(bump, excess, grid=np.linspace(ends[0], ends[1], 60))
     resolved = bool(ends[0] + 1e-6 < found.parameter < ends[1] - 1e-6)
-    return LineFit(found.height, float(np.exp(found.parameter)), float(np.sqrt(found.sse / len(x))), resolved)
+    width = float(np.exp(found.parameter))
+    return MapFit(found.height, (width, None), float(np.sqrt(found.sse / len(x))), resolved)
 
 
 class StudyRow(Record):
@@ -320,13 +315,16 @@ class Lookalikes(Record, eq=False):
 
     small: CentredFrame
     large: CentredFrame
-    difference: float
-    """Root mean square difference of the frames over the root mean square of what the smaller lump adds."""
 
     @property
     def of_mean(self) -> float:
         """Root mean square difference as a share of the frames' mean."""
         return _rms(self.large.share - self.small.share)
+
+    @property
+    def difference(self) -> float:
+        """The same over the root mean square of what the smaller lump adds."""
+        return self.of_mean / _rms(self.small.added)
 
 
 def centred_frame(d_mm: float, depth_ratio: float, *, settings: StudySettings, seat: float) -> CentredFrame:
@@ -375,17 +373,12 @@ def find_lookalikes(
     _, small_mm, small_depth, d_mm, depth = min(pairs)
     small = centred_frame(small_mm, small_depth, settings=settings, seat=seat)
 
-    def gap(depth_ratio: float) -> float:
-        return _difference(small, centred_frame(d_mm, depth_ratio, settings=settings, seat=seat))
+    def pair(depth_ratio: float) -> Lookalikes:
+        return Lookalikes(small, centred_frame(d_mm, depth_ratio, settings=settings, seat=seat))
 
     ends = max(depth - 2 * _STEP, depth_ratios[0]), min(depth + 2 * _STEP, depth_ratios[-1])
-    found = float(minimize_scalar(gap, bounds=ends, method="bounded", options={"xatol": 1e-3}).x)
-    large_frame = centred_frame(d_mm, found, settings=settings, seat=seat)
-    return Lookalikes(small, large_frame, _difference(small, large_frame))
-
-
-def _difference(small: CentredFrame, large: CentredFrame) -> float:
-    return _rms(large.share - small.share) / _rms(small.added)
+    found = minimize_scalar(lambda h: pair(h).difference, bounds=ends, method="bounded", options={"xatol": 1e-3})
+    return pair(float(found.x))
 
 
 def _rms(values: FloatArray) -> float:

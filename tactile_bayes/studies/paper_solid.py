@@ -24,7 +24,7 @@ from tactile_bayes.posterior.bump import Bump, FitCells, window_cells
 from tactile_bayes.posterior.white import LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, WIDEST_IN_RADII
 from tactile_bayes.presets import FIT_RADIUS_MM, Background
 from tactile_bayes.scans import CountArray, ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
-from tactile_bayes.studies.paper import HARD_RATIO, CaseSettings, centre_line
+from tactile_bayes.studies.paper import HARD_RATIO, CaseSettings, MapFit, centre_line
 
 # --- Maps of a study's raster of frames, built and fitted like a patient's.
 
@@ -68,7 +68,7 @@ def _readings(pressure_kpa: FloatArray) -> CountArray:
     return counts
 
 
-def fit_raster(made: TactileMap, settings: SolidSettings) -> RasterFit:
+def fit_raster(made: TactileMap, settings: SolidSettings) -> MapFit:
     """Fit Eq 7 about the lump's axis with equal weights; the level is fitted or 1, by the settings.
 
     All readings of a cell come from its middle, so the Gaussian is not averaged over it. A patient's readings are
@@ -81,7 +81,22 @@ def fit_raster(made: TactileMap, settings: SolidSettings) -> RasterFit:
     cells = replace(window_cells(made, (0.0, 0.0), radius_mm=radius_mm), cell_mm=0.0)
     pitch = settings.head.pitch_mm
     ends = np.log([LEAST_WIDTH_IN_CELLS * pitch, WIDEST_IN_RADII * radius_mm])
-    log_widths = _lowest(cells, ends, free=free)
+
+    def left(log_widths: FloatArray) -> float:
+        return _height(log_widths, cells, free=free)[1]
+
+    line = np.linspace(ends[0], ends[1], _TRIED)
+    start: FloatArray = min((np.array([x, y], dtype=np.float64) for x in line for y in line), key=left)
+    inwards = np.where(start > ends.mean(), -0.4, 0.4) * (line[1] - line[0])
+    simplex = start + inwards * np.array([[0, 0], [1, 0], [0, 1]])
+    found = minimize(
+        left,
+        start,
+        method="Nelder-Mead",
+        bounds=[(float(ends[0]), float(ends[1]))] * 2,
+        options={"xatol": 1e-9, "fatol": np.inf, "maxiter": 400, "initial_simplex": simplex},
+    )
+    log_widths = np.asarray(found.x, dtype=np.float64)
     amplitude, sse = _height(log_widths, cells, free=free)
     narrow, wide = sorted(np.exp(log_widths))
     resolved = (
@@ -90,7 +105,7 @@ def fit_raster(made: TactileMap, settings: SolidSettings) -> RasterFit:
         and wide <= MOST_AXIS_RATIO * narrow
     )
     sigma_x, sigma_y = np.exp(log_widths).tolist()
-    return RasterFit(amplitude, (sigma_x, sigma_y), float(np.sqrt(sse / len(cells))), bool(resolved))
+    return MapFit(amplitude, (sigma_x, sigma_y), float(np.sqrt(sse / len(cells))), bool(resolved))
 
 
 def _height(log_widths: FloatArray, cells: FitCells, *, free: bool) -> tuple[float, float]:
@@ -102,31 +117,6 @@ def _height(log_widths: FloatArray, cells: FitCells, *, free: bool) -> tuple[flo
         # what is left of both once a level is taken off
         shape, excess = shape - shape.mean(), excess - excess.mean()
     return fit_height(shape, excess)
-
-
-def _lowest(cells: FitCells, ends: FloatArray, *, free: bool) -> FloatArray:
-    """(2,) log widths of the lowest minimum between the ends."""
-
-    def left(log_widths: FloatArray) -> float:
-        return _height(log_widths, cells, free=free)[1]
-
-    line = np.linspace(ends[0], ends[1], _TRIED)
-    tried = [np.array([x, y], dtype=np.float64) for x in line for y in line]
-    start: FloatArray = min(tried, key=left)
-    inwards = np.where(start > ends.mean(), -0.4, 0.4) * (line[1] - line[0])
-    found = minimize(
-        left,
-        start,
-        method="Nelder-Mead",
-        bounds=[(float(ends[0]), float(ends[1]))] * 2,
-        options={
-            "xatol": 1e-9,
-            "fatol": np.inf,
-            "maxiter": 400,
-            "initial_simplex": start + inwards * np.array([[0, 0], [1, 0], [0, 1]]),
-        },
-    )
-    return np.asarray(found.x, dtype=np.float64)
 
 
 # --- The forward study in three dimensions: the frames over a ball, over sizes, depths, stiffnesses and seats.
@@ -164,7 +154,7 @@ class SolidSettings(CaseSettings, kw_only=True):
         head, condensed = self.on(body), self.condensed(body)
         return lambda ratio: raster_map(raster_frames(head, [self.placed(condensed, ratio)], self))
 
-    def fitted(self, made: TactileMap) -> RasterFit:
+    def fitted(self, made: TactileMap) -> MapFit:
         return fit_raster(made, self)
 
     def geometry(self, body: Body) -> LumpGeometry:
@@ -223,15 +213,6 @@ class RasterFrames(Record, eq=False):
     plain_kpa: FloatArray | None = None
     """(rows, columns) array: The head's frame over the same body without the lump, where the map is to be divided by
     it."""
-
-
-class RasterFit(Record):
-    """The fit of Eq 7 to a raster's map."""
-
-    amplitude: float  #: a of Eq 7: height above the level, in units of the map.
-    widths_mm: tuple[float, float]  #: Across and along the head.
-    rms: float  #: Root mean square of what the Gaussian leaves, in units of the background.
-    resolved: bool  #: True when both widths are ones that array and window can tell.
 
 
 def raster_frames(head: SolidHead, lumps: Sequence[SkinPerturbation], settings: SolidSettings) -> RasterFrames:

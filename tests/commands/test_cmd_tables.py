@@ -26,14 +26,16 @@ from tactile_bayes.studies.model_comparison import (
     table_distance,
     table_scenes,
 )
-from tactile_bayes.studies.paper import LineFit
+from tactile_bayes.studies.paper import MapFit
 
 Run = Callable[..., "CompletedProcess[str]"]
 
 
 def agreement(scene) -> Agreement:
     others = ((0.2, 0.15, 0.1),) * len(OTHER_DEFINITIONS)
-    return Agreement(scene, 0.05, 0.06, 0.01, 0.4, LineFit(0.3, 3.0, 0.01), LineFit(0.4, 3.5, 0.02), 0.03, others)
+    return Agreement(
+        scene, 0.05, 0.06, 0.01, 0.4, MapFit(0.3, (3.0, None), 0.01), MapFit(0.4, (3.5, None), 0.02), 0.03, others
+    )
 
 
 def test_the_tables_stand_beside_the_printed_ones_and_say_what_they_mean() -> None:

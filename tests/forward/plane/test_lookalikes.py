@@ -37,7 +37,7 @@ def test_without_two_visible_sizes_there_is_no_pair() -> None:
 def test_the_line_says_whether_they_are(difference: float, words: str) -> None:
     small = CentredFrame(10.0, 1.0, np.ones(4), 0.2 * np.ones(4))
     large = CentredFrame(15.0, 0.9, np.ones(4) + 0.2 * difference, 0.2 * np.ones(4))
-    text = lookalikes_text(Lookalikes(small, large, difference))
+    text = lookalikes_text(Lookalikes(small, large))
     assert words in text
     assert f"{20 * difference:.2f} % of the mean" in text
     assert "no two visible lumps" in lookalikes_text(None)

@@ -238,7 +238,7 @@ def test_the_skin_is_symmetric_about_the_lump() -> None:
 
 def line_figures(body: Body, ratio: float = 100.0, **options: float) -> tuple[float, float]:
     fit = fit_line(build_line(slide(condense(body, **options), ratio)), 48.0)
-    return fit.amplitude, fit.sigma_mm
+    return fit.amplitude, fit.widths_mm[0]
 
 
 def agrees_with_half_its_cell(body: Body) -> None:

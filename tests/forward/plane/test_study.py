@@ -47,7 +47,7 @@ def row(d: float, depth: float, amplitude: float, sigma: float, *, ratio: float 
 def test_the_fit_finds_a_gaussian_bump_on_a_background_of_one(amplitude: float, sigma: float) -> None:
     found = fit_line(line_of(amplitude, sigma), 48.0)
     assert found.amplitude == pytest.approx(amplitude, rel=1e-6)
-    assert found.sigma_mm == pytest.approx(sigma, rel=1e-6)
+    assert found.widths_mm[0] == pytest.approx(sigma, rel=1e-6)
     assert found.rms < 1e-7
 
 
@@ -73,18 +73,18 @@ def test_the_fit_is_that_of_a_patients_map() -> None:
     )
     assert other.converged
     assert found.amplitude == pytest.approx(other.theta[0], rel=1e-6)
-    assert found.sigma_mm == pytest.approx(np.exp(other.theta[1]), rel=1e-6)
+    assert found.widths_mm[0] == pytest.approx(np.exp(other.theta[1]), rel=1e-6)
     assert found.rms == pytest.approx(np.sqrt(other.sse / inside.sum()), rel=1e-6)
 
 
 def test_only_what_lies_within_the_radius_is_fitted() -> None:
     spoiled = line_of(0.3, 4.0, extra=np.where(np.abs(X) > 48, 5.0, 0.0))
-    assert fit_line(spoiled, 48.0).sigma_mm == pytest.approx(4.0, rel=1e-6)
+    assert fit_line(spoiled, 48.0).widths_mm[0] == pytest.approx(4.0, rel=1e-6)
 
 
 def test_a_bump_wider_than_the_window_is_reported_at_its_edge() -> None:
     found = fit_line(line_of(0.5, 200.0), 48.0)
-    assert found.sigma_mm == pytest.approx(36.0)
+    assert found.widths_mm[0] == pytest.approx(36.0)
     assert not found.resolved
     assert fit_line(line_of(0.5, 20.0), 48.0).resolved
 
