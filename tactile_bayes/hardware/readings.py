@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -79,21 +79,19 @@ class Parser:
 
 
 class RecordParser(Parser):
-    """Parser of fixed-length records; after garbage it tries again at each next byte.
+    """Parser of records of a fixed length; after garbage it tries again at each next byte.
 
-    A subclass sets `record_bytes` and says what `_record` makes of that many bytes.
+    `read` makes a pose of so many bytes, or None where they are no record.
     """
 
-    record_bytes: int
-
-    def __init__(self) -> None:
-        self._rest = b""
+    def __init__(self, record_bytes: int, read: Callable[[bytes], PoseReading | None]) -> None:
+        self.record_bytes, self._read, self._rest = record_bytes, read, b""
 
     def feed(self, data: bytes) -> list[Reading]:
         buffer, place, size = self._rest + data, 0, self.record_bytes
         found: list[Reading] = []
         while len(buffer) - place >= size:
-            pose = self._record(buffer[place : place + size])
+            pose = self._read(buffer[place : place + size])
             if pose is None:
                 place += 1
                 self.garbage_bytes += 1
@@ -102,10 +100,6 @@ class RecordParser(Parser):
                 place += size
         self._rest = buffer[place:]
         return found
-
-    def _record(self, record: bytes) -> PoseReading | None:
-        """Parse one record; None when the bytes are not a record."""
-        raise NotImplementedError
 
 
 def plausible(position_mm: Sequence[float], quaternion_wxyz: Sequence[float]) -> bool:

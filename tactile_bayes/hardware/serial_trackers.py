@@ -8,6 +8,7 @@ import struct
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, suppress
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -30,35 +31,22 @@ from tactile_bayes.hardware.readings import (
 )
 from tactile_bayes.hardware.trackers import ASK_FOR_TDATA, NAME_BYTES, IgtlinkParser, NdiPort, encode_transform
 
-# --- Parser for Ascension Flock of Birds and miniBIRD trackers, position and quaternion.
+# --- Records of Ascension Flock of Birds and miniBIRD trackers, position and quaternion, by the standard transmitter.
 #
 # A record is seven words of 14 bits, each sent as two bytes of seven; bit 7 marks the first byte of a record and no
-# other, so that a lost byte costs one record.
+# other, so that a lost byte costs one record. In group mode the bird's address follows.
 
 _SCALE_INCH: Final = 36.0
-_WORDS: Final = 7
+_BIRD_BYTES: Final = 14
 
 
-class BirdParser(RecordParser):
-    """Parser of Flock of Birds records of the standard transmitter; in group mode the bird's address follows each."""
-
-    def __init__(self, *, group: bool = False) -> None:
-        super().__init__()
-        self.record_bytes = 2 * _WORDS + group
-        self._group = group
-
-    def _record(self, record: bytes) -> PoseReading | None:
-        if not record[0] & 0x80 or any(byte & 0x80 for byte in record[1:]):
-            return None
-        x, y, z, *turn = (word(record[i], record[i + 1]) / 32768 for i in range(0, 2 * _WORDS, 2))
-        inches = (_SCALE_INCH * x, _SCALE_INCH * y, _SCALE_INCH * z)
-        return _pose((*inches, *turn), str(record[-1]) if self._group else "")
-
-
-def word(low: int, high: int) -> int:
-    """Decode a signed word from its two bytes of seven bits; the two lowest bits are not sent."""
-    number = (low & 0x7F) << 2 | (high & 0x7F) << 9
-    return number - 65536 if number & 0x8000 else number
+def _bird_pose(record: bytes) -> PoseReading | None:
+    if not record[0] & 0x80 or any(byte & 0x80 for byte in record[1:]):
+        return None
+    words = ((record[i] & 0x7F) << 2 | record[i + 1] << 9 for i in range(0, _BIRD_BYTES, 2))  # two bits are not sent
+    x, y, z, *turn = ((word - 65536 if word & 0x8000 else word) / 32768 for word in words)
+    inches = (_SCALE_INCH * x, _SCALE_INCH * y, _SCALE_INCH * z)
+    return _pose((*inches, *turn), str(record[-1]) if len(record) > _BIRD_BYTES else "")
 
 
 def record_bytes(numbers: Sequence[float]) -> bytes:
@@ -71,11 +59,13 @@ def record_bytes(numbers: Sequence[float]) -> bytes:
     return bytes(out)
 
 
-# --- Parsers for Polhemus FASTRAK, LIBERTY and PATRIOT trackers, in the layouts that the drivers below ask for.
+# --- Records of Polhemus FASTRAK, LIBERTY and PATRIOT trackers, in the layouts that the drivers below ask for.
 #
 # FASTRAK numbers its output items otherwise than LIBERTY and PATRIOT: 11 is a quaternion there, the distortion
 # here. Positions are asked for in inches, because that is what both give after a reset; quaternions are scalar
-# first.
+# first. Binary records carry no checksum. FASTRAK's are told from noise by the station, the error byte, the closing
+# space and the length of the quaternion; LIBERTY's header has a size, whose tolerance is the closing space: firmware
+# may count it or not.
 #
 # References
 # ----------
@@ -84,6 +74,7 @@ def record_bytes(numbers: Sequence[float]) -> bytes:
 FASTRAK: Final = struct.Struct("<7f")  # position, quaternion
 FASTRAK_DECIMALS: Final = (2, 2, 2, 4, 4, 4, 4)
 _COLUMN: Final = 7
+_FASTRAK_BYTES, _FASTRAK_TEXT_BYTES = 3 + FASTRAK.size + 1, 3 + 7 * _COLUMN + 2  #: Binary, and as text.
 # Tag, station, command, error, spare, size; then position, quaternion, ms, distortion.
 LIBERTY: Final = struct.Struct("<2sBBBBH7fIi")
 LIBERTY_HEADER_BYTES: Final = 8
@@ -94,27 +85,15 @@ _LIBERTY_TEXT: Final = re.compile(rb"([ 0]\d|1[0-6])([A-Za-z ])")  # station, er
 _NUMBER: Final = re.compile(rb"[+-]?\d+(\.\d*)?([eE][+-]?\d+)?")
 
 
-class FastrakParser(RecordParser):
-    """Parser of FASTRAK records, ASCII or binary; their fixed layout finds the next record after garbage.
-
-    Binary records carry no checksum: the station, the error byte, the closing space and the length of the quaternion
-    tell a record from noise.
-    """
-
-    def __init__(self, *, binary: bool = True) -> None:
-        super().__init__()
-        self._binary = binary
-        self.record_bytes = 3 + FASTRAK.size + 1 if binary else 3 + 7 * _COLUMN + 2
-
-    def _record(self, record: bytes) -> PoseReading | None:
-        station, error = record[1] - 48, record[2:3]
-        if record[:1] != b"0" or not 1 <= station <= 4 or not (error.isalpha() or error == b" "):
-            return None
-        if self._binary:
-            values = FASTRAK.unpack_from(record, 3) if record[-1:] == b" " else None
-        else:
-            values = _columns(record[3:-2]) if record[-2:] == b"\r\n" else None
-        return None if values is None else _pose(values, str(station), error)
+def _fastrak_pose(record: bytes) -> PoseReading | None:
+    station, error = record[1] - 48, record[2:3]
+    if record[:1] != b"0" or not 1 <= station <= 4 or not (error.isalpha() or error == b" "):
+        return None
+    if len(record) == _FASTRAK_BYTES:
+        values = FASTRAK.unpack_from(record, 3) if record[-1:] == b" " else None
+    else:
+        values = _columns(record[3:-2]) if record[-2:] == b"\r\n" else None
+    return None if values is None else _pose(values, str(station), error)
 
 
 def _columns(text: bytes) -> tuple[float, ...] | None:
@@ -126,20 +105,12 @@ def _columns(text: bytes) -> tuple[float, ...] | None:
     return tuple(float(cell.replace(b" ", b"")) for cell in cells)
 
 
-class LibertyParser(RecordParser):
-    """Parser of LIBERTY, PATRIOT and Latus binary records.
-
-    The header's size is a check with a tolerance of the closing space, which firmware may or may not count.
-    """
-
-    record_bytes = LIBERTY.size + 1
-
-    def _record(self, record: bytes) -> PoseReading | None:
-        tag, station, command, error, _, size, *values, time_ms, distortion = LIBERTY.unpack_from(record)
-        fits = abs(size - LIBERTY.size + LIBERTY_HEADER_BYTES) <= 2
-        if tag not in _TAGS or not 1 <= station <= 16 or command not in b"CP" or not fits or record[-1:] != b" ":
-            return None
-        return _pose(values, str(station), bytes([error]), time_ms, distortion)
+def _liberty_pose(record: bytes) -> PoseReading | None:
+    tag, station, command, error, _, size, *values, time_ms, distortion = LIBERTY.unpack_from(record)
+    fits = abs(size - LIBERTY.size + LIBERTY_HEADER_BYTES) <= 2
+    if tag not in _TAGS or not 1 <= station <= 16 or command not in b"CP" or not fits or record[-1:] != b" ":
+        return None
+    return _pose(values, str(station), bytes([error]), time_ms, distortion)
 
 
 class LibertyAsciiParser(Parser):
@@ -393,20 +364,20 @@ def _liberty(words: str, form: bytes, closing: bytes, parser: Callable[[], Parse
 
 
 TRACKERS: Final[dict[str, TrackerDriver]] = {
-    "fastrak": _fastrak("binary", b"f", b"0", FastrakParser),
-    "fastrak-ascii": _fastrak("ASCII", b"F", b"1", lambda: FastrakParser(binary=False)),
-    "liberty": _liberty("binary", b"F1\r", b"0", LibertyParser),
+    "fastrak": _fastrak("binary", b"f", b"0", partial(RecordParser, _FASTRAK_BYTES, _fastrak_pose)),
+    "fastrak-ascii": _fastrak("ASCII", b"F", b"1", partial(RecordParser, _FASTRAK_TEXT_BYTES, _fastrak_pose)),
+    "liberty": _liberty("binary", b"F1\r", b"0", partial(RecordParser, LIBERTY.size + 1, _liberty_pose)),
     "liberty-ascii": _liberty("ASCII", b"F0\r", b"1", LibertyAsciiParser),
     "bird": TrackerDriver(
         "an Ascension Flock of Birds",
         115_200,
-        BirdParser,
+        partial(RecordParser, _BIRD_BYTES, _bird_pose),
         (b"]",),
         b"BB",  # two: only the second shows whether an address ended the first
         b"@",
         b"B",
         several=(b"P\x23\x01",),  # group mode
-        other_parser=lambda: BirdParser(group=True),
+        other_parser=partial(RecordParser, _BIRD_BYTES + 1, _bird_pose),
     ),
     "open": _open_framing("a tracker in the open framing", head.DEFAULT_BAUD),
     "igtlink": TrackerDriver(

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tactile_bayes.hardware.readings import Parser, PoseReading
-from tactile_bayes.hardware.serial_trackers import PROTOCOLS, TRACKERS, BirdParser, encoded
+from tactile_bayes.hardware.serial_trackers import PROTOCOLS, TRACKERS, encoded
 
 BEFORE, AFTER = 2, 5
 STREAMS = 40
@@ -33,7 +33,8 @@ class Stream(NamedTuple):
 
 
 def parser_of(name: str) -> Parser:
-    return BirdParser(group=True) if name == GROUP else TRACKERS[name].parser()
+    flock = TRACKERS["bird"].other_parser
+    return flock() if flock and name == GROUP else TRACKERS[name].parser()
 
 
 @cache

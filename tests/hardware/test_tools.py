@@ -38,7 +38,7 @@ from tactile_bayes.hardware.readings import (
     pose_from_relative,
     relative_pose,
 )
-from tactile_bayes.hardware.serial_trackers import TRACKERS, BirdParser, check_head, open_tracker
+from tactile_bayes.hardware.serial_trackers import TRACKERS, check_head, open_tracker
 from tactile_bayes.hardware.trackers import IgtlinkParser, encode_transform
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.select import Jumps, scan_findings
@@ -332,7 +332,7 @@ def test_a_flock_in_group_mode_is_noticed_by_what_it_sends():
         port = open_tracker("bird", emulator.link.url)
         answer = TRACKERS["bird"].check(port)
         assert answer.tools == {"": ""}
-        assert answer.parser().record_bytes == BirdParser().record_bytes
+        assert answer.parser().record_bytes == TRACKERS["bird"].parser().record_bytes
         port.close()
 
 

@@ -9,16 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tactile_bayes.hardware.head import HeadParser, encode_pose
+from tactile_bayes.hardware.head import encode_pose
 from tactile_bayes.hardware.readings import PoseReading
-from tactile_bayes.hardware.serial_trackers import (
-    BirdParser,
-    FastrakParser,
-    LibertyAsciiParser,
-    LibertyParser,
-    record_bytes,
-)
-from tactile_bayes.hardware.trackers import IgtlinkParser, crc64, encode_transform
+from tactile_bayes.hardware.serial_trackers import TRACKERS, record_bytes
+from tactile_bayes.hardware.trackers import crc64, encode_transform
 
 # One pose in every protocol: (10, -5, 1) inches, quaternion (.5, .5, -.5, .5).
 FASTRAK = bytes.fromhex(
@@ -35,15 +29,18 @@ BIRD = bytes.fromhex("e3 11 0e 77 63 01 00 20 00 20 00 60 00 20")
 IGTLINK = encode_transform(PoseReading((254.0, -127.0, 25.4), (0.5, 0.5, -0.5, 0.5), 123_456_000_000))
 OPEN = encode_pose(PoseReading((254.0, -127.0, 25.4), (0.5, 0.5, -0.5, 0.5), 123_456_000_000), sequence=0)
 
+FLOCK = TRACKERS["bird"].other_parser
+assert FLOCK is not None
+
 PROTOCOLS = {
-    "fastrak": (FastrakParser, FASTRAK),
-    "fastrak text": (lambda: FastrakParser(binary=False), FASTRAK_TEXT),
-    "liberty": (LibertyParser, LIBERTY),
-    "liberty text": (LibertyAsciiParser, LIBERTY_TEXT),
-    "bird": (BirdParser, BIRD),
-    "bird group": (lambda: BirdParser(group=True), BIRD + b"\x01"),
-    "igtlink": (IgtlinkParser, IGTLINK),
-    "open": (HeadParser, OPEN),
+    "fastrak": (TRACKERS["fastrak"].parser, FASTRAK),
+    "fastrak text": (TRACKERS["fastrak-ascii"].parser, FASTRAK_TEXT),
+    "liberty": (TRACKERS["liberty"].parser, LIBERTY),
+    "liberty text": (TRACKERS["liberty-ascii"].parser, LIBERTY_TEXT),
+    "bird": (TRACKERS["bird"].parser, BIRD),
+    "bird group": (FLOCK, BIRD + b"\x01"),
+    "igtlink": (TRACKERS["igtlink"].parser, IGTLINK),
+    "open": (TRACKERS["open"].parser, OPEN),
 }
 
 
@@ -111,22 +108,22 @@ def check_noise(protocol, noise: bytes) -> None:
 
 
 def test_fastrak_text_is_cut_by_column_because_numbers_touch():
-    (pose,) = FastrakParser(binary=False).feed(FASTRAK_TOUCHING)
+    (pose,) = TRACKERS["fastrak-ascii"].parser().feed(FASTRAK_TOUCHING)
     assert (pose.flags, pose.tool) == (("error E",), "2")
     assert pose.position_mm == pytest.approx((254.0, -127.0, -3135.63))
     assert pose.quaternion_wxyz == (0.5, -0.5, -0.5, -0.5)
 
 
 def test_records_are_as_long_as_their_items_make_them():
-    assert FastrakParser().record_bytes == len(FASTRAK) == 3 + 7 * 4 + 1
-    assert FastrakParser(binary=False).record_bytes == len(FASTRAK_TEXT) == 3 + 7 * 7 + 2
-    assert LibertyParser().record_bytes == len(LIBERTY) == 8 + 9 * 4 + 1
+    assert TRACKERS["fastrak"].parser().record_bytes == len(FASTRAK) == 3 + 7 * 4 + 1
+    assert TRACKERS["fastrak-ascii"].parser().record_bytes == len(FASTRAK_TEXT) == 3 + 7 * 7 + 2
+    assert TRACKERS["liberty"].parser().record_bytes == len(LIBERTY) == 8 + 9 * 4 + 1
 
 
 def test_liberty_keeps_time_error_and_distortion():
     header = struct.pack("<2sBBBBH", b"PA", 2, ord("C"), ord("I"), 0, 37)
     body = struct.pack("<7fIi", 10, -5, 1, 0.5, 0.5, -0.5, 0.5, 4_000_000_000, -3)
-    (pose,) = LibertyParser().feed(header + body + b" ")
+    (pose,) = TRACKERS["liberty"].parser().feed(header + body + b" ")
     assert pose.tool == "2"
     assert pose.device_ns == 4_000_000_000_000_000
     assert pose.flags == ("error I", "distortion -3")
@@ -135,14 +132,14 @@ def test_liberty_keeps_time_error_and_distortion():
 @pytest.mark.parametrize("size", [37, 36])
 def test_the_size_may_or_may_not_count_the_space(size):
     record = LIBERTY[:6] + struct.pack("<H", size) + LIBERTY[8:]
-    assert len(LibertyParser().feed(record)) == 1
+    assert len(TRACKERS["liberty"].parser().feed(record)) == 1
 
 
 def test_bird_words_are_fourteen_bits():
-    (pose,) = BirdParser().feed(BIRD)
+    (pose,) = TRACKERS["bird"].parser().feed(BIRD)
     assert [mm / 25.4 for mm in pose.position_mm] == pytest.approx([9.99756, -5.00098, 0.99756], abs=1e-5)
     assert record_bytes((10, -5, 1, 0.5, 0.5, -0.5, 0.5)) == BIRD
-    (second,) = BirdParser(group=True).feed(BIRD + b"\x02")
+    (second,) = FLOCK().feed(BIRD + b"\x02")
     assert second.tool == "2"
 
 
@@ -152,9 +149,9 @@ def test_the_checksum_of_a_transform_is_the_published_one():
 
 def test_other_messages_and_other_devices_are_passed_over():
     status = struct.pack(">H12s20sIIQQ", 1, b"STATUS", b"Tracker", 0, 0, 4, crc64(b"okay")) + b"okay"
-    assert len(IgtlinkParser().feed(status + IGTLINK)) == 1
+    assert len(TRACKERS["igtlink"].parser().feed(status + IGTLINK)) == 1
 
 
 def test_an_exact_pose_stays_exact():
     pose = PoseReading((152.27590461023, -107.0805, 1e-9), (0.1, -0.7, 0.1, 0.7), 8_333_333)
-    assert HeadParser().feed(encode_pose(pose, sequence=0)) == [pose]
+    assert TRACKERS["open"].parser().feed(encode_pose(pose, sequence=0)) == [pose]
