@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, NotConvergedError, require
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.presets import HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS, HEADS, SHOULDER_MM, SHOULDERS_INSIDE
 
 # --- The head's cross-section.
-
-BoolArray = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
 
 
 class Head(Record):
@@ -81,10 +79,8 @@ class Head(Record):
     def sensing_cells(self, cell_mm: float) -> BoolArray:
         """(n,) whether each cell of the face, from left to right, senses pressure or only presses."""
         count = round(self.width_mm / cell_mm)
-        if count < 2 or abs(count * cell_mm - self.width_mm) > 1e-9 * self.width_mm:
-            raise BadDataError(
-                f"cell_mm is {cell_mm:g}", way_out=f"it must divide the head's width of {self.width_mm:g} mm"
-            )
+        fits = count >= 2 and abs(count * cell_mm - self.width_mm) <= 1e-9 * self.width_mm
+        require(fits, "cell_mm", cell_mm, f"divide the head's width of {self.width_mm:g} mm")
         around = max(0, int(np.ceil((self.half_face_mm - self.half_width_mm) / cell_mm - 0.5 - 1e-9)))
         return np.pad(np.ones(count, dtype=bool), around)
 

@@ -256,26 +256,20 @@ def lump_mesh(geometry: LumpGeometry, size: MeshSize | None = None) -> Mesh:
     )
 
 
-def _box(g: LumpGeometry, boundary: float) -> tuple[float, float, float]:
-    """Radius, top and bottom of the box that the fan of rays fills."""
-    margin = 1.3 * max(g.radius_mm, g.half_height_mm)
-    high, low = g.depth_mm - g.half_height_mm, g.depth_mm + g.half_height_mm
-    top, bottom = 0.0, low + margin
-    if boundary < high:
-        top = boundary
-    if low < boundary < bottom + 0.5 * margin:
-        bottom = boundary
-    if bottom > g.layers.thickness_mm - 0.5 * margin:
-        bottom = g.layers.thickness_mm
-    return max(g.radius_mm + margin, 0.8 * (g.depth_mm - top)), top, bottom
-
-
 def _fan(g: LumpGeometry, boundary: float, *, cut: bool, elements: int) -> tuple[list[FloatArray], list[FloatArray]]:
     """Nodes on the lump and on the box about it, sector by sector from the top pole to the bottom pole.
 
     Sectors end at the box's corners, and at the layer boundary where it cuts the lump.
     """
-    corner_r, top, bottom = _box(g, boundary)
+    # the box
+    margin = 1.3 * max(g.radius_mm, g.half_height_mm)
+    high, low = g.depth_mm - g.half_height_mm, g.depth_mm + g.half_height_mm
+    top, bottom = boundary if boundary < high else 0.0, low + margin
+    if low < boundary < bottom + 0.5 * margin:
+        bottom = boundary
+    if bottom > g.layers.thickness_mm - 0.5 * margin:
+        bottom = g.layers.thickness_mm
+    corner_r = max(g.radius_mm + margin, 0.8 * (g.depth_mm - top))
     upper = float(np.arctan2(corner_r, g.depth_mm - top))
     lower = float(np.pi - np.arctan2(corner_r, bottom - g.depth_mm))
     breaks, depths = [0.0, upper, lower, np.pi], [top, bottom]
@@ -286,7 +280,7 @@ def _fan(g: LumpGeometry, boundary: float, *, cut: bool, elements: int) -> tuple
     share = np.diff(breaks) / np.pi * elements
     counts = [max(2 if 0 < i < len(share) - 1 else 1, round(float(s))) for i, s in enumerate(share)]
     # a thin bridge of tissue above the lump needs elements as short as it is thick
-    bridge = max(g.depth_mm - g.half_height_mm - top, 0.1 * g.half_height_mm)
+    bridge = max(high - top, 0.1 * g.half_height_mm)
     shortest = g.depth_mm * np.tan(breaks[1] / counts[0])
     counts[0] = max(counts[0], round(counts[0] * min(shortest / bridge, 2.0)))
 

@@ -10,7 +10,7 @@ from scipy.linalg import toeplitz
 from scipy.optimize import minimize_scalar
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.axisymmetric import surface_flexibility
 from tactile_bayes.forward.contact import ContactStiffness, Head, solve_contact
 from tactile_bayes.forward.mesh import CondensedHole, Elements, Mesh, body_mesh, quadrature, stiffness_factor
@@ -143,8 +143,7 @@ class SurfaceCompliance(Record, eq=False):
 
     def with_lump(self, stiffness_ratio: float) -> FloatArray:
         """(n, n) compliance with a lump of E2/E1 = `stiffness_ratio`, symmetric and positive definite."""
-        if not (stiffness_ratio > 0 and np.isfinite(stiffness_ratio)):
-            raise BadDataError(f"stiffness_ratio is {stiffness_ratio:g}", way_out="it must be finite and above 0")
+        require(0 < stiffness_ratio < np.inf, "stiffness_ratio", stiffness_ratio, "be finite and above 0")
         even, odd = (hole.change(stiffness_ratio * self.body.fat_kpa) for hole in (self.even, self.odd))
         alike, across = even + odd, even - odd
         change = np.block([[alike[::-1, ::-1], across[::-1]], [across[:, ::-1], alike]])
@@ -212,11 +211,8 @@ class LineFrames(Record, eq=False):
     def as_taxels(self, pitch_mm: float) -> LineFrames:
         """The same frames as sensors of width `pitch_mm` measure them: means over whole cells."""
         group = round(pitch_mm / self.cell_mm)
-        if group < 1 or abs(group * self.cell_mm - pitch_mm) > 1e-9 or len(self.s_mm) % group:
-            raise BadDataError(
-                f"pitch_mm is {pitch_mm:g}",
-                way_out=f"it must hold whole cells of {self.cell_mm:g} mm and fill the head",
-            )
+        fits = group >= 1 and abs(group * self.cell_mm - pitch_mm) <= 1e-9 and not len(self.s_mm) % group
+        require(fits, "pitch_mm", pitch_mm, f"hold whole cells of {self.cell_mm:g} mm and fill the head")
         means = self.pressure_kpa.reshape(len(self.x_c_mm), -1, group).mean(axis=2)
         return LineFrames(self.x_c_mm, self.s_mm.reshape(-1, group).mean(axis=1), means)
 

@@ -248,34 +248,23 @@ def check_solid(body: SceneBody, lumps: Sequence[SolidLump], ribs: Sequence[Rib]
     check(body, "body")
     for i, lump in enumerate(lumps):
         check(lump, f"lump[{i}]")
-        _check_depth(i, lump, body)
+        half = (1.0 + _LEAST_COVER) * lump.vertical_mm / 2
+        least, most = half / lump.d_mm, (body.thickness_mm - half) / lump.d_mm
+        if least > most:
+            room = f"the body has {body.thickness_mm:g} mm of room"
+            raise BadDataError(f"lump[{i}] is {lump.vertical_mm:g} mm high", way_out=room)
+        key = f"lump[{i}].depth_ratio"
+        _check_room(key, lump.depth_ratio, (least, most), "the lump", " for this size and body")
     for i, rib in enumerate(ribs):
         check(rib, f"rib[{i}]")
-        _check_rib(i, rib, body)
+        half = (1.0 + _LEAST_COVER) * rib.d_mm / 2
+        ends = half, body.thickness_mm - half
+        _check_room(f"rib[{i}].depth_mm", rib.depth_mm, ends, "the rib", " mm for this diameter and body")
+        count = 2 * int(rib.half_length_mm / rib.spacing_mm + 1e-9) + 1
+        if count > MOST_BALLS:
+            way_out = f"give spacing_mm or half_length_mm for {MOST_BALLS} or fewer"
+            raise BadDataError(f"rib[{i}] is a row of {count} balls", way_out=way_out)
     fat_thickness(body, lumps)
-
-
-def _check_rib(index: int, rib: Rib, body: SceneBody) -> None:
-    half = (1.0 + _LEAST_COVER) * rib.d_mm / 2
-    ends = half, body.thickness_mm - half
-    _check_room(f"rib[{index}].depth_mm", rib.depth_mm, ends, "the rib", " mm for this diameter and body")
-    count = 2 * int(rib.half_length_mm / rib.spacing_mm + 1e-9) + 1
-    if count > MOST_BALLS:
-        raise BadDataError(
-            f"rib[{index}] is a row of {count} balls",
-            way_out=f"give spacing_mm or half_length_mm for {MOST_BALLS} or fewer",
-        )
-
-
-def _check_depth(index: int, lump: SolidLump, body: SceneBody) -> None:
-    half = (1.0 + _LEAST_COVER) * lump.vertical_mm / 2
-    least, most = half / lump.d_mm, (body.thickness_mm - half) / lump.d_mm
-    if least > most:
-        raise BadDataError(
-            f"lump[{index}] is {lump.vertical_mm:g} mm high", way_out=f"the body has {body.thickness_mm:g} mm of room"
-        )
-    key = f"lump[{index}].depth_ratio"
-    _check_room(key, lump.depth_ratio, (least, most), "the lump", " for this size and body")
 
 
 def _check_room(key: str, depth: float, ends: tuple[float, float], what: str, where: str) -> None:

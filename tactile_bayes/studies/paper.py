@@ -472,16 +472,14 @@ def search_heads(
 ) -> list[Uniformity]:
     """Uniformity of every head of a grid of places (`presets.HEADS`) and radii of arc and shoulders; sections that
     cannot be are left out."""
-    found = []
-    for kind in kinds:
-        for radius in radii_mm:
-            widest = Head().half_width_mm if kind == SHOULDERS_INSIDE else radius
-            found += [
-                uniformity(Head(radius_mm=radius, shoulder_mm=shoulder, shoulders=kind), tissue)
-                for shoulder in shoulders_mm
-                if shoulder < widest
-            ]
-    return found
+    sections = [
+        Head(radius_mm=radius, shoulder_mm=shoulder, shoulders=kind)
+        for kind in kinds
+        for radius in radii_mm
+        for shoulder in shoulders_mm
+        if shoulder < (Head().half_width_mm if kind == SHOULDERS_INSIDE else radius)
+    ]
+    return [uniformity(section, tissue) for section in sections]
 
 
 def most_even(found: Sequence[Uniformity]) -> Uniformity:
