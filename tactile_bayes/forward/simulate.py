@@ -188,7 +188,6 @@ class PlaneSection(Record, eq=False):
     scene: Scene
     fidelity: str  #: The contact problem (``"plane-strain"``) or Eqs 1 to 4.
     head: Section  #: Section of the head: shoulders of the scene's `shoulder_mm`, or its `rim_mm` where that is 0.
-    layers: Layers  #: The body without the lump.
     lump: tuple[Body, float] | None  #: Below the skin, with its stiffness ratio; None for nothing.
 
     @classmethod
@@ -196,18 +195,16 @@ class PlaneSection(Record, eq=False):
         """Prepare the section of a scene; a key that two dimensions cannot follow is an error."""
         many = "a rib" if scene.ribs else f"{len(scene.solid_lumps)} lumps" if len(scene.solid_lumps) > 1 else ""
         if many:
-            raise BadDataError(
-                f"the scene has {many}", way_out=f"the {fidelity} model has one lump and no rib; use --fidelity solid"
-            )
-        layers = scene.layers
-        lump = _cylinder(scene.solid_lumps[0], layers, fidelity) if scene.solid_lumps else None
+            way_out = f"the {fidelity} model has one lump and no rib; use --fidelity solid"
+            raise BadDataError(f"the scene has {many}", way_out=way_out)
+        lump = _cylinder(scene.solid_lumps[0], scene.layers, fidelity) if scene.solid_lumps else None
         width = scene.head.rows * scene.head.pitch_mm
         if shoulders == SHOULDERS_INSIDE and scene.head.rim_mm > width / 2:
             raise BadDataError(
                 f"head.rim_mm is {scene.head.rim_mm:g}",
                 way_out=f"in two dimensions the rim is cut into the array: give at most {width / 2:g} mm",
             )
-        return cls(scene, fidelity, scene.head.section(shoulders), layers, lump)
+        return cls(scene, fidelity, scene.head.section(shoulders), lump)
 
     @property
     def x_mm(self) -> float:
@@ -227,7 +224,7 @@ class PlaneSection(Record, eq=False):
     @property
     def most_reach_mm(self) -> float:
         """How far from the lump's axis the head's edges may get."""
-        return mesh.REACH_MM + self.layers.thickness_mm
+        return mesh.REACH_MM + self.scene.layers.thickness_mm
 
     def places_mm(self, rotation: FloatArray, origin_mm: FloatArray) -> FloatArray:
         """(n, columns) place of each column of taxels at (n,) poses, from the lump's axis."""
@@ -287,7 +284,7 @@ class PlaneSection(Record, eq=False):
         return plane.fit_empirical(over.s_mm, far.at(0.0), over.at(0.0), d_mm=d, half_width_mm=half), over.s_mm
 
     def _far(self, mean_kpa: float | FloatArray) -> plane.LineFrames:
-        far = plane.press_layers(self.layers, head=self.head, mean_kpa=mean_kpa, cell_mm=self.cell_mm)
+        far = plane.press_layers(self.scene.layers, head=self.head, mean_kpa=mean_kpa, cell_mm=self.cell_mm)
         return far.as_taxels(self.scene.head.pitch_mm)
 
     def _over(
