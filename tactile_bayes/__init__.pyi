@@ -1,6 +1,5 @@
 from tactile_bayes import errors as errors
 from tactile_bayes.actions.record import record as record
-from tactile_bayes.api.arrays import scan as scan
 from tactile_bayes.api.comparing import Comparison as Comparison
 from tactile_bayes.api.comparing import compare as compare
 from tactile_bayes.api.diagnosing import Diagnosis as Diagnosis
@@ -15,6 +14,7 @@ from tactile_bayes.api.maps import demo_scan as demo_scan
 from tactile_bayes.api.maps import map_of as map_of
 from tactile_bayes.api.maps import read_map as read_map
 from tactile_bayes.api.maps import read_scan as read_scan
+from tactile_bayes.api.maps import scan as scan
 from tactile_bayes.api.maps import simulate as simulate
 from tactile_bayes.api.pooled import PooledSize as PooledSize
 from tactile_bayes.api.repeatability import calibrate_repeatability as calibrate_repeatability

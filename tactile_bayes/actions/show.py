@@ -9,14 +9,23 @@ from typing import Any
 import click
 import numpy as np
 
-from tactile_bayes.files.documents import dump_json
-from tactile_bayes.files.identify import describe
-from tactile_bayes.files.size_json import SHIPPED, size_calibration_path
+from tactile_bayes.declarations import as_dict
+from tactile_bayes.errors import BadDataError, in_file
+from tactile_bayes.files import scan_mcap
+from tactile_bayes.files.documents import dump_json, load_json, load_schema, parse_json
+from tactile_bayes.files.map_nc import read_map_and_header
+from tactile_bayes.files.netcdf import Group, open_netcdf
+from tactile_bayes.files.reading import HDF5_MAGIC, MCAP_MAGIC, first_bytes, is_json
+from tactile_bayes.files.size_json import SHIPPED, read_repeatability, read_size_calibration, size_calibration_path
+from tactile_bayes.files.tables import header_of, read_table
+from tactile_bayes.findings import finding_lines, findings_in
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.select import intervals, missing_records
+from tactile_bayes.mapping.select import Span, intervals, missing_records, with_times
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.scans import Scan
+from tactile_bayes.scans import HeadGeometry, Scan
 from tactile_bayes.shell import padded, shown_columns
+from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.pooling import Calibration
 
 
 def show_action(file: Path, as_json: bool) -> None:
@@ -79,3 +88,224 @@ def describe_scan(scan: Scan) -> list[str]:
 def _rate(times: FloatArray) -> str:
     steps, usual = intervals([times])
     return f"{1 / usual:.1f} Hz" if len(steps) else "no rate"
+
+
+# --- What a file is, by its first bytes, and the facts that it holds.
+
+_UNITS = {"sigma": "mm", "d": "mm", "amplitude": "1 is the background"}
+_ACCOUNT = (
+    *("frames_lost", "head_dropped", "poses_repeated", "poses_flagged", "flagged_why", "poses_missing", "missing_why"),
+    *("other_tools", "overrun_bytes", "ended_by", "fault"),
+)
+_TABLES = ("trial", "excision", "exams", "population", "size_table", "phantom_maps")
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """Describe a file of ours: ``schema``, ``kind``, and shape, units, quality and provenance as the kind has them."""
+    head = first_bytes(path, 4096)
+    if head.startswith(MCAP_MAGIC):
+        return _scan(path)
+    if head.startswith(HDF5_MAGIC):
+        with open_netcdf(path, way_out="it may be cut short; make it again") as netcdf:
+            group = netcdf.group("posterior")
+            if group is not None and "schema" in group.attributes():
+                return _posterior(group)
+        return _map(path)
+    if is_json(head):
+        return _json(path)
+    return _table(path)
+
+
+def _posterior(group: Group) -> dict[str, Any]:
+    attributes = group.attributes()
+    return {
+        "schema": attributes["schema"],
+        "kind": "posterior",
+        "method": attributes.get("method", ""),
+        "chains": group.dimension("chain"),
+        "draws": group.dimension("draw"),
+        "variables": [name for name in group.variables() if name not in ("chain", "draw")],
+        "units": {"_mm": "mm", "_rad": "rad", "others": "as the map: 1 is the background"},
+        **_told(parse_json(attributes.get("estimate", "{}"))),
+        "diagnostics": parse_json(attributes.get("diagnostics", "{}")),
+        "provenance": parse_json(attributes.get("provenance", "{}")),
+    }
+
+
+def _told(document: Any) -> dict[str, Any]:
+    """Verdict of an estimate and what speaks against it, in sentences; nothing of a document without them."""
+    if not isinstance(document, dict) or "findings" not in document:
+        return {}
+    return {"verdict": document.get("verdict"), "findings": finding_lines(findings_in(document["findings"]))}
+
+
+def _map(path: Path) -> dict[str, Any]:
+    tactile_map, header = read_map_and_header(path)
+    ny, nx = tactile_map.mean.shape
+    unit = tactile_map.recipe.value_unit
+    return {
+        "schema": header.schema,
+        "kind": "map",
+        "shape": {"ny": ny, "nx": nx},
+        "extent_mm": {"x": nx * tactile_map.recipe.cell_mm, "y": ny * tactile_map.recipe.cell_mm},
+        "units": {"x": "mm", "y": "mm", "mean": "1 is the background" if unit == "1" else unit or "unknown"},
+        "covered_cells": int(tactile_map.covered.sum()),
+        "background": tactile_map.background,
+        "frames": tactile_map.frame_count,
+        "patient_frame": tactile_map.patient_from_plane is not None,
+        **({} if tactile_map.nipple_mm is None else {"nipple_mm": tactile_map.nipple_mm.tolist()}),
+        "findings": finding_lines(tactile_map.findings),
+        "recipe": as_dict(tactile_map.recipe),
+        **({} if tactile_map.head is None else {"head": as_dict(tactile_map.head)}),
+        "quality": dict(tactile_map.quality),
+        "masked_taxels": list(tactile_map.masked_taxels),
+        "provenance": header.provenance,
+    }
+
+
+def _json(path: Path) -> dict[str, Any]:
+    document: Any = load_json(path, way_out="give one of this program's files")
+    if isinstance(document, list) and document and isinstance(document[0], dict):
+        return {"schema": document[0].get("schema"), "kind": "list", "length": len(document)}
+    schema = document.get("schema") if isinstance(document, dict) else None
+    if not isinstance(schema, str) or not schema.startswith("tactile-bayes/"):
+        raise _foreign(path)
+    if schema.startswith("tactile-bayes/size-calibration/"):
+        return _described(read_size_calibration(path), document)
+    if schema.startswith("tactile-bayes/site-calibration/"):
+        return _site_calibration(path, document)
+    if schema.startswith("tactile-bayes/repeatability/"):
+        return _repeatability(path, document)
+    kept = {name: value for name, value in document.items() if name not in ("schema", "modalities")}
+    return {"schema": schema, "kind": schema.split("/")[1], **kept, **_told(document)}
+
+
+def _site_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
+    calibration = read_size_calibration(path)
+    assert isinstance(calibration, BodyCalibration)
+    assert calibration.site is not None
+    site = calibration.site
+    middle, low, high = site.percent(site.phantoms_log_width)
+    kept = ("base", "phantoms", "maps", "mean", "covariance", "uses_fat", "fit", "cautions", "left_out")
+    told = {name: document["site"][name] for name in kept}
+    return {
+        "schema": document["schema"],
+        "kind": "size calibration corrected by phantoms",
+        "correction": {"percent": middle, "percent_interval": [low, high], **told},
+        "base": _described(calibration, document["base"]),
+        "provenance": document["provenance"],
+    }
+
+
+def _repeatability(path: Path, document: dict[str, Any]) -> dict[str, Any]:
+    found = read_repeatability(path)
+    provenance = dict(document["provenance"])
+    if isinstance(inputs := provenance.get("inputs"), list):  # those of a long list that are no exam's draws
+        drawn = [isinstance(one, dict) and str(one.get("role")).startswith("draws_") for one in inputs]
+        provenance["inputs"] = [one for one, left_out in zip(inputs, drawn, strict=True) if not left_out]
+    kept = ("between_map_sd", "log_sd", "median", "low", "high", "probability", "masses", "maps", "calibration")
+    return {
+        "schema": document["schema"],
+        "kind": "spread between exams of one mass at a site",
+        "in_words": found.words(),
+        **{name: document[name] for name in (*kept, "half_width") if name in document},
+        "units": {"between_map_sd, median, low, high, half_width": "share of the size"},
+        "repeats": {one["name"]: f"{len(one['exams'])} exams" for one in document["repeats"]},
+        "outlying": document["outlying"],
+        "left_out": document["left_out"],
+        "provenance": provenance,
+    }
+
+
+def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, Any]:
+    """Facts of a calibration's document, without its long arrays."""
+    if isinstance(calibration, BodyCalibration):
+        kept = ("form", "source", "bodies", "recipe", "centre", "constants", "domain", "fit", "provenance")
+        return {
+            "schema": document["schema"],
+            "kind": "size calibration",
+            "head": str(calibration.recipe.head),
+            "units": _UNITS,
+            **{name: document[name] for name in kept},
+            "variance_taken_away_by_knowing": calibration.unknowns,
+            "residual_points": 0 if calibration.residual is None else len(calibration.residual.points),
+            "fat_mm": None if calibration.depth is None else list(calibration.depth.fat_mm),
+            "other_sd": calibration.other_sd,
+            "other_source": calibration.spread.other_source,
+        }
+    of_axis = ("mean", "domain", "fit", "reference_amplitude")
+    return {
+        "schema": document["schema"],
+        "kind": "size calibration",
+        "form": document["form"],
+        "axes": document["axes"],
+        "recipe": document["recipe"],
+        "draws": len(calibration.x.draws),
+        "units": _UNITS,
+        "residual_correlation": document["residual_correlation"],
+        **{axis: {name: document[axis][name] for name in of_axis} for axis in ("x", "y")},
+        "provenance": document["provenance"],
+    }
+
+
+def _table(path: Path) -> dict[str, Any]:
+    """Describe a CSV table whose header fits one of the schemas."""
+    header = header_of(path)
+    for name in _TABLES:
+        schema = load_schema(f"{name}.table.json")
+        required = {f["name"] for f in schema["fields"] if f.get("constraints", {}).get("required")}
+        if header and required <= set(header):
+            table = read_table(path, f"{name}.table.json")
+            filled = [n for n, values in table.columns.items() if any(v is not None for v in values)]
+            kind = f"table: {name.replace('_', ' ')}"
+            return {"schema": schema["$id"], "kind": kind, "rows": len(table), "columns": filled}
+    raise _foreign(path)
+
+
+def _foreign(path: Path) -> BadDataError:
+    return BadDataError(
+        "is empty" if not path.stat().st_size else "is no scan, map, table or report that `show` can describe",
+        way_out="bring arrays, grids and images in with `tactile-bayes import`; settings and scenes are plain text",
+        path=str(path),
+    )
+
+
+def _scan(path: Path) -> dict[str, Any]:
+    """Summarise frames, poses, duration, losses, session and provenance; memory grows by one time per message.
+
+    Nothing looks into the messages: those that hold what they must not are not met.
+    """
+    records = scan_mcap.scan_records(path, keep=())
+    with in_file(path):
+        head = scan_mcap.attached(records, HeadGeometry, "head.json")
+        time_s = scan_mcap.message_times(records.messages("/pressure", schema="foxglove.Grid"), topic="/pressure")
+        pose_s = scan_mcap.message_times(records.messages("/pose", schema="foxglove.PoseInFrame"), topic="/pose")
+        touches = {
+            name: len(records.messages("/landmark", schema="foxglove.PoseInFrame", name=name))
+            for name in (*scan_mcap.LANDMARK_NAMES, scan_mcap.NIPPLE)
+        }
+        findings = with_times(scan_mcap.file_findings(records), Span.of(time_s), Span.of(pose_s))
+        provenance = scan_mcap.provenance_of(records)
+    span_s = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
+    account = records.metadata.get("recording", {})  # of the recorder, where it wrote the file
+    told = {name: account[name] for name in _ACCOUNT if account.get(name)}
+    logs = [number for number, channel in records.channels.items() if channel.topic == "/log"]
+    return {
+        "schema": scan_mcap.SCAN_SCHEMA,
+        "kind": "scan",
+        "complete": records.finished and not records.lost,
+        "findings": finding_lines(findings),
+        "frames": len(time_s),
+        "taxels": list(head.shape),
+        "poses": len(pose_s),
+        "duration_s": span_s,
+        "frame_rate_hz": (len(time_s) - 1) / span_s if span_s > 0 else None,
+        "frames_missing": missing_records(time_s),
+        "notes": sum(len(records.by_channel.get(number, ())) for number in logs),
+        **({"recording": told} if told else {}),
+        "landmarks": all(touches[name] for name in scan_mcap.LANDMARK_NAMES),
+        "nipple": touches[scan_mcap.NIPPLE] > 0,
+        "units": {"counts": "raw, 0 to saturation", "pressure": "kPa", "position": "mm", "time": "s"},
+        "session": dict(records.metadata.get("session", {})),
+        "provenance": provenance,
+    }

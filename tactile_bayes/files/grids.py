@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,7 +16,7 @@ from tactile_bayes.files.arrays_layout import GridOptions
 from tactile_bayes.files.images import read_image
 from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, AXES, Grid, read_named, turned_by_axes
 from tactile_bayes.findings import Finding
-from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
+from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap, block_sums
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
@@ -55,7 +55,11 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
     text = "\n".join(texts)
     marks = (*words, text_lines.NO_SENSEL) if "ASCII_DATA" in text else tuple(words)
     before, rows, after, notes = rows[:first], rows[first:last], rows[last:], list[str]()
-    _refuse_several(rows, first)
+    for number, row in enumerate(rows, start=first):  # blank lines and titles of frames separate tables, not rows
+        if (blank := len(row) <= 1 and not any(row)) or _is_title(row):
+            what = f"has {'a blank line' if blank else repr(row[0][:20])} after row {number}"
+            way_out = "give one grid, such as one frame or a mean of frames, in a file; frames with poses are a scan"
+            raise BadDataError(what, way_out=way_out)
     for part, where in ((before, "before"), (after, "after")):
         if lines := [said for row in part if (said := " ".join(filter(None, row)))]:
             more = f" and {len(lines) - 1} more" if len(lines) > 1 else ""
@@ -68,7 +72,6 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
         if alike := sum(field == mark for row in rows for field in row):
             notes.append(f"{alike:,} cells hold {mark!r}, which is no value")
     _refuse_labels(values)
-    _refuse_list(values)
     named = _UNITS_LINE.search(text)
     units = "" if named is None else "kPa" if named[1].lower() == "kpa" else named[1]
     sides = {side: float(number) * MM_PER_UNIT[unit or "mm"] for side, number, unit in _SPACING_LINE.findall(text)}
@@ -114,34 +117,19 @@ def _is_title(row: Sequence[str]) -> bool:
     return row[0][:5].lower() == "frame"
 
 
-def _refuse_several(rows: Sequence[list[str]], before: int) -> None:
-    """Refuse several tables: blank lines and titles of frames separate tables, not rows."""
-    for number, row in enumerate(rows, start=before):
-        blank = len(row) <= 1 and not any(row)
-        if blank or _is_title(row):
-            what = f"has {'a blank line' if blank else repr(row[0][:20])} after row {number}"
-            way_out = "give one grid, such as one frame or a mean of frames, in a file; frames with poses are a scan"
-            raise BadDataError(what, way_out=way_out)
-
-
 def _values(rows: Sequence[list[str]], marks: Sequence[str], before: int) -> FloatArray:
-    for number, row in enumerate(rows, start=before + 1):
-        if len(row) != len(rows[0]):
-            what = f"row {number} has {len(row)} fields, row {before + 1} has {len(rows[0])}"
+    """The numbers of rows of one length, NaN for marks; the way out of anything else is by what it is."""
+    for number, held in enumerate(rows, start=before + 1):
+        if len(held) != len(rows[0]):
+            what = f"row {number} has {len(held)} fields, row {before + 1} has {len(rows[0])}"
             raise BadDataError(what, way_out="give every row one length")
     none = {"", *marks}
-    if not all(field in none or is_number(field) for row in rows for field in row):
-        raise _no_number(rows, none, before)
-    return np.array([[np.nan if field in none else float(field) for field in row] for row in rows])
-
-
-def _no_number(rows: Sequence[list[str]], marks: set[str], before: int) -> BadDataError:
-    """The fault of the first field that is no number, with the way out for what it is."""
     fields = ((i, j, field) for i, row in enumerate(rows, before + 1) for j, field in enumerate(row, 1))
-    faults = [one for one in fields if one[2] not in marks and not is_number(one[2])]
+    faults = [one for one in fields if one[2] not in none and not is_number(one[2])]
+    if not faults:
+        return np.array([[np.nan if field in none else float(field) for field in row] for row in rows])
     row, column, field = faults[0]
     alike = sum(one[2] == field for one in faults) - 1
-    what = f"row {row}, column {column} holds {field[:30]!r}" + (f" (and {alike} more do)" if alike else "")
     way_out = f"if it means no value, give --no-value {field[:30]}"
     if len(faults) > 1 and all(one[1] == 1 for one in faults) and len(faults) >= len(rows) - 1:
         way_out = "leave out the column of names"
@@ -149,11 +137,12 @@ def _no_number(rows: Sequence[list[str]], marks: set[str], before: int) -> BadDa
         way_out = f"leave out the labels of rows and columns; {way_out}"
     elif re.search(r"\d", field) and "#" not in field:  # 1.#QNAN and #DIV/0! are words
         way_out = "write numbers as 1.5"
-    return BadDataError(what, way_out=way_out)
+    more = f" (and {alike} more do)" if alike else ""
+    raise BadDataError(f"row {row}, column {column} holds {field[:30]!r}{more}", way_out=way_out)
 
 
 def _refuse_labels(table: FloatArray) -> None:
-    """Refuse numbers of rows and columns, or their places, in the first row and column: they are no readings."""
+    """Refuse numbers or places of rows and columns in the first of these, and a list of x, y and value: no readings."""
     row, column = table[0], table[:, 0]
     both = np.isnan(table[0, 0]) and _evenly(row[1:]) and _evenly(column[1:])
     for found, line, where in (
@@ -168,21 +157,15 @@ def _refuse_labels(table: FloatArray) -> None:
         if len(line) >= text_lines.FEWEST_LABELS and _evenly(line) and not any(map(_evenly, beside)):
             what = f"{name} 1 runs in equal steps ({_first_three(line)}...)"
             raise BadDataError(what, way_out="leave out times or places; frames that stand one a row are a scan")
+    nx, ny = (len(np.unique(line)) for line in (column, table[:, 1 % table.shape[1]]))
+    each_once = table.shape[1] == 3 and len(np.unique(table[:, :2], axis=0)) == len(table)
+    if each_once and nx > 2 and ny > 2 and nx * ny == len(table):
+        what = f"is a list of {len(table)} values with their places, on {nx} by {ny} of them"
+        raise BadDataError(what, way_out="give the values as rows and columns (pandas: pivot)")
 
 
 def _first_three(line: FloatArray) -> str:
     return ", ".join(f"{value:g}" for value in line[:3])
-
-
-def _refuse_list(table: FloatArray) -> None:
-    """Refuse a list of x, y and value, whose first two columns name each place of a lattice once."""
-    if table.shape[1] != 3 or len(table) < 9:
-        return
-    nx, ny = (len(np.unique(table[:, column])) for column in (0, 1))
-    places = len(np.unique(table[:, :2], axis=0))
-    if nx > 2 and ny > 2 and nx * ny == places == len(table):
-        what = f"is a list of {len(table)} values with their places, on {nx} by {ny} of them"
-        raise BadDataError(what, way_out="give the values as rows and columns (pandas: pivot)")
 
 
 def _evenly(line: FloatArray) -> bool:
@@ -261,16 +244,6 @@ _MOST_CONSTANT: Final = 8
 _FEWEST_LINES: Final = 8
 _TIMES_OF_LINES: Final = 10.0
 """A line stands apart where its median step to both sides is so many times the largest of the other lines."""
-
-
-def without_values(values: FloatArray, no_value: Sequence[str]) -> tuple[FloatArray, list[str]]:
-    """The values with NaN where they are one of `no_value`, and how many there were of each."""
-    notes = []
-    for number in [float(text) for text in no_value if is_number(text)]:
-        same = (values == number) | (values == np.float64(np.float32(number)))
-        values = np.where(same, np.nan, values)
-        notes.append(f"{int(same.sum()):,} cells hold {number:g}, stated to be no value")
-    return values, notes
 
 
 def _refuse_apart(values: FloatArray) -> None:
@@ -387,6 +360,7 @@ def grid_map(grid: Grid, asked: GridOptions) -> tuple[TactileMap, list[str]]:
     is given, which makes it ``"gain"``.
     """
     spacing, notes = _spacing(grid, given=asked.spacing_mm)
+    marked: list[str] = []
     mean = _real(grid.arrays["mean"], name="mean")
     if mean.ndim != 2 or 0 in mean.shape:
         raise BadDataError(f"mean has shape {mean.shape}", way_out="it must be (ny, nx)")
@@ -395,7 +369,11 @@ def grid_map(grid: Grid, asked: GridOptions) -> tuple[TactileMap, list[str]]:
         what = f"{mean.shape[0]} x {mean.shape[1]} cells of {spacing:g} mm are {longest / 1000:.3g} m long"
         way_out = "one frame a row, or frames below each other? import them as a scan; otherwise check the spacing"
         raise BadDataError(what, way_out=way_out)
-    values, marked = without_values(mean, asked.no_value)
+    values = mean
+    for number in [float(text) for text in asked.no_value if is_number(text)]:
+        same = (values == number) | (values == np.float64(np.float32(number)))
+        values = np.where(same, np.nan, values)
+        marked.append(f"{int(same.sum()):,} cells hold {number:g}, stated to be no value")
     arrays = {**grid.arrays, "mean": values}
     if "count" in arrays and arrays["count"].shape == mean.shape:
         arrays["count"] = np.where(np.isnan(values) & ~np.isnan(mean), 0, arrays["count"])
@@ -431,13 +409,9 @@ def _averaged(made: TactileMap, times: int) -> TactileMap:
     square = block_sums(weight * (np.nan_to_num(made.variance) + np.nan_to_num(made.mean) ** 2), times) / each
     variance = np.maximum(square - mean**2, 0.0) if made.counts_known else np.where(known, 0.0, np.nan)
     count = np.where(known, total if made.counts_known else 1.0, 0.0).astype(np.int64)
-    axes = {"x_mm": made.x_mm, "y_mm": made.y_mm}
-    for name, axis in axes.items():
-        step = float(axis[1] - axis[0]) if len(axis) > 1 else 0.0
-        first = float(axis[0]) + (times - 1) / 2 * step
-        axes[name] = np.asarray(first + times * step * np.arange(-(-len(axis) // times)), dtype=np.float64)
+    x_mm, y_mm = (axis[::times] + (times - 1) / 2 * np.ptp(axis[:2]) for axis in (made.x_mm, made.y_mm))
     recipe = replace(made.recipe, cell_mm=times * made.recipe.cell_mm)
-    return replace(made, mean=mean, variance=variance, count=count, recipe=recipe, **axes)
+    return replace(made, mean=mean, variance=variance, count=count, x_mm=x_mm, y_mm=y_mm, recipe=recipe)
 
 
 def _divided(made: TactileMap, level: float | str) -> TactileMap:
@@ -493,14 +467,36 @@ def _spacing(grid: Grid, *, given: float | None) -> tuple[float, list[str]]:
 
 
 def _map(arrays: dict[str, np.ndarray[Any, Any]], *, spacing_mm: float, normalise: str, units: str) -> TactileMap:
-    mean = _numbers(arrays["mean"], name="mean", like=arrays["mean"])
-    count = _count(arrays.get("count"), mean)
-    variance = _variance(arrays.get("variance"), count)
-    _check_level(mean[count > 0], normalise=normalise, units=units)
+    """The map of a grid that is in kPa or divided by its level as the caller declares.
+
+    Where the file has no more than the mean, a value is of 1 reading, and its variance 0. A variance may be NaN where a
+    cell has a single reading: a sample variance, numpy's with ddof=1, does not exist there.
+    """
+    mean = _numbers(arrays, "mean")
+    held = _numbers(arrays, "count") if "count" in arrays else np.isfinite(mean).astype(np.float64)
+    if index := _first((held < 0) | (held != np.floor(held)) | np.isnan(held)):
+        raise BadDataError(f"count is {held[index]:g} at {index}", way_out="give whole numbers from 0 up")
+    count = held.astype(np.int64)
+    if index := _first((count > 0) & np.isnan(mean)):
+        raise BadDataError(f"mean is NaN at {index}, where count is {count[index]}", way_out="set count to 0 there")
+    if not count.any():
+        raise BadDataError("no cell holds data", way_out="give at least one finite value")
+    variance = _numbers(arrays, "variance") if "variance" in arrays else np.zeros(mean.shape)
+    if index := _first((count > 0) & ~(variance >= 0) & ~((count == 1) & np.isnan(variance))):
+        what = f"variance is {variance[index]:g} at {index}, where count is {count[index]}"
+        raise BadDataError(what, way_out="it must not be negative, and NaN (not known) only where count is 0 or 1")
+    median = float(np.median(mean[count > 0]))
+    if units.strip().lower() == "kpa" and median > _MOST_KPA:
+        what = f"the median value is {median:.4g} kPa"
+        raise BadDataError(what, way_out="looks like Pa, give --units Pa, or divide by 1000")
+    low, high = _NORMALISED_MEDIAN
+    if normalise != "none" and not low <= median <= high:
+        what = f"the median value is {median:.4g}, not near 1 as --normalise {normalise} says"
+        raise BadDataError(what, way_out="divide by the level first, or give its unit and --level fit")
     y_mm, x_mm = ((np.arange(n) - (n - 1) / 2) * spacing_mm for n in mean.shape)
     return TactileMap(
         mean=np.where(count > 0, mean, np.nan),
-        variance=variance,
+        variance=np.where(count > 0, variance, np.nan),
         count=count,
         x_mm=x_mm,
         y_mm=y_mm,
@@ -516,10 +512,10 @@ def _real(array: np.ndarray[Any, Any], *, name: str) -> FloatArray:
     return np.asarray(array, dtype=np.float64)
 
 
-def _numbers(array: np.ndarray[Any, Any], *, name: str, like: np.ndarray[Any, Any]) -> FloatArray:
-    values = _real(array, name=name)
-    if values.shape != like.shape:
-        raise BadDataError(f"{name} has shape {values.shape}", way_out=f"it must be {like.shape}, as mean")
+def _numbers(arrays: Mapping[str, np.ndarray[Any, Any]], name: str) -> FloatArray:
+    values, shape = _real(arrays[name], name=name), arrays["mean"].shape
+    if values.shape != shape:
+        raise BadDataError(f"{name} has shape {values.shape}", way_out=f"it must be {shape}, as mean")
     if index := _first(np.isinf(values)):
         raise BadDataError(f"{name} is infinite at {index}", way_out="mark cells without data by NaN")
     return values
@@ -528,45 +524,3 @@ def _numbers(array: np.ndarray[Any, Any], *, name: str, like: np.ndarray[Any, An
 def _first(wrong: BoolArray) -> tuple[int, ...]:
     """Index of the first cell that is; empty without one."""
     return tuple(int(i) for i in np.argwhere(wrong)[0]) if wrong.any() else ()
-
-
-def _count(held: np.ndarray[Any, Any] | None, mean: FloatArray) -> IndexArray:
-    """Readings per cell: 1 where there is a value, unless the file has counts."""
-    if held is None:
-        count = np.isfinite(mean).astype(np.int64)
-    else:
-        values = _numbers(held, name="count", like=mean)
-        if index := _first((values < 0) | (values != np.floor(values)) | np.isnan(values)):
-            raise BadDataError(f"count is {values[index]:g} at {index}", way_out="give whole numbers from 0 up")
-        count = values.astype(np.int64)
-        if index := _first((count > 0) & np.isnan(mean)):
-            raise BadDataError(f"mean is NaN at {index}, where count is {count[index]}", way_out="set count to 0 there")
-    if not count.any():
-        raise BadDataError("no cell holds data", way_out="give at least one finite value")
-    return count
-
-
-def _variance(held: np.ndarray[Any, Any] | None, count: IndexArray) -> FloatArray:
-    """Variance within a cell: 0 in a grid without variances, NaN where there is no data.
-
-    It may also be NaN where a cell has a single reading: a sample variance, numpy's with ddof=1, does not exist there.
-    """
-    if held is None:
-        return np.where(count > 0, 0.0, np.nan)
-    variance = _numbers(held, name="variance", like=count)
-    if index := _first((count > 0) & ~(variance >= 0) & ~((count == 1) & np.isnan(variance))):
-        what = f"variance is {variance[index]:g} at {index}, where count is {count[index]}"
-        raise BadDataError(what, way_out="it must not be negative, and NaN (not known) only where count is 0 or 1")
-    return np.where(count > 0, variance, np.nan)
-
-
-def _check_level(values: FloatArray, *, normalise: str, units: str) -> None:
-    """Refuse values that cannot be what the caller declares: divided by their level, or in kPa."""
-    median = float(np.median(values))
-    if units.strip().lower() == "kpa" and median > _MOST_KPA:
-        what = f"the median value is {median:.4g} kPa"
-        raise BadDataError(what, way_out="looks like Pa, give --units Pa, or divide by 1000")
-    low, high = _NORMALISED_MEDIAN
-    if normalise != "none" and not low <= median <= high:
-        what = f"the median value is {median:.4g}, not near 1 as --normalise {normalise} says"
-        raise BadDataError(what, way_out="divide by the level first, or give its unit and --level fit")

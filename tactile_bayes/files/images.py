@@ -99,11 +99,8 @@ def _decoded(data: bytes) -> Grid:
         image.load()
         ImageOps.exif_transpose(image, in_place=True)  # what its own reader has not done already
         mode, pixels = image.mode, np.asarray(image.convert("RGBA") if image.mode == "P" else image)
-    values, without = _grey(pixels, mode)
-    values, without = described.read(values, without)
     notes += [f"turned as its orientation ({turned}) says"] if turned != 1 else []
-    held = {"mean": np.where(without, np.nan, values)}
-    return Grid(held, resolution_mm=described.spacing_mm, notes=(*notes, *described.notes))
+    return _numbered(*_grey(pixels, mode), described, notes)
 
 
 def _choose_page(image: Any) -> None:
@@ -151,27 +148,25 @@ class _Facts(Record):
     no_value: float | None = None  #: As the file numbers it.
     spacing_mm: tuple[float, float] | None = None
 
-    def read(self, values: np.ndarray[Any, Any], without: BoolArray) -> tuple[FloatArray, BoolArray]:
-        """The numbers in the file from what Pillow makes of them, and where there are none."""
-        top = 2.0**self.bits - 1
-        if self.kind == 2 and self.bits == 8:
-            values = values.astype(np.uint8).view(np.int8)
-        elif self.kind == 1 and self.bits == 32:
-            values = values.view(np.uint32)
-        numbers: FloatArray = np.asarray(values, dtype=np.float64)
-        if self.bits < 8:  # stretched to 0..255
-            numbers = numbers * (top / 255)
-        raw = top - numbers if self.white_is_zero and self.bits <= 8 else numbers  # turned round already
-        if self.no_value is not None:
-            without = without | (raw == np.float64(self.no_value)) | (raw == np.float64(np.float32(self.no_value)))
-        return (top - raw if self.white_is_zero else raw), without
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What of it the values no longer show."""
-        turned = ["its zero is white: values are turned round, so that more is brighter"] if self.white_is_zero else []
-        marked = [] if self.no_value is None else [f"{self.no_value:g} is no value in it, as the file says"]
-        return (*turned, *marked)
+def _numbered(values: np.ndarray[Any, Any], without: BoolArray, facts: _Facts, notes: list[str]) -> Grid:
+    """The numbers in the file from what Pillow makes of them, NaN where there are none."""
+    top = 2.0**facts.bits - 1
+    if facts.kind == 2 and facts.bits == 8:
+        values = values.astype(np.uint8).view(np.int8)
+    elif facts.kind == 1 and facts.bits == 32:
+        values = values.view(np.uint32)
+    raw: FloatArray = np.asarray(values, dtype=np.float64)
+    if facts.bits < 8:  # stretched to 0..255
+        raw = raw * (top / 255)
+    if facts.white_is_zero:
+        raw = top - raw if facts.bits <= 8 else raw  # turned round already
+        notes.append("its zero is white: values are turned round, so that more is brighter")
+    if (no_value := facts.no_value) is not None:
+        without = without | (raw == np.float64(no_value)) | (raw == np.float64(np.float32(no_value)))
+        notes.append(f"{no_value:g} is no value in it, as the file says")
+    values = np.where(without, np.nan, top - raw if facts.white_is_zero else raw)
+    return Grid({"mean": values}, resolution_mm=facts.spacing_mm, notes=tuple(notes))
 
 
 def _png_facts(data: bytes, info: Mapping[Any, Any]) -> _Facts:

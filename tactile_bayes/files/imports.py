@@ -21,7 +21,7 @@ from tactile_bayes.files.named_arrays import Source, is_text, plain_names, read_
 from tactile_bayes.files.npz import Arrays
 from tactile_bayes.files.reading import kind_of
 from tactile_bayes.files.scan_mcap import read_scan
-from tactile_bayes.files.scan_text import IDENTITY, read_frames, read_poses, seen
+from tactile_bayes.files.scan_text import is_identity, read_frames, read_poses, seen
 from tactile_bayes.files.sequence_mha import is_sequence, read_sequence
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.select import other_units
@@ -64,23 +64,6 @@ def import_arrays(path: Path, given: ArrayMap, beside: Sequence[Source] = ()) ->
         same = {name, "pose_matrix"} if name in ("position_mm", "quaternion_wxyz") else {name}
         of_it = (one.path for one in reversed(beside) if one.path and same & set(one.arrays))
         raise error.at(next(of_it, path)) from None
-
-
-def _over(given: Stated, said: Stated) -> Stated:
-    """What is stated by the caller, and otherwise by a file."""
-    more = {name: value for name, value in said.given.items() if getattr(given, name) is None}
-    if given.unit not in (None, said.unit):
-        more.pop("saturation", None)  # in the file's unit
-    return replace(given, **more)
-
-
-def _overridden(given: Stated, said: Stated) -> list[str]:
-    """A line for each thing that the caller states and a file says otherwise."""
-    return [
-        f"{name.replace('_', '-')} {ours} as stated, where the file says {theirs}"
-        for name, theirs in said.given.items()
-        if (ours := getattr(given, name)) not in (None, theirs)
-    ]
 
 
 def _read(path: Path, given: ArrayMap, beside: Sequence[Source]) -> Source:
@@ -170,8 +153,14 @@ def combined(sources: Sequence[Source], given: Stated) -> tuple[Scan, list[str]]
     for source in sources:
         if "head_surface_mm" in source.arrays:
             checked_on = source.checked_on
-        told += [*_overridden(given, source.stated), *source.notes]
-        stated = _over(stated, source.stated)
+        said = source.stated.given
+        for name, theirs in said.items():
+            if (ours := getattr(given, name)) not in (None, theirs):
+                told.append(f"{name.replace('_', '-')} {ours} as stated, where the file says {theirs}")
+        told += source.notes
+        if stated.unit not in (None, source.stated.unit):
+            said.pop("saturation", None)  # in the file's unit
+        stated = replace(stated, **{name: value for name, value in said.items() if getattr(stated, name) is None})
         held |= {name: np.asarray(one) for name, one in source.arrays.items()}
     _leave_out_gaps(held, stated, told)
     _check_numbers(held)
@@ -229,10 +218,7 @@ def _leave_out_gaps(held: Arrays, stated: Stated, told: list[str]) -> None:
     if not parts or any(one.dtype.kind not in "iuf" or one.ndim < 2 or len(one) != len(time) for one in parts):
         return  # whatever is wrong is told later
     numbers = np.hstack([one.reshape(len(time), -1) for one in parts]).astype(np.float64)
-    same = (
-        numbers[:, :12] == IDENTITY[layout] if numbers[:, :12].shape[1] == len(IDENTITY[layout]) else np.zeros((1, 1))
-    )
-    if np.isfinite(numbers).all() and not same.all(axis=1).any():
+    if np.isfinite(numbers).all() and not is_identity(numbers, layout).any():
         return
     found = seen(time, numbers, [""] * len(time), layout=layout)
     held.update(found.arrays)
@@ -301,7 +287,20 @@ def _frames(held: Arrays, stated: Stated, told: list[str]) -> None:
         told.append(f"frames of shape {counts.shape} read along the last axis, which is as long as their times")
         counts = np.moveaxis(counts, -1, 0)
     if counts.ndim == 2:
-        counts = _unfolded(counts, held, stated, told)
+        beside = (held[name] for name in ("head_surface_mm", "gain_kpa_per_count") if name in held)
+        shape = stated.frame_shape or next((one.shape[:2] for one in beside if one.ndim > 1), None)
+        each = f"frames of {counts.shape[1]} numbers (counts has shape {counts.shape})"
+        if shape is None:
+            raise BadDataError(each, way_out="give --frame-shape ROWS COLUMNS, or --head-geometry HEAD.json")
+        if shape[0] * shape[1] != counts.shape[1]:
+            what = f"{each}, and {_sides(shape)} taxels are {shape[0] * shape[1]}"
+            way_out = "give --frame-shape ROWS COLUMNS, or --skip-columns for those before the readings"
+            raise BadDataError(what, way_out=way_out)
+        along = stated.frame_order or "rows"
+        if stated.frame_order is None or stated.frame_shape is None:
+            told.append(f"each {counts.shape[1]} numbers read as {_sides(shape)}, along the array's {along}")
+        by_columns = counts.reshape(-1, shape[1], shape[0]).swapaxes(1, 2)
+        counts = by_columns if along == "columns" else counts.reshape(-1, *shape)
     elif stated.frame_shape is not None and counts.shape[1:] != stated.frame_shape:
         what = f"frames have {_sides(counts.shape[1:])} taxels, not {_sides(stated.frame_shape)}"
         raise BadDataError(what, way_out="leave --frame-shape out")
@@ -318,36 +317,16 @@ def _sides(shape: Sequence[int]) -> str:
     return " x ".join(map(str, shape))
 
 
-def _unfolded(counts: np.ndarray[Any, Any], held: Arrays, stated: Stated, told: list[str]) -> np.ndarray[Any, Any]:
-    """Frames of one row each, folded into rows and columns."""
-    beside = (held[name] for name in ("head_surface_mm", "gain_kpa_per_count") if name in held)
-    shape = stated.frame_shape or next((one.shape[:2] for one in beside if one.ndim > 1), None)
-    each = f"frames of {counts.shape[1]} numbers (counts has shape {counts.shape})"
-    if shape is None:
-        raise BadDataError(each, way_out="give --frame-shape ROWS COLUMNS, or --head-geometry HEAD.json")
-    if shape[0] * shape[1] != counts.shape[1]:
-        what = f"{each}, and {_sides(shape)} taxels are {shape[0] * shape[1]}"
-        way_out = "give --frame-shape ROWS COLUMNS, or --skip-columns for those before the readings"
-        raise BadDataError(what, way_out=way_out)
-    by_columns = stated.frame_order == "columns"
-    if stated.frame_order is None or stated.frame_shape is None:
-        along = "columns" if by_columns else "rows"
-        told.append(f"each {counts.shape[1]} numbers read as {_sides(shape)}, along the array's {along}")
-    if by_columns:
-        return counts.reshape(len(counts), shape[1], shape[0]).swapaxes(1, 2)
-    return counts.reshape(len(counts), *shape)
-
-
 def _clocks(held: Arrays, stated: Stated) -> None:
     """Times in s, on the frames' clock."""
-    if "frame_time_s" in held:
-        held["frame_time_s"] = held["frame_time_s"] * _SECONDS[stated.time_unit or "s"]
-    elif stated.rate_hz is not None and "counts" in held:
-        held["frame_time_s"] = np.arange(len(held["counts"])) / stated.rate_hz
-    if "pose_time_s" in held:
-        held["pose_time_s"] = held["pose_time_s"] * _SECONDS[stated.pose_time_unit or "s"]
-    elif stated.pose_rate_hz is not None and "position_mm" in held:
-        held["pose_time_s"] = np.arange(len(held["position_mm"])) / stated.pose_rate_hz
+    for time, each, unit, rate in (
+        ("frame_time_s", "counts", stated.time_unit, stated.rate_hz),
+        ("pose_time_s", "position_mm", stated.pose_time_unit, stated.pose_rate_hz),
+    ):
+        if time in held:
+            held[time] = held[time] * _SECONDS[unit or "s"]
+        elif rate is not None and each in held:
+            held[time] = np.arange(len(held[each])) / rate
     if "pose_time_s" in held and stated.pose_offset_s:
         held["pose_time_s"] = held["pose_time_s"] + stated.pose_offset_s
 
@@ -473,32 +452,29 @@ def _check_units(arrays: Arrays, *, calibrated: bool) -> None:
     if not calibrated and (full_scale > 1000.0 or 0 < full_scale < 0.5):
         what = f"gain_kpa_per_count gives {full_scale:.4g} kPa at 4095 counts"
         raise BadDataError(what, way_out="looks like Pa or MPa, give kPa")
-    _check_clock(arrays["frame_time_s"], arrays["pose_time_s"])
-    _check_pitch(surface, float(arrays["pitch_mm"]))
-
-
-def _check_clock(frame_time_s: np.ndarray[Any, Any], pose_time_s: np.ndarray[Any, Any]) -> None:
-    for (name, option), times in zip(_TIME_OPTIONS.items(), (frame_time_s, pose_time_s), strict=True):
-        step = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
-        if len(times) > 1 and times[0] == times.min() == times.max():
-            raise BadDataError(f"{name} is {times[0]:g} throughout", way_out="give its times, not a constant")
-        if step > 0.5:
-            what = f"{name} steps by {step:.4g}"
-            raise BadDataError(what, way_out=f"looks like milliseconds, give s or --{option} ms")
-    (a, b), (c, d) = ((float(times.min()), float(times.max())) for times in (frame_time_s, pose_time_s))
-    if b < c or d < a:
-        what = f"frame_time_s ({a:.3f} to {b:.3f}) and pose_time_s ({c:.3f} to {d:.3f}) do not overlap"
-        raise BadDataError(what, way_out="give both on one clock: --pose-offset-s is added to the poses' times")
-
-
-def _check_pitch(surface: np.ndarray[Any, Any], pitch_mm: float) -> None:
-    for axis in (0, 1):
-        if surface.shape[axis] < 2:
-            continue
+    _check_clocks(arrays)
+    pitch_mm = float(arrays["pitch_mm"])
+    for axis in (one for one in (0, 1) if surface.shape[one] > 1):
         spacing = float(np.median(np.linalg.norm(np.diff(surface, axis=axis), axis=-1)))
         if not 0.8 * pitch_mm <= spacing <= 1.25 * pitch_mm:
             what = f"head_surface_mm has elements {spacing:.4g} mm apart along axis {axis}, pitch_mm is {pitch_mm:.4g}"
             raise BadDataError(what, way_out="give both in mm, for the same head")
+
+
+def _check_clocks(arrays: Arrays) -> None:
+    ends = []
+    for name, option in _TIME_OPTIONS.items():
+        times = arrays[name]
+        if len(times) > 1 and times[0] == times.min() == times.max():
+            raise BadDataError(f"{name} is {times[0]:g} throughout", way_out="give its times, not a constant")
+        if len(times) > 1 and (step := float(np.median(np.diff(times)))) > 0.5:
+            what = f"{name} steps by {step:.4g}"
+            raise BadDataError(what, way_out=f"looks like milliseconds, give s or --{option} ms")
+        ends.append((float(times.min()), float(times.max())))
+    (a, b), (c, d) = ends
+    if b < c or d < a:
+        what = f"frame_time_s ({a:.3f} to {b:.3f}) and pose_time_s ({c:.3f} to {d:.3f}) do not overlap"
+        raise BadDataError(what, way_out="give both on one clock: --pose-offset-s is added to the poses' times")
 
 
 def _scan(arrays: Arrays, facts: Mapping[str, str], checked_on: str) -> Scan:

@@ -79,22 +79,19 @@ def read_named(path: Path, choose: Choose) -> Arrays:
         elif start.startswith(b"CDF"):
             arrays = _netcdf_3(path)
         else:
-            raise _of_another_kind(path, start)
+            what = f"is not an .npz, .npy, .mat or HDF5 file (it starts with {start[:6]!r})"
+            way_out = "save the arrays with numpy.savez_compressed"
+            if start.startswith(reading.MCAP_MAGIC):
+                what, way_out = "is a scan", "give it as it is"
+            elif path.suffix.lower() == ".mat":
+                what, way_out = "is not a .mat of version 5 to 7.3", "save it with save(..., '-v7')"
+            raise BadDataError(what, way_out=way_out)
         return {name: arrays[name] for name in choose(list(arrays))}
 
 
 def is_text(path: Path) -> bool:
     """True for a file that is none of arrays by its first bytes and its suffix, and may be a text."""
     return path.suffix.lower() not in ARRAY_SUFFIXES and not reading.first_bytes(path, _LOOKED_AT).startswith(_KNOWN)
-
-
-def _of_another_kind(path: Path, start: bytes) -> BadDataError:
-    if start.startswith(reading.MCAP_MAGIC):
-        return BadDataError("is a scan", way_out="give it as it is")
-    if path.suffix.lower() == ".mat":
-        return BadDataError("is not a .mat of version 5 to 7.3", way_out="save it with save(..., '-v7')")
-    what = f"is not an .npz, .npy, .mat or HDF5 file (it starts with {start[:6]!r})"
-    return BadDataError(what, way_out="save the arrays with numpy.savez_compressed")
 
 
 AXES: Final = ("x", "y")  #: Places of the columns and rows of a grid, or of each of its cells.
@@ -270,13 +267,21 @@ def array_template(path: Path | None) -> str:
     """TOML for `read_array_map` to fill in: of a file, with its arrays and those that their shapes tell."""
     shapes = {} if path is None else {name: one.shape for name, one in read_named(path, list).items()}
     held = [f"#   {name}: {' x '.join(map(str, shape)) or 'one value'}" for name, shape in shapes.items()]
-    told = ["# The file has:", *held, ""] if held else []
+    lines = [_HEADING.format(path=path or "a file"), *(["# The file has:", *held, ""] if held else []), "[arrays]"]
     words = {name: f"{in_words(one.shape)}: {one.meaning}" for name, one in LAYOUT.items()}
     words |= {name: f"may be left out; {words[name]}" for name in OPTIONAL}
     words["pose_matrix"] = "m, 4, 4: in place of position_mm and quaternion_wxyz"
     guessed = _guessed(shapes)
-    lines = [_line(name, guessed, shapes, meaning) for name, meaning in words.items()]
-    return "\n".join([_HEADING.format(path=path or "a file"), *told, "[arrays]", *lines, _VALUES])
+    for name, meaning in words.items():
+        if name in shapes:
+            lines.append(f"# {name}: found under this name")
+        elif name == "counts" and "frames" in shapes:
+            lines.append("# counts: found as frames")
+        else:
+            said = f"{name} = {dump_json(guessed[name]).strip()}  # guessed" if name in guessed else f'# {name} = ""'
+            lines.append(said)
+        lines += textwrap.wrap(meaning, _COLUMNS, initial_indent="#   ", subsequent_indent="#   ")
+    return "\n".join([*lines, _VALUES])
 
 
 _PLAIN_WORDS: Final[Mapping[str, tuple[str, ...]]] = {
@@ -316,18 +321,6 @@ def plain_names(
         if len(alike) == 1:
             found[here] = alike[0]
     return found
-
-
-def _line(name: str, guessed: Mapping[str, str], shapes: Mapping[str, Shape], told: str) -> str:
-    if name in shapes:
-        line = f"# {name}: found under this name"
-    elif name == "counts" and "frames" in shapes:
-        line = "# counts: found as frames"
-    elif name in guessed:
-        line = f"{name} = {dump_json(guessed[name]).strip()}  # guessed"
-    else:
-        line = f'# {name} = ""'
-    return "\n".join([line, *textwrap.wrap(told, _COLUMNS, initial_indent="#   ", subsequent_indent="#   ")])
 
 
 def _guessed(shapes: Mapping[str, Shape]) -> dict[str, str]:

@@ -44,7 +44,14 @@ def load_npz(path: Path, *, required: Sequence[str], optional: Sequence[str]) ->
 def choose_npz(path: Path, choose: Callable[[Sequence[str]], Iterable[str]]) -> Arrays:
     """Read the arrays that `choose` takes from the names in an .npz file; for the errors see `load_npz`."""
     with reading.open_input(path) as stream:
-        _check_zip(stream)
+        start = stream.read(6)
+        if not zipfile.is_zipfile(stream):
+            what, way_out = f"is not an .npz file (it starts with {start!r})", "save it with numpy.savez_compressed"
+            if start.startswith(reading.ZIP_MAGIC[:2]):
+                what, way_out = "is a zip archive that is cut off (no directory at its end)", "copy it again"
+            elif start == np.lib.format.MAGIC_PREFIX:
+                what, way_out = "is a single .npy array", "save all arrays in one file with numpy.savez_compressed"
+            raise BadDataError(what, way_out=way_out)
         with reading.decoding("is not a whole .npz file", way_out="copy it again"), zipfile.ZipFile(stream) as archive:
             members = {name.removesuffix(".npy"): archive.getinfo(name) for name in archive.namelist()}
             if members and not any(name.endswith(".npy") for name in archive.namelist()):
@@ -70,17 +77,6 @@ def load_npy(path: Path) -> Arrays:
     if array.dtype.names is None:
         return {"frames": array}
     return {name: array[name] for name in array.dtype.names}
-
-
-def _check_zip(stream: IO[bytes]) -> None:
-    start = stream.read(6)
-    if zipfile.is_zipfile(stream):
-        return
-    if start.startswith(reading.ZIP_MAGIC[:2]):
-        raise BadDataError("is a zip archive that is cut off (no directory at its end)", way_out="copy it again")
-    if start == np.lib.format.MAGIC_PREFIX:
-        raise BadDataError("is a single .npy array", way_out="save all arrays in one file with numpy.savez_compressed")
-    raise BadDataError(f"is not an .npz file (it starts with {start!r})", way_out="save it with numpy.savez_compressed")
 
 
 def _array(stream: IO[bytes], length: int, name: str) -> np.ndarray[Any, np.dtype[Any]]:

@@ -33,7 +33,7 @@ from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.named_arrays import Source
 from tactile_bayes.files.text_lines import NO_SENSEL, Line, counts_up, number, read_text_table, unit_of_time
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import BoolArray, FloatArray
 
 # --- Poses: columns by their names, or numbers in a stated layout.
 
@@ -68,13 +68,7 @@ _BARE: Final = {"wxyz": 7, "xyzw": 7, "euler": 6, "matrix": 16}
 """Numbers of a pose in a text without names, by its layout; a time and a station may stand before them."""
 _MOST_NUMBERS: Final = 20  # of a pose with what stands before it
 _MOST_STATIONS: Final = 16
-IDENTITY: Final[Mapping[str, FloatArray]] = {
-    "matrix": np.eye(4).ravel()[:12],
-    "wxyz": np.eye(7)[3],
-    "xyzw": np.eye(7)[6],
-    "euler": np.zeros(6),
-}
-"""Numbers that a server goes on sending while a tool is out of sight, of a pose by its layout."""
+_IDENTITY: Final = {"matrix": np.eye(4).ravel()[:12], "wxyz": np.eye(7)[3], "xyzw": np.eye(7)[6], "euler": np.zeros(6)}
 _LARGEST_MM: Final = 1e7  # NDI writes -3.697314e28 where a tool is not seen
 
 
@@ -107,7 +101,14 @@ def seen(
     `numbers` are (m, k) places and then rotations in the layout, or (m, 16) matrices; `why` says why a row has no pose,
     by its status, and is empty where it has one.
     """
-    reasons = [reason or _without(row, layout) for reason, row in zip(why, numbers, strict=True)]
+    faults = {
+        "without numbers": ~np.isfinite(numbers).all(axis=1),
+        "with numbers that mean none": (np.abs(numbers) > _LARGEST_MM).any(axis=1),
+        "with the identity": is_identity(numbers, layout),
+        "without a rotation": ~numbers[:, 3:].any(axis=1) & (layout in ("wxyz", "xyzw")),
+    }
+    read = np.select(list(faults.values()), list(faults), "")
+    reasons = [said or str(found) for said, found in zip(why, read, strict=True)]
     keep = np.array([not reason for reason in reasons], dtype=bool)
     counted = ", ".join(f"{number} {reason}" for reason, number in Counter(filter(None, reasons)).most_common())
     if not keep.any():
@@ -121,17 +122,10 @@ def seen(
     return Source(arrays, Stated(**{"pose_layout": layout, **stated}), notes)
 
 
-def _without(row: FloatArray, layout: str) -> str:
-    """Why the numbers of a row are no pose; empty where they are one."""
-    if not np.isfinite(row).all():
-        return "without numbers"
-    if (np.abs(row) > _LARGEST_MM).any():
-        return "with numbers that mean none"
-    if np.array_equal(row[:12], IDENTITY[layout]):
-        return "with the identity"
-    if layout == "matrix":
-        return ""
-    return "without a rotation" if layout != "euler" and not row[3:].any() else ""
+def is_identity(numbers: FloatArray, layout: str) -> BoolArray:
+    """Rows that hold what a server goes on sending while a tool is out of sight."""
+    held, same = numbers[:, :12], _IDENTITY[layout]
+    return (held == same).all(axis=1) if held.shape[1] == len(same) else np.zeros(len(held), dtype=bool)
 
 
 def chosen(names: Sequence[str], given: Stated, *, what: str) -> str:
@@ -194,7 +188,10 @@ def _of_one_tool(
     sets = [i for i, kind in enumerate(kinds) if kind == names[3]]
     at = sets[0]
     if len(sets) > 1:
-        numbered = [f"{i + 1}{_port_before(header.fields[:one])}" for i, one in enumerate(sets)]
+        numbered = []
+        for i, one in enumerate(sets, start=1):  # NDI's ToolBox names the tool before its columns
+            ports = [name for name in header.fields[:one] if name.lower().startswith("port ")]
+            numbered.append(f"{i} ({' '.join(ports[-1].split())})" if ports else f"{i}")
         at = sets[numbered.index(chosen(numbered, given, what=f"{len(sets)} groups of columns"))]
     ahead = not set(_PLACE) & set(kinds[: sets[0]])  # a tool's place stands behind its rotation, not before it
     columns = {kind: _nearest(kinds, kind, at, pose=kind in names, ahead=ahead) for kind in set(kinds) if kind}
@@ -203,12 +200,6 @@ def _of_one_tool(
         tool = chosen(list(dict.fromkeys(_field(line, columns["tool"]) for line in rows)), given, what="its rows")
         held = [line for line in rows if _field(line, columns["tool"]) == tool]
     return columns, held
-
-
-def _port_before(names: Sequence[str]) -> str:
-    """What NDI's ToolBox calls the tool of the columns that follow; empty where nothing does."""
-    ports = [name for name in names if name.lower().startswith("port ")]
-    return f" ({' '.join(ports[-1].split())})" if ports else ""
 
 
 def _nearest(kinds: Sequence[str], kind: str, at: int, *, pose: bool, ahead: bool) -> int:
@@ -243,7 +234,8 @@ def _unseen(status: Sequence[str], given: Stated) -> list[str]:
 
 def _times(rows: Sequence[Line], columns: Mapping[str, int], header: Line, given: Stated) -> tuple[FloatArray, str]:
     """Times of all rows and their unit where the header says it."""
-    held = {name: _values(rows, column) for name, column in columns.items() if name in _TIMES}
+    named = ("time", "seconds", "nanoseconds", "frame")
+    held = {name: _values(rows, columns[name]) for name in named if name in columns}
     if "time" in held and not np.isfinite(held["time"]).any():
         what = f"its column of times holds {_field(rows[0], columns['time'])!r}, which is no time that is known"
         way_out = "write s, HH:MM:SS.s or YYYY-MM-DD HH:MM:SS.s, or leave it out and give --pose-rate-hz"
@@ -257,9 +249,6 @@ def _times(rows: Sequence[Line], columns: Mapping[str, int], header: Line, given
         raise BadDataError(f"has {counted}", way_out="give the tracker's rate, --pose-rate-hz HZ")
     number = _settled(held["frame"]) if "frame" in held else np.arange(len(rows), dtype=np.float64)
     return (number - number[0]) / given.pose_rate_hz, "s"
-
-
-_TIMES: Final = ("time", "seconds", "nanoseconds", "frame")
 
 
 def _settled(values: FloatArray) -> FloatArray:
@@ -458,45 +447,37 @@ def _said(before: Iterable[Line]) -> tuple[Stated, list[str]]:
 
 
 def _said_in(text: str) -> Iterable[tuple[str, Any]]:
-    unit = _UNIT_LINE.search(text)
-    word = unit[1] if unit else (named[1] if (named := _UNIT_WORD.search(text)) else "")
+    word = _UNIT_LINE.search(text) or _UNIT_WORD.search(text)
     if _FULL_SCALE.search(text):
         yield "unit", "counts"
-    elif word.lower() in _UNITS:
-        yield "unit", _UNITS[word.lower()]
-    for pattern, option, made in (
-        (_PERIOD_LINE, "rate_hz", lambda value: 1 / value),
-        (_RATE_LINE, "rate_hz", float),
-        (_SATURATION_LINE, "saturation", float),
-    ):
+    elif word and word[1].lower() in _UNITS:
+        yield "unit", _UNITS[word[1].lower()]
+    for pattern, option in ((_PERIOD_LINE, "rate_hz"), (_RATE_LINE, "rate_hz"), (_SATURATION_LINE, "saturation")):
         if (found := pattern.search(text)) and (value := float(found[found.lastindex or 1].replace(",", "."))) > 0:
-            yield option, made(value)
+            yield option, 1 / value if pattern is _PERIOD_LINE else value
 
 
 def _of_blocks(lines: Sequence[Line], blocks: Sequence[Sequence[Line]], stated: Stated, notes: list[str]) -> Source:
+    """Frames of a block each, with their times where each has one above it."""
     frames = np.array([[line.values for line in block] for block in blocks], dtype=np.float64)
-    arrays = {"frames": frames}
-    first = blocks[0][0].number
-    times = _times_between([line for line in lines if not line.is_numbers], [block[0].number for block in blocks])
-    if times is not None:
-        arrays["frame_time_s"] = times
-        notes.append("times of the frames by the lines above them")
-    notes.append(f"{len(frames)} frames, each a block of {frames.shape[1]} rows (the first at line {first})")
-    return Source(arrays, stated, tuple(notes))
-
-
-def _times_between(titles: Sequence[Line], starts: Sequence[int]) -> FloatArray | None:
-    """A time above each block, in s; None where one has none."""
-    found, before = [], 0
-    for start in starts:
-        texts = [line.text for line in titles if before < line.number < start]
-        match = next((one for text in reversed(texts) if (one := _TIME_LINE.search(text))), None)
-        time = None if match is None else number(match[1], decimal_comma=True)
-        if match is None or time is None:
-            return None
-        found.append(time * (0.001 if (match[2] or "").lower() == "ms" else 1.0))
+    titles = [line for line in reversed(lines) if not line.is_numbers]
+    times, before = [], 0
+    for start in (block[0].number for block in blocks):
+        above = (_TIME_LINE.search(line.text) for line in titles if before < line.number < start)
+        found = next(filter(None, above), None)
+        time = None if found is None else number(found[1], decimal_comma=True)
+        if found is None or time is None:
+            break
+        times.append(time * (0.001 if (found[2] or "").lower() == "ms" else 1.0))
         before = start
-    return np.array(found)
+    arrays = {"frames": frames}
+    if len(times) == len(frames):
+        arrays["frame_time_s"] = np.array(times)
+        notes.append("times of the frames by the lines above them")
+    notes.append(
+        f"{len(frames)} frames, each a block of {frames.shape[1]} rows (the first at line {blocks[0][0].number})"
+    )
+    return Source(arrays, stated, tuple(notes))
 
 
 def _of_rows(rows: Sequence[Line], names: Sequence[str], given: Stated, stated: Stated, notes: list[str]) -> Source:
@@ -526,13 +507,6 @@ def _of_rows(rows: Sequence[Line], names: Sequence[str], given: Stated, stated: 
     return Source(arrays, stated, tuple(notes))
 
 
-def _numbered_alike(names: Sequence[str], taxels: int) -> list[int]:
-    """The columns whose names differ by their numbers only, where there are as many as taxels; else none."""
-    stems = [re.sub(r"\d+", "0", name) for name in names]
-    alike = [stem for stem, number in Counter(stems).items() if number == taxels]
-    return [i for i, stem in enumerate(stems) if alike == [stem]]
-
-
 def _columns(values: FloatArray, names: list[str], taxels: int | None, given: Stated) -> tuple[int | None, list[int]]:
     """Columns of times (None without) and of readings: as stated, by their names, else by how many there are."""
     width = values.shape[1]
@@ -543,8 +517,10 @@ def _columns(values: FloatArray, names: list[str], taxels: int | None, given: St
     first = given.skip_columns
     if first is None and (timed or others):
         readings = [i for i in range(width) if i not in (*timed, *others)]
-        if taxels is not None and len(readings) != taxels:
-            readings = _numbered_alike(names, taxels) or readings
+        if taxels is not None and len(readings) != taxels:  # by names that differ by their numbers only
+            stems = [re.sub(r"\d+", "0", name) for name in names]
+            alike = [stem for stem, number in Counter(stems).items() if number == taxels]
+            readings = [i for i, stem in enumerate(stems) if alike == [stem]] or readings
         if taxels is None or len(readings) == taxels:
             return (timed[0] if timed else None), readings
         told = ", ".join(repr(one) for one in (*names[:3], *names[-1:]))

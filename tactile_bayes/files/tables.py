@@ -50,9 +50,20 @@ def read_text(path: Path) -> str:
 
 
 def _raw(path: Path, text: str) -> RawTable:
-    """Split CSV text into cells; columns without a name or any filled cell are left out."""
+    """Split CSV text into cells; blank rows, and columns without a name or any filled cell, are left out."""
     separator = separator_in(text)
-    (_, header), *body = _rows(text, separator) or [(1, [])]
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
+    rows: list[tuple[int, list[str]]] = []
+    before = 0
+    try:
+        for cells in reader:
+            if any(cells):
+                rows.append((before + 1, cells))
+            before = reader.line_num
+    except csv.Error as error:
+        what = f"line {before + 1}: not CSV ({error})"
+        raise BadDataError(what, way_out="check the quotes and line ends around it") from None
+    (_, header), *body = rows or [(1, [])]
     end = len(header)
     while end and not header[end - 1] and not any(cell for _, cells in body for cell in cells[end - 1 :]):
         end -= 1
@@ -92,22 +103,6 @@ def composed(text: str) -> str:
 def may_be_thousands(number: str) -> bool:
     """True when the comma of a number may separate thousands as well as decimals: 1,234; not 0,234, 1,23, 1234,567."""
     return _THOUSANDS.fullmatch(number) is not None
-
-
-def _rows(text: str, separator: str) -> list[tuple[int, list[str]]]:
-    """Rows that are not blank, each with its first line number."""
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
-    rows: list[tuple[int, list[str]]] = []
-    before = 0
-    try:
-        for cells in reader:
-            if any(cells):
-                rows.append((before + 1, cells))
-            before = reader.line_num
-    except csv.Error as error:
-        what = f"line {before + 1}: not CSV ({error})"
-        raise BadDataError(what, way_out="check the quotes and line ends around it") from None
-    return rows
 
 
 # --- Reading of comma-separated tables under a Table Schema, with each bad cell named in one line.
@@ -173,8 +168,11 @@ def read_table(source: Path | Sheet, schema_name: str) -> Table:
             row = dict(zip(header, cells, strict=True))
             row |= {name: composed(row.get(name, "")) for name in keys}
             for name, field in fields.items():
-                cell = row.get(name, "")
-                columns[name].append(_parse_cell(line, cell, field=field, decimal_comma=raw.decimal_comma))
+                try:
+                    cell = _parse_cell(row.get(name, ""), field, decimal_comma=raw.decimal_comma)
+                except BadDataError as refusal:
+                    raise _fault(line, name, refusal.what, way_out=refusal.way_out) from None
+                columns[name].append(cell)
     table = Table(path=path, columns=columns, line_numbers=[line for line, _ in body])
     first: dict[tuple[Any, ...], int] = {}
     for index, key in enumerate(_keys(table, keys)):
@@ -259,8 +257,7 @@ def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Ta
 def _check_header(header: Sequence[str], fields: Mapping[str, Any], *, wide: str) -> None:
     for name in header:
         if name not in fields:
-            advice = _other_table(header, fields) or _advice_on_column(name, header, fields)
-            advice += f", or {wide}" if wide else ""
+            advice = _advice_on_column(name, header, fields) + (f", or {wide}" if wide else "")
             raise _fault(1, name, "is not known here", way_out=advice)
         if header.count(name) > 1:
             raise _fault(1, name, "appears more than once", way_out="keep one of them")
@@ -271,25 +268,21 @@ def _check_header(header: Sequence[str], fields: Mapping[str, Any], *, wide: str
         raise _fault(1, missing[0], "is missing", way_out=f"add it: {first}{also}")
 
 
-def _other_table(header: Sequence[str], fields: Mapping[str, Any]) -> str:
-    """Advice where a header is another table's, such as of trial and excision that were exchanged; else empty."""
-    for kind in ("trial", "excision"):
+def _advice_on_column(name: str, header: Sequence[str], fields: Mapping[str, Any]) -> str:
+    """Advice on a name that is not known: one of another table (trial and excision exchanged), or mistyped."""
+    for kind, held in (("trial", "readings"), ("excision", "sizes after excision")):
         other = {one["name"]: one for one in load_schema(f"{kind}.table.json")["fields"]}
         needed = {name for name, one in other.items() if _is_required(one)}
         if list(other) != list(fields) and needed <= set(header) <= set(other):
-            what = "readings" if kind == "trial" else "sizes after excision"
-            return f"this is the table of {what}: give the other one here"
-    return ""
-
-
-def _advice_on_column(name: str, header: Sequence[str], fields: Mapping[str, Any]) -> str:
-    stem, _, unit = name.strip().lower().rpartition("_")
+            return f"this is the table of {held}: give the other one here"
+    name = name.strip().lower()
+    stem, _, unit = name.rpartition("_")
     if unit in MM_PER_UNIT and unit != "mm" and f"{stem}_mm" in fields:
         return f"convert it to {stem}_mm (multiply by {MM_PER_UNIT[unit]:g})"
     wanted = [field for field in fields if field not in header]
-    if f"{name.strip().lower()}_mm" in wanted:
-        return f"did you mean {name.strip().lower()}_mm, in millimetres?"
-    near = difflib.get_close_matches(name.strip().lower(), wanted, n=1, cutoff=0.7)
+    if f"{name}_mm" in wanted:
+        return f"did you mean {name}_mm, in millimetres?"
+    near = difflib.get_close_matches(name, wanted, n=1, cutoff=0.7)
     return f"did you mean {near[0]}?" if near else f"remove it; the columns are {_names(fields)}"
 
 
@@ -302,24 +295,40 @@ def _check_length(line: int, cells: Sequence[str], header: Sequence[str]) -> Non
     raise BadDataError(f"line {line}: {len(cells)} cells under {len(header)} columns", way_out=way_out)
 
 
-def _parse_cell(line: int, text: str, *, field: Mapping[str, Any], decimal_comma: bool) -> Any:
-    """Parse a cell by the schema's type; None where it is blank and may be."""
-    name = field["name"]
+def _parse_cell(text: str, field: Mapping[str, Any], *, decimal_comma: bool) -> Any:
+    """A cell by the schema's type and rules; None where it is blank and may be. Errors do not say where it stands."""
     if text == "":
         if _is_required(field):
-            raise _fault(line, name, "is blank", way_out=f"fill it in: {field['description']}")
+            raise BadDataError("is blank", way_out=f"fill it in: {field['description']}")
         return None
-    try:
-        if text != text.strip() or not text.isprintable():
-            what = f"{_shown(text)} has blanks or unprintable characters around or in it"
-            raise BadDataError(what, way_out="remove them")
-        if decimal_comma and field["type"] == "number":
-            text = _with_point(text)
-        value = _parsed(text, field)
-        _check_constraints(value, text, field)
-    except BadDataError as refusal:
-        raise _fault(line, name, refusal.what, way_out=refusal.way_out) from None
+    if text != text.strip() or not text.isprintable():
+        what = f"{_shown(text)} has blanks or unprintable characters around or in it"
+        raise BadDataError(what, way_out="remove them")
+    if decimal_comma and field["type"] == "number":
+        text = _with_point(text)
+    value = _parsed(text, field)
+    rules = field.get("constraints", {})
+    if value == 0 and "exclusiveMinimum" in rules and "ifZero" in field:
+        raise BadDataError("is 0", way_out=field["ifZero"])
+    for rule, (holds, words) in _LIMITS.items():
+        if rule in rules and not holds(value, rules[rule]):
+            what = f"{_shown(text)} is not {words} {rules[rule]}"
+            raise BadDataError(what, way_out=f"correct it: {field['description']}")
+    if "enum" in rules and value not in rules["enum"]:
+        near = difflib.get_close_matches(text.lower(), rules["enum"], n=1)
+        guess = f"did you mean {near[0]}? " if near else ""
+        raise BadDataError(f"{_shown(text)} is not known", way_out=f"{guess}it must be {' or '.join(rules['enum'])}")
+    if "pattern" in rules and not re.fullmatch(rules["pattern"], text):
+        raise BadDataError(f"{_shown(text)} does not match {rules['pattern']}", way_out=field["description"])
     return value
+
+
+_LIMITS: Final[Mapping[str, tuple[Callable[[Any, Any], bool], str]]] = {
+    "minimum": (operator.ge, "at least"),
+    "exclusiveMinimum": (operator.gt, "above"),
+    "maximum": (operator.le, "at most"),
+    "exclusiveMaximum": (operator.lt, "below"),
+}
 
 
 def _parsed(text: str, field: Mapping[str, Any]) -> Any:
@@ -375,30 +384,6 @@ def parse_date(text: str) -> date:
     if not _DATE.fullmatch(text):
         raise ValueError(text)
     return date.fromisoformat(text)
-
-
-_LIMITS: dict[str, tuple[Callable[[Any, Any], bool], str]] = {
-    "minimum": (operator.ge, "at least"),
-    "exclusiveMinimum": (operator.gt, "above"),
-    "maximum": (operator.le, "at most"),
-    "exclusiveMaximum": (operator.lt, "below"),
-}
-
-
-def _check_constraints(value: Any, text: str, field: Mapping[str, Any]) -> None:
-    rules = field.get("constraints", {})
-    if value == 0 and "exclusiveMinimum" in rules and "ifZero" in field:
-        raise BadDataError("is 0", way_out=field["ifZero"])
-    for rule, (holds, words) in _LIMITS.items():
-        if rule in rules and not holds(value, rules[rule]):
-            what = f"{_shown(text)} is not {words} {rules[rule]}"
-            raise BadDataError(what, way_out=f"correct it: {field['description']}")
-    if "enum" in rules and value not in rules["enum"]:
-        near = difflib.get_close_matches(text.lower(), rules["enum"], n=1)
-        guess = f"did you mean {near[0]}? " if near else ""
-        raise BadDataError(f"{_shown(text)} is not known", way_out=f"{guess}it must be {' or '.join(rules['enum'])}")
-    if "pattern" in rules and not re.fullmatch(rules["pattern"], text):
-        raise BadDataError(f"{_shown(text)} does not match {rules['pattern']}", way_out=field["description"])
 
 
 def _keys(table: Table, fields: Sequence[str]) -> list[tuple[Any, ...]]:

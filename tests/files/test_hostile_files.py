@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from map_files import read_grid
 
+from tactile_bayes.actions.show import describe
 from tactile_bayes.api.settings import read_settings
-from tactile_bayes.batch import open_store
+from tactile_bayes.batch_store import open_store
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.column_map import read_mapping, read_wide
 from tactile_bayes.files.documents import parse_toml, read_protocol
 from tactile_bayes.files.estimate_json import read_stated_size
-from tactile_bayes.files.identify import describe
 from tactile_bayes.files.imports import read_arrays
 from tactile_bayes.files.instrument import read_landmarks, read_scene
 from tactile_bayes.files.map_nc import read_map, write_map

@@ -12,9 +12,9 @@ from in_process import run_here
 from map_files import PROVENANCE, plain_map
 from mapping_scans import make_scan, strokes
 
+from tactile_bayes.actions.show import describe
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.identify import describe
 from tactile_bayes.files.instrument import read_landmarks
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.scan_mcap import read_scan, write_scan

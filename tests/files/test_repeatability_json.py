@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from repeated_exams import write_repeats
 
+from tactile_bayes.actions.show import describe
 from tactile_bayes.api.repeatability import exams_in, learn_from_exams
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import sha256
-from tactile_bayes.files.identify import describe
 from tactile_bayes.files.size_json import read_repeatability
 
 

@@ -221,7 +221,7 @@ def _checkpoint(folder: Path) -> bytes:
 
 
 def _store(folder: Path) -> bytes:
-    from tactile_bayes.batch import open_store
+    from tactile_bayes.batch_store import open_store
 
     with open_store(folder / "b.jsonl", settings={"seed": 1}) as store:
         for number in range(6):
@@ -236,9 +236,8 @@ def _read_scan(path: Path) -> object:
 
 
 def _describe(path: Path) -> object:
-    from tactile_bayes.actions.show import shown
+    from tactile_bayes.actions.show import describe, shown
     from tactile_bayes.files.documents import dump_json
-    from tactile_bayes.files.identify import describe
 
     found = describe(path)
     return dump_json(found), list(shown(found))
@@ -379,7 +378,7 @@ def _read_checkpoint(path: Path) -> object:
 
 
 def _read_store(path: Path) -> object:
-    from tactile_bayes.batch import open_store
+    from tactile_bayes.batch_store import open_store
 
     copy = path.with_suffix(".copy")
     shutil.copyfile(path, copy)  # opening a store may shorten it

@@ -20,9 +20,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import tactile_bayes as tb
+from tactile_bayes.actions.show import describe
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
-from tactile_bayes.files.identify import describe
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.geometry import rotation_from_quaternion

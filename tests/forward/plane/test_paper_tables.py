@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile_bayes.actions.show import describe
 from tactile_bayes.errors import EXIT_BAD_DATA, BadDataError
 from tactile_bayes.files.documents import load_schema
-from tactile_bayes.files.identify import describe
 from tactile_bayes.files.tables import check_references, read_table, separator_in
 
 TRIAL = "trial.table.json"
