@@ -340,7 +340,7 @@ def _guessed(shapes: Mapping[str, Shape]) -> dict[str, str]:
     }
     for here, places in _TIMES_BESIDE.items():
         only = [free[found[name][0]] for name in places if len(found.get(name, ())) == 1]
-        only += [shapes[name] for name in places if name in shapes]
+        only += [shapes[name] for name in places if shapes.get(name)]
         ends = {max(shape[0], shape[-1], key=int) for shape in only}  # either may be that of time
         found[here] = of(lambda s, ends=ends: len(s) == 1 and s[0] in ends)  # type: ignore[misc]
     by_shape = {here: names[0] for here, names in found.items() if here not in shapes and len(names) == 1}

@@ -503,6 +503,12 @@ def test_the_template_names_what_shapes_tell_and_is_read_back(pressed: Arrays, t
     assert parse_toml(empty.stdout, way_out="") == {"arrays": {}, "values": {}}
 
 
+def test_the_template_of_single_numbers_names_them_too(tmp_path: Path) -> None:
+    """Of frames that are one number the template took an axis that they do not have."""
+    np.savez(tmp_path / "exam.npz", counts=5, position_mm=1.0, t=np.arange(3.0))
+    assert "# counts: found under this name" in array_template(tmp_path / "exam.npz")
+
+
 def test_a_name_is_found_however_its_letters_are_spelled(pressed: Arrays, tmp_path: Path) -> None:
     """A Mac may write an umlaut as two signs, and a TOML's editor as one."""
     pressed[unicodedata.normalize("NFD", "Größe")] = pressed.pop("frames")
