@@ -54,15 +54,13 @@ def door(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
 
     @wraps(function)
     def called(*args: _Given.args, **keywords: _Given.kwargs) -> _Returned:
-        if BY_OPTIONS.get():
-            return function(*args, **keywords)
         try:
             return function(*args, **keywords)
-        except BadDataError as error:
-            error.what, error.way_out = in_keywords(error.what), in_keywords(error.way_out)
-            raise
         except TactileBayesError as error:
-            error.args = (in_keywords(str(error)),)
+            if isinstance(error, BadDataError) and not BY_OPTIONS.get():
+                error.what, error.way_out = in_keywords(error.what), in_keywords(error.way_out)
+            elif not BY_OPTIONS.get():
+                error.args = (in_keywords(str(error)),)
             raise
 
     return called
