@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import BadDataError, in_file, meant
-from tactile_bayes.files.arrays_layout import KNOWN, LAYOUT, OPTIONAL, ArrayMap, Shape, Stated, in_words
+from tactile_bayes.files.arrays_layout import KNOWN, LAYOUT, OPTIONAL, ArrayMap, Stated, in_words
 from tactile_bayes.files.instrument import read_array_calibration, read_head_geometry, read_landmarks
 from tactile_bayes.files.named_arrays import Source, is_text, plain_names, read_named
 from tactile_bayes.files.npz import Arrays
@@ -175,7 +175,11 @@ def combined(sources: Sequence[Source], given: Stated) -> tuple[Scan, list[str]]
         _as_counts(held, stated, told)
     elif stated.saturation is not None:
         held["saturation_count"] = np.asarray(int(np.ceil(stated.saturation)))
-    held = {name: _squeezed(held[name], LAYOUT[name].shape) for name in LAYOUT if name in held}
+    held = {name: held[name] for name in LAYOUT if name in held}
+    for name, array in held.items():  # without axes of length 1 that MATLAB adds
+        axes = len(LAYOUT[name].shape)
+        if axes < 2 and array.ndim > axes and array.size == max(array.shape):
+            held[name] = array.reshape(-1) if axes else array.reshape(())
     for name in ("gain_kpa_per_count", "offset_kpa"):
         if name in held and held[name].size == 1 and held.get("counts", np.empty(0)).ndim == 3:
             held[name] = np.full(held["counts"].shape[1:], float(held[name].item()))  # one for all taxels
@@ -201,13 +205,6 @@ def _refuse_missing(held: Arrays, others: Sequence[str]) -> None:
             f"lacks {lacks}; not known: {', '.join(others[:_MOST_NAMES])}", way_out=f"{_TEMPLATE}; or {way_out}"
         )
     raise BadDataError(f"lacks {lacks} (it has {', '.join(sorted(held))})", way_out=f"{way_out}; {_HELP}")
-
-
-def _squeezed(array: np.ndarray[Any, Any], want: Shape) -> np.ndarray[Any, Any]:
-    """The array without axes of length 1 that MATLAB adds."""
-    if array.ndim > len(want) and (len(want) < 2) and array.size == max(array.shape, default=1):
-        return array.reshape(-1) if want else array.reshape(())
-    return array
 
 
 def _leave_out_gaps(held: Arrays, stated: Stated, told: list[str]) -> None:

@@ -286,28 +286,22 @@ def _bare(lines: Sequence[Line], given: Stated) -> Source:
         stations = [f"{one:g}" for one in np.unique(column)]
         if len(stations) <= _MOST_STATIONS < len(values):
             keep &= column == float(chosen(stations, given, what="its rows (stations)"))
-    time, unit, told = _bare_times(before[keep], given, f"has {width} numbers a row")
+    # with a rate stated, a column of whole numbers that rises counts the poses
+    before, rate_hz = before[keep], given.pose_rate_hz
+    rising = [i for i, one in enumerate(np.diff(before, axis=0).T) if (one >= 0).all() and one.any()]
+    counting = [i for i in rising if rate_hz and (before[:, i] == np.rint(before[:, i])).all()]
+    if rate_hz and (counting or not rising):
+        number = before[:, counting[-1]] if counting else np.arange(len(before), dtype=np.float64)
+        time, unit = (number - number[0]) / rate_hz, {"pose_time_unit": "s"}
+        told = f"counted in column {counting[-1] + 1}" if counting else "counted by rows"
+    elif rising:
+        time, unit, told = before[:, rising[-1]], {}, f"in column {rising[-1] + 1}"
+    else:
+        raise BadDataError(f"has {width} numbers a row, of which none is a time", way_out="give --pose-rate-hz HZ")
     notes = [f"poses as {layout} from column {width - size + 1} on, times {told}"]
     if lost := sum(line.number > rows[0].number for line in lines) + 1 - len(values):
         notes.append(f"{lost} lines of other than {width} numbers left out as gaps")
     return seen(time, numbers[keep], [""] * len(time), *notes, layout=layout, stated=unit)
-
-
-def _bare_times(before: FloatArray, given: Stated, what: str) -> tuple[FloatArray, dict[str, Any], str]:
-    """Times by the columns before the poses, their unit where it is known, and where they stand.
-
-    With a rate stated, a column of whole numbers that rises counts the poses.
-    """
-    steps = np.diff(before, axis=0).T
-    rising = [i for i, one in enumerate(steps) if (one >= 0).all() and one.any()]
-    counting = [i for i in rising if given.pose_rate_hz and (before[:, i] == np.rint(before[:, i])).all()]
-    if given.pose_rate_hz and (counting or not rising):
-        number = before[:, counting[-1]] if counting else np.arange(len(before), dtype=np.float64)
-        told = f"counted in column {counting[-1] + 1}" if counting else "counted by rows"
-        return (number - number[0]) / given.pose_rate_hz, {"pose_time_unit": "s"}, told
-    if not rising:
-        raise BadDataError(f"{what}, of which none is a time", way_out="give --pose-rate-hz HZ")
-    return before[:, rising[-1]], {}, f"in column {rising[-1] + 1}"
 
 
 # --- Frames: one row a frame, or blocks of rows, behind what their program writes first.
