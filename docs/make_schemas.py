@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any, get_args
 
 import msgspec
+from record_schema import schema_of
 
 from tactile_bayes.api.settings import SettingsFile
-from tactile_bayes.declarations import Record, schema_of
+from tactile_bayes.declarations import Record
 from tactile_bayes.files.arrays_layout import ArrayMap
 from tactile_bayes.files.column_map import ColumnMap
 from tactile_bayes.files.documents import OF_A_PERSON, Fact, FactName, Protocol, Session

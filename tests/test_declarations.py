@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from record_schema import schema_of
 
 from tactile_bayes.declarations import (
     Meta,
@@ -23,7 +24,6 @@ from tactile_bayes.declarations import (
     from_plain,
     names_of,
     replace,
-    schema_of,
     settle,
     to_plain,
 )
