@@ -22,24 +22,12 @@ from __future__ import annotations
 import dataclasses
 import math
 import types
-from collections.abc import Iterator, Mapping, Sequence
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import date
 from functools import cache
 from pathlib import Path
-from typing import (
-    TYPE_CHECKING,
-    Annotated,
-    Any,
-    ClassVar,
-    Final,
-    Literal,
-    TypeVar,
-    Union,
-    cast,
-    dataclass_transform,
-    get_args,
-    get_origin,
-)
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar, get_args, get_origin
 
 import msgspec
 from msgspec import UNSET as UNSET
@@ -55,9 +43,9 @@ MOST_SHOWN: Final = 100  #: Characters of a value that a record's repr shows; of
 
 if TYPE_CHECKING:  # to a type checker each record is frozen, as the class below makes them
 
-    @dataclass_transform(frozen_default=True, field_specifiers=(msgspec.field,))
+    @typing.dataclass_transform(frozen_default=True, field_specifiers=(msgspec.field,))
     class _Struct:
-        __struct_fields__: ClassVar[tuple[str, ...]]
+        __struct_fields__: typing.ClassVar[tuple[str, ...]]
 
         def __init_subclass__(cls, **options: Any) -> None: ...
 
@@ -96,18 +84,9 @@ class Options(Record):
     def __post_init__(self) -> None:
         for name, kind in kinds(type(self)).items():
             value = getattr(self, name)
-            if not _allowed(kind, value):
+            if _refused(kind, value, exact=True) is not None:
                 fault = _fault(kind, value, name)
                 raise UsageError(f"{fault.what}; {fault.way_out}")
-
-
-def _allowed(kind: Any, value: object) -> bool:
-    """Whether a value of Python's is what is declared, as it is: 3.0 is no whole number here."""
-    try:
-        msgspec.convert(value, kind, dec_hook=_custom)
-    except msgspec.ValidationError:
-        return False
-    return _finite(value)
 
 
 def kinds(record: Any) -> Mapping[str, Any]:
@@ -173,15 +152,20 @@ def names_of(kind: Any) -> tuple[str, ...]:
 
 def as_dict(record: Any) -> dict[str, Any]:
     """A record's values by name, those of records and data classes in it too; for what JSON holds see `to_plain`."""
-    return {name: _unfolded(getattr(record, name)) for name in names_of(record)}
+    return {name: _each(getattr(record, name), _unfolded) for name in names_of(record)}
 
 
 def _unfolded(value: Any) -> Any:
-    if isinstance(value, msgspec.Struct) or dataclasses.is_dataclass(value):
-        return as_dict(value)
+    return as_dict(value) if isinstance(value, msgspec.Struct) or dataclasses.is_dataclass(value) else value
+
+
+def _each(value: Any, changed: Callable[[Any], Any], *, lists: bool = False) -> Any:
+    """A value, or each in dictionaries, lists and tuples, `changed`; with `lists` tuples become lists."""
     if isinstance(value, dict):
-        return {key: _unfolded(one) for key, one in value.items()}
-    return type(value)(map(_unfolded, value)) if type(value) in (list, tuple) else value
+        return {key: _each(one, changed, lists=lists) for key, one in value.items()}
+    if type(value) in (list, tuple):
+        return (list if lists else type(value))(_each(one, changed, lists=lists) for one in value)
+    return changed(value)
 
 
 def from_plain(kind: type[T], document: object, *, where: str = "") -> T:
@@ -200,14 +184,10 @@ def _converted(kind: type[T], document: object) -> T:
     try:
         return msgspec.convert(document, kind, dec_hook=_custom)
     except msgspec.ValidationError:
-        return msgspec.convert(_whole(document), kind, dec_hook=_custom)
+        return msgspec.convert(_each(document, _whole), kind, dec_hook=_custom)
 
 
 def _whole(value: object) -> object:
-    if isinstance(value, dict):
-        return {key: _whole(one) for key, one in value.items()}
-    if isinstance(value, list):
-        return [_whole(one) for one in value]
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
@@ -223,16 +203,14 @@ def to_plain(record: object, *, digits: int = 9) -> Any:
 
 def rounded(value: T, digits: int = 9, *, lists: bool = False) -> T:
     """A record, or plain data, whose floats have so many significant digits; with `lists` tuples become lists."""
-    found: Any = value
-    if isinstance(value, msgspec.Struct):
-        found = type(value)(**{name: rounded(getattr(value, name), digits) for name in value.__struct_fields__})
-    elif isinstance(value, float):
-        found = float(f"{value:.{digits}g}")
-    elif isinstance(value, dict):
-        found = {key: rounded(one, digits, lists=lists) for key, one in value.items()}
-    elif isinstance(value, list | tuple):
-        found = (list if lists else type(value))(rounded(one, digits, lists=lists) for one in value)
-    return cast("T", found)
+
+    def short(one: Any) -> Any:
+        if isinstance(one, msgspec.Struct):
+            return type(one)(**{name: rounded(getattr(one, name), digits) for name in one.__struct_fields__})
+        return float(f"{one:.{digits}g}") if isinstance(one, float) else one
+
+    found: T = _each(value, short, lists=lists)
+    return found
 
 
 def schema_name(kind: Any) -> str | None:
@@ -313,10 +291,10 @@ def _of_rule(where: str, what: str, record: Any) -> str:
     return f"{where}.{what}" if what.split(" ")[0] in record.__struct_fields__ else f"{where}: {what}"
 
 
-def _refused(kind: Any, value: Any) -> Exception | None:
-    """Why a value is none of its kind; None where it is one."""
+def _refused(kind: Any, value: Any, *, exact: bool = False) -> Exception | None:
+    """Why a value is none of its kind, or with `exact` would have to be made one, as 3.0 a whole number; else None."""
     try:
-        _converted(kind, value)
+        msgspec.convert(value, kind, dec_hook=_custom) if exact else _converted(kind, value)
     except msgspec.ValidationError as error:
         return error.__cause__ if isinstance(error.__cause__, BadDataError) else error
     return None if _finite(value) else ValueError("no finite number")
@@ -379,7 +357,7 @@ def _record_for(kind: Any, value: Any) -> Any:
 def _members(kind: Any) -> tuple[Any, ...]:
     """Kinds of a union, each with its ranges; a single kind alone."""
     bare = _bare(kind)
-    return get_args(bare) if get_origin(bare) in (Union, types.UnionType) else (kind,)
+    return get_args(bare) if get_origin(bare) in (typing.Union, types.UnionType) else (kind,)
 
 
 def _bare(kind: Any) -> Any:
