@@ -240,9 +240,6 @@ class TrialSettings(Options):
     error_ratio: Annotated[
         float, says("Ratio of the ex-vivo error's variance to the modality's, for Deming lines.", ge=1e-6, le=1e6)
     ] = 1.0
-    check_intervals: Annotated[
-        int, named("TRIALS", "Simulate this many trials of this size and report how often the intervals cover.", ge=0)
-    ] = 0
     bayes: Annotated[bool, says("Predict the error of the next mass, by an errors-in-variables model and MCMC.")] = (
         False
     )

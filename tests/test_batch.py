@@ -24,13 +24,14 @@ from tactile_bayes import batch
 from tactile_bayes import batch as executors
 from tactile_bayes.batch import (
     BatchInterrupted,
+    BatchStore,
     InlineExecutor,
     cluster_executor,
     fault_lines,
     open_executor,
+    open_store,
     run_batch,
 )
-from tactile_bayes.batch_store import BatchStore, open_store
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.shell import ended_in_order
 
@@ -506,7 +507,7 @@ def test_a_killed_batch_resumes_and_its_workers_end(tmp_path, child_environment)
             import os, sys, time
             from pathlib import Path
             from tactile_bayes.batch import run_batch
-            from tactile_bayes.batch_store import BatchStore, open_store
+            from tactile_bayes.batch import BatchStore, open_store
             from tactile_bayes.batch import open_executor
 
             def slow(item):

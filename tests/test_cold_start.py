@@ -130,3 +130,9 @@ def test_what_neither_draws_nor_samples_imports_no_plot_and_no_sampler(words, ru
 def test_a_map_is_made_without_scipy_and_the_posterior(run_python, tmp_path):
     modules = imported_by(run_python("-c", RUN, "map", DEMO / "scan.mcap", "-o", "map.nc", cwd=tmp_path))
     assert not {name for name in modules if name.split(".")[0] == "scipy" or name.startswith("tactile_bayes.posterior")}
+
+
+def test_a_trial_without_posteriors_is_analysed_without_hdf5_and_the_estimates(run_python):
+    modules = imported_by(run_python("-c", RUN, "validate", DEMO / "trial.csv", "--excision", DEMO / "excision.csv"))
+    without = ("h5py", "tactile_bayes.posterior", "tactile_bayes.size", "tactile_bayes.mapping")
+    assert not {name for name in modules if name.startswith(without)}

@@ -17,9 +17,9 @@ from tactile_bayes.trial import accuracy, method_comparison
 from tactile_bayes.trial.figures import JACKKNIFE, Figure, Intervals
 from tactile_bayes.trial.lines import concordance, deming, least_squares
 from tactile_bayes.trial.method_comparison import compare_methods
-from tactile_bayes.trial.planning import ErrorModel, simulate
 from tactile_bayes.trial.readings import ModalitySizes
 from validation.common import Table, parser
+from validation.simulated_trials import ErrorModel, simulate
 
 Ends = tuple[float, float]
 ONE_EACH = np.minimum(np.arange(25), 23)

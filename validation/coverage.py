@@ -15,9 +15,9 @@ import numpy as np
 from tactile_bayes.options import IntervalMethod as Method
 from tactile_bayes.trial.accuracy import mape_ratio
 from tactile_bayes.trial.figures import Intervals
-from tactile_bayes.trial.planning import ErrorModel, check_intervals, simulate
 from tactile_bayes.trial.readings import ModalitySizes
 from validation.common import Table, parser, share
+from validation.simulated_trials import ErrorModel, check_intervals, simulate
 
 METHODS = get_args(Method)
 HEADS = {"corrected": "corrected (default)", "bca": "BCa"}

@@ -14,9 +14,9 @@ import numpy as np
 
 import tactile_bayes.trial.next_mass as model
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.trial.planning import ErrorModel
 from tactile_bayes.trial.readings import MassKey, Reading, Trial
 from validation.common import Table, parser, share
+from validation.simulated_trials import ErrorModel
 
 LEVELS = (0.5, 0.8, 0.95)
 BIAS, CALIPER = 0.05, 0.05

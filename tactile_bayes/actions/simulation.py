@@ -10,8 +10,7 @@ import click
 import numpy as np
 
 from tactile_bayes.actions.show import describe_scan
-from tactile_bayes.batch import fault_lines, open_executor, run_batch
-from tactile_bayes.batch_store import open_unfinished, unfinished
+from tactile_bayes.batch import fault_lines, open_executor, open_unfinished, run_batch, unfinished
 from tactile_bayes.declarations import as_dict, names_of
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.atomic import write_text

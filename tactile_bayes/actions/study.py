@@ -15,8 +15,15 @@ from typing import Any
 import click
 import numpy as np
 
-from tactile_bayes.batch import BatchInterrupted, Outcome, fault_lines, open_executor, run_batch
-from tactile_bayes.batch_store import open_unfinished, unfinished
+from tactile_bayes.batch import (
+    BatchInterrupted,
+    Outcome,
+    fault_lines,
+    open_executor,
+    open_unfinished,
+    run_batch,
+    unfinished,
+)
 from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import TactileBayesError, UsageError, in_file
 from tactile_bayes.files.atomic import refuse_existing, write_text

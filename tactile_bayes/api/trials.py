@@ -18,20 +18,17 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
 from tactile_bayes.files.documents import dump_json, read_protocol
-from tactile_bayes.files.estimate_json import fill_from_posteriors
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.tables import Sheet, Table, check_references, read_table
 from tactile_bayes.options import MOST_PATIENTS, Aim, PlanErrors, PlanOptions, TrialSettings
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.progress import Progress, untold
-from tactile_bayes.report.compare import Growth
-from tactile_bayes.report.pages import PageFiles
+from tactile_bayes.report.pages import Growth, PageFiles
 from tactile_bayes.report.trial import DIGITS, plan_text, trial_text
 from tactile_bayes.report.trial_html import plan_figure, trial_html
 from tactile_bayes.trial import planning
 from tactile_bayes.trial.figures import MIN_PATIENTS, Intervals, UndefinedError
 from tactile_bayes.trial.next_mass import next_mass
-from tactile_bayes.trial.planning import check_all
 from tactile_bayes.trial.readings import Trial, at_excision, readings_from_columns, unit_doubts
 from tactile_bayes.trial.summary import TrialReport, summarise
 
@@ -120,8 +117,6 @@ def analyse(
         trial, intervals=intervals, error_ratio=settings.error_ratio, seed=settings.seed, provenance=made.as_dict()
     )
     more: dict[str, Any] = {} if title is None else {"title": title}
-    if trials := settings.check_intervals:
-        more["interval_check"] = check_all(trial.sizes(), intervals=intervals, trials=trials, seed=settings.seed)
     if settings.bayes:
         rng = np.random.default_rng(settings.seed)
         more["next_mass"] = next_mass(trial, rng=rng)
@@ -144,7 +139,12 @@ def load_trial(trial: Path | Sheet, excision: Path | Sheet, columns: Path | None
     else:
         table = read_wide(trial, mapping, mapping.reading)
     check_references(table, "trial.table.json", targets={"excision": sizes})
-    filled, posteriors = fill_from_posteriors(table)
+    filled: Mapping[str, list[Any]] = table.columns
+    posteriors: list[Path] = []
+    if any(filled.get("posterior", ())):
+        from tactile_bayes.files.estimate_json import fill_from_posteriors  # h5py and the estimates' declarations
+
+        filled, posteriors = fill_from_posteriors(table)
     keys = list(zip(sizes.columns["patient"], sizes.columns["mass"], strict=True))
     readings = readings_from_columns(filled, fault=table.error)
     excised_on = dict(zip(keys, sizes.columns["date"], strict=True))

@@ -13,7 +13,7 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import open_executor
 from tactile_bayes.campaigns import report
 from tactile_bayes.campaigns.inputs import open_campaign, tidy
-from tactile_bayes.campaigns.run import FEW, Bar, Campaign, CampaignState
+from tactile_bayes.campaigns.run import FEW, Bar, Campaign, no_bar
 from tactile_bayes.campaigns.steps import CampaignSettings
 from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import UsageError
@@ -43,13 +43,13 @@ class CampaignResult(Told, eq=False):
     @property
     def failed(self) -> tuple[str, ...]:
         """A line for each of the first exams or masses that failed, and one that counts the others."""
-        faults = self.campaign.found.faults
+        faults = self.campaign.faults
         lines = [f"{name}: {fault.step}: {fault.reason}" for name, fault in list(faults.items())[:FEW]]
         more = [f"{len(faults) - FEW} more, see failures.csv"] if len(faults) > FEW else []
         return (*lines, *more)
 
     def _planned(self) -> Iterator[str]:
-        found = self.campaign.found
+        found = self.campaign
         for step, todo in found.todo.items():
             named = f" ({', '.join(found.names[step])})" if _few(found, step) and found.kept[step] else ""
             yield f"{step}: {todo} to do{named}, {found.kept[step]} done"
@@ -60,8 +60,8 @@ class CampaignResult(Told, eq=False):
         yield "Nothing was run."
 
     def _done(self, written: report.Written) -> Iterator[str]:
-        campaign, found = self.campaign, self.campaign.found
-        yield f"{self.folder}: {len(campaign.exams)} exams: {written.counts}"
+        found = self.campaign
+        yield f"{self.folder}: {len(found.exams)} exams: {written.counts}"
         yield from written.masses
         yield f"to look at: {self.folder / report.INDEX}, a row for each mass with the pages of its exams"
         yield f"{sum(found.todo.values())} steps run, {sum(found.kept.values())} kept from earlier runs"
@@ -145,11 +145,11 @@ def run_campaign(
         open_executor(workers=settings.workers, cluster=None if settings.dry_run else settings.scheduler) as executor,
     ):
         place = Path(os.path.abspath(output))  # noqa: PTH100 (links stay links)
-        run = Campaign(table, place, settings, store=store, executor=executor, dry=settings.dry_run, bar=bar)
+        run = Campaign(table, place, settings, store, executor, dry=settings.dry_run, bar=bar or no_bar)
         run.run()
         if settings.dry_run:
             return CampaignResult(run, output, None)
-        left = tidy(place, table, run.found.results, unread=run.unread)
+        left = tidy(place, table, run.files, unread=run.unread)
         written = report.write_outputs(run, unlisted=left)
         for name in (*report.WRITTEN, JOURNAL):  # the journal last: with it the copy is whole
             if settings.copy_to and (place / name).exists():
@@ -170,6 +170,6 @@ def _check_folder(table: Sequence[Exam], output: Path, settings: CampaignSetting
         raise UsageError(f"{inside} lies in the output folder {output}; choose another folder")
 
 
-def _few(found: CampaignState, step: str) -> bool:
+def _few(found: Campaign, step: str) -> bool:
     """Whether all exams or masses that need a step are known by name, and fit a line."""
     return 0 < found.todo[step] == len(found.names[step])

@@ -7,15 +7,14 @@ import hashlib
 import os
 import shutil
 import time
-from collections import UserDict, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
-from tactile_bayes.batch import CLUSTER_LOST, run_batch
-from tactile_bayes.batch_store import BatchStore, open_store
+from tactile_bayes.batch import CLUSTER_LOST, BatchStore, open_store, run_batch
 from tactile_bayes.campaigns.exams import Breasts
 from tactile_bayes.campaigns.steps import FILES, STAGED, UNWRITTEN, WAITING, Result, put_in_place, stamp
 from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
@@ -26,8 +25,9 @@ from tactile_bayes.files.reading import sha256_of, version_of
 # --- The output folder of a campaign: its journal, and the files that belong to its steps.
 
 _HEADER: Final = {"campaign": 1}
-_BESIDE: Final = ("repeatability",)  #: Steps whose files lie beside the exams.
-_OTHERS: Final = ("pool", "compare", *_BESIDE)  #: Steps that are of no single exam.
+_BESIDE: Final = "repeatability"  #: The step whose files lie beside the exams.
+SITE: Final = "site"  #: Its name: it is of no exam or mass.
+_OTHERS: Final = ("pool", "compare", _BESIDE)  #: Steps that are of no single exam.
 
 
 @contextlib.contextmanager
@@ -80,34 +80,19 @@ def unchanged(folder: Path, result: Result) -> bool:
         return False
 
 
-class StepResults(UserDict[str, Any]):
-    """Results of one step by the names of the exams or masses, read from the journal when they are asked for.
-
-    `data` is under which keys the journal has them.
-    """
-
-    def __init__(self, values: Mapping[str, Result]) -> None:
-        super().__init__()
-        self._values = values
-
-    def __getitem__(self, name: str) -> Result:
-        return self._values[self.data[name]]
-
-
 def tidy(
-    folder: Path, exams: Sequence[Exam], results: Mapping[str, Mapping[str, Result]], *, unread: Collection[str] = ()
+    folder: Path, exams: Sequence[Exam], files_of: Callable[[str, str], Collection[str]], *, unread: Collection[str]
 ) -> list[str]:
     """Remove files of earlier runs that this one would not make, and name the folders of exams no longer listed.
 
-    `unread` are exams whose file could not be read: a disk that is away costs nothing that is done.
+    `files_of` says what a step of this run made of an exam or mass; `unread` are exams whose file could not be read: a
+    disk that is away costs nothing that is done.
     """
     left = []
     spared = {*unread, *(name for exam in exams if exam.name in unread for name in (exam.of_mass, exam.of_visits))}
-    for step in _BESIDE:
-        made = {file for result in results[step].values() for file in result["files"]}
-        _clear(folder, known=FILES[step], made=made)
+    _clear(folder, known=FILES[_BESIDE], made=files_of(_BESIDE, SITE))
     for kind, names, steps in (
-        (EXAMS, {exam.name for exam in exams}, tuple(step for step in results if step not in _OTHERS)),
+        (EXAMS, {exam.name for exam in exams}, tuple(step for step in FILES if step not in _OTHERS)),
         (MASSES, {exam.of_mass for exam in exams}, ("pool",)),
         (GROWTH, {exam.of_visits for exam in exams}, ("compare",)),
     ):
@@ -116,7 +101,7 @@ def tidy(
                 left.append(f"{kind}/{name}")
             if name not in names or name in spared:
                 continue
-            made = {file for step in steps if name in results[step] for file in results[step][name]["files"]}
+            made = {file for step in steps for file in files_of(step, name)}
             _clear(folder / kind / name, known={file for step in steps for file in FILES[step]}, made=made)
         _remove_if_empty(folder / kind)
     return left

@@ -26,8 +26,9 @@ from tactile_bayes.files.tables import Table
 from tactile_bayes.findings import Finding, by_weight, capital, finding_lines, verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.report.campaign_page import ExamEntry, MassRow, VisitEntry, campaign_html, worst
-from tactile_bayes.report.compare import CompareReport, Growth, growth_line, growths
+from tactile_bayes.report.compare import CompareReport, growths
 from tactile_bayes.report.exam_words import reason_on_paper
+from tactile_bayes.report.pages import Growth, growth_line
 from tactile_bayes.trial.readings import at_excision
 
 # --- Tables: exams done, failures, and the trial table that `validate` takes.
@@ -123,13 +124,13 @@ def _of_pooled(pooled: Iterable[PooledReport]) -> dict[str, tuple[Finding, ...]]
 
 
 def _row(campaign: Campaign, exam: Exam) -> Row:
-    fault = campaign.found.faults.get(exam.name)
-    mapped = campaign.found.of("map", exam.name) or {}
+    fault = campaign.faults.get(exam.name)
+    mapped = campaign.result("map", exam.name)
     facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "synthetic": mapped.get("synthetic")}
     if fault is not None and fault.step not in ("figures", "page"):
         reason = f"{fault.step} failed: {fault.reason}"
         return Row(exam, "not_done", reason, reason, failed=True, **facts)
-    by_site = layout.SIZED in campaign.found.files("size", exam.name)
+    by_site = layout.SIZED in campaign.files("size", exam.name)
     place = campaign.folder / layout.EXAMS / exam.name / (layout.SIZED if by_site else layout.ESTIMATE)
     return Row.of(exam, read_record(place, EstimateReport), **facts)
 
@@ -137,7 +138,7 @@ def _row(campaign: Campaign, exam: Exam) -> Row:
 def pooled_reports(campaign: Campaign) -> dict[str, PooledReport]:
     """Each pooled mass, by its name."""
     folder = campaign.folder / layout.MASSES
-    return {name: read_record(folder / name / layout.POOLED, PooledReport) for name in campaign.found.results["pool"]}
+    return {name: read_record(folder / name / layout.POOLED, PooledReport) for name in campaign.keys["pool"]}
 
 
 def done_line(row: Row) -> dict[str, object]:
@@ -176,7 +177,7 @@ def failure_lines(campaign: Campaign, rows: Sequence[Row]) -> list[dict[str, obj
     failed |= {row.exam.of_mass: {**_names(row.exam), "replicate": None, "file": None} for row in rows}
     blank = {"visit": None, "replicate": None, "file": None}
     failed |= {row.exam.of_visits: {**_names(row.exam), **blank} for row in rows}
-    found = campaign.found.faults
+    found = campaign.faults
     return [failed[name] | {"step": found[name].step, "reason": found[name].reason} for name in failed if name in found]
 
 
@@ -216,7 +217,7 @@ def _together(campaign: Campaign, rows: Sequence[Row], report: PooledReport | No
         silent = all(row.status == "not_done" for row in rows)
         status = "not_done" if silent and report.max_size_mm is None else _status(report)
         return _reading(exam, POOLED_MODALITY, status, report.max_size_mm, report.reason, synthetic)
-    fault = campaign.found.faults.get(exam.of_mass)
+    fault = campaign.faults.get(exam.of_mass)
     reason = "every exam failed" if fault is None else f"{fault.step} failed: {fault.reason}"
     return _reading(exam, POOLED_MODALITY, "not_done", None, reason, synthetic)
 
@@ -244,7 +245,7 @@ def _reading(
 
 def growth_rows(campaign: Campaign) -> list[Growth]:
     """What `compare` says of each mass with several visits, in order of the masses."""
-    compared, rows = campaign.found.results["compare"], []
+    compared, rows = campaign.keys["compare"], []
     for name, visits in grown_masses(campaign.exams).items():
         codes, exam = [*visits], next(iter(visits.values()))[0]
         place = f"{layout.GROWTH}/{name}"
@@ -254,7 +255,7 @@ def growth_rows(campaign: Campaign) -> list[Growth]:
             sized = [code for code, exams in visits.items() if any(one.name in of for one in exams)]
             rows += growths(exam.patient, exam.mass, sized, report, f"{place}/{layout.GROWTH_PAGE}")
         else:
-            fault = campaign.found.faults.get(name)
+            fault = campaign.faults.get(name)
             reason = "exams of fewer than two visits came through" if fault is None else fault.reason
             rows.append(Growth(exam.patient, exam.mass, codes[0], codes[-1], "failed", campaign.not_compared or reason))
     return rows
@@ -468,7 +469,7 @@ def _exam(campaign: Campaign, row: Row, *, inline: bool) -> ExamEntry:
     made = {
         name
         for step in ("map", "estimate", "figures", "size", "page")
-        for name in campaign.found.files(step, exam.name)
+        for name in campaign.files(step, exam.name)
         if not row.failed
     }
     picture: bytes | str | None = f"{folder}/{layout.THUMBNAIL}" if layout.THUMBNAIL in made else None

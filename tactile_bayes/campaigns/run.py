@@ -17,6 +17,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -24,12 +25,11 @@ from typing import Any, Final, TypeVar
 
 from tactile_bayes.api.repeatability import ExamFolder
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, Outcome, run_batch
-from tactile_bayes.batch_store import BatchStore
+from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, BatchStore, Outcome, run_batch
 from tactile_bayes.campaigns import steps
 from tactile_bayes.campaigns.exams import Breasts, Match, NamedPlace, Visits, grown_masses, visit_dates
-from tactile_bayes.campaigns.inputs import READ, Alike, StepResults, read_sources, unchanged
-from tactile_bayes.declarations import Record, field, names_of, replace
+from tactile_bayes.campaigns.inputs import READ, SITE, Alike, read_sources, unchanged
+from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.manifest_csv import ESTIMATE, EXAMS, GROWTH, MAP, MASSES, REPEATABILITY, SHAPE, SIZED, Exam
@@ -50,79 +50,75 @@ class Fault(Record):
     reason: str
 
 
-class CampaignState(Record, eq=False):
-    """How far a campaign is: results by step and name, faults by name, counts of steps."""
-
-    results: dict[str, StepResults]  #: By step, then by the name of the exam or mass.
-    faults: dict[str, Fault] = field(default_factory=dict)  #: By the name of the exam or mass.
-    kept: dict[str, int] = field(default_factory=lambda: defaultdict(int))
-    todo: dict[str, int] = field(default_factory=lambda: defaultdict(int))
-    """`kept`, `todo`: Steps done by earlier runs, and steps of this run, by step; for a plan those that it would do."""
-    names: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
-    """By step, the first few exams or masses of `todo`."""
-
-    def of(self, step: str, name: str) -> steps.Result | None:
-        """Result of a step of an exam or mass; None where there is none."""
-        return self.results[step].get(name)
-
-    def files(self, step: str, name: str) -> Mapping[str, str]:
-        """Digests of the files that a step made of an exam or mass, by their names; empty where it made none."""
-        made: Mapping[str, str] = (self.of(step, name) or {"files": {}})["files"]
-        return made
-
-
 Bar = Callable[[str], AbstractContextManager[Progress]]
 _Any = TypeVar("_Any")
 _BLOCK: Final = 64  #: Exams that go through the steps together at least; workers wait for the slowest of a block.
 _AHEAD_IN_BLOCK: Final = 8  #: Blocks hold so many times what an executor takes ahead.
 
 
+def no_bar(_label: str) -> AbstractContextManager[Progress]:
+    """Nobody is told."""
+    return nullcontext(untold)
+
+
+@dataclass(eq=False)
 class Campaign:
-    """A run, or the plan of one.
+    """A run, or the plan of one, and how far it is: results by step and name, faults by name, counts of steps.
 
     A plan (`dry`) runs and writes nothing. `bar` gives, for what is counted ("files read", "steps"), a context with a
     callback for those done and those needed.
     """
 
-    def __init__(
-        self,
-        exams: Sequence[Exam],
-        folder: Path,
-        settings: steps.CampaignSettings,
-        *,
-        store: BatchStore | None,
-        executor: Executor | None = None,
-        dry: bool = False,
-        bar: Bar | None = None,
-    ) -> None:
-        self.exams, self.folder, self.settings = exams, folder, settings
-        values = {} if store is None else store
-        self.found = CampaignState({step: StepResults(values) for step in steps.FILES})
-        self.not_pooled = ""  # why no mass is; empty where masses are
-        self.not_compared = ""  # the same of visits; empty too where no mass has several
-        self.unread: set[str] = set()  # names of the exams whose file could not be read
-        self.repeatability: Repeatability | None = None  # learned from the repeats
-        self.not_learned = ""  # why it was not, where masses have repeats
-        self._sizes_unknown = False
-        self._store, self._executor, self._dry = store, executor, dry
-        self._bar: Bar = (lambda _label: nullcontext(untold)) if bar is None else bar
-        self._tell: Progress = untold
-        self._needed: Counter[str] = Counter()  # by step, still to be run or found done, as far as is known
-        self._done = 0  # steps of this run
-        self._block = max(_BLOCK, _AHEAD_IN_BLOCK * int(getattr(executor, "ahead", 0)))
-        self._breasts = Breasts(exams)
-        self._recordings = Alike(self._breasts, "recording")
-        self._repeated: set[str] = set()
-        self._digests: dict[Path, str] = {}
+    exams: Sequence[Exam]
+    folder: Path
+    settings: steps.CampaignSettings
+    store: BatchStore | None
+    executor: Executor | None = None
+    dry: bool = False
+    bar: Bar = no_bar
+    keys: dict[str, dict[str, str]] = field(default_factory=lambda: {step: {} for step in steps.FILES})
+    """By step and name of the exam or mass, under which key the journal has the result."""
+    faults: dict[str, Fault] = field(default_factory=dict)  #: By the name of the exam or mass.
+    kept: Counter[str] = field(default_factory=Counter)
+    todo: Counter[str] = field(default_factory=Counter)
+    """`kept`, `todo`: Steps done by earlier runs, and steps of this run, by step; for a plan those that it would do."""
+    names: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    """By step, the first few exams or masses of `todo`."""
+    not_pooled: str = ""  #: Why no mass is; empty where masses are.
+    not_compared: str = ""  #: The same of visits; empty too where no mass has several.
+    unread: set[str] = field(default_factory=set)  #: Names of the exams whose file could not be read.
+    repeatability: Repeatability | None = None  #: Learned from the repeats.
+    not_learned: str = ""  #: Why it was not, where masses have repeats.
+    _sizes_unknown: bool = False
+    _tell: Progress = untold
+    _needed: Counter[str] = field(default_factory=Counter)  #: By step, still to be run or found done, as far as known.
+    _done: int = 0  #: Steps of this run.
+    _repeated: set[str] = field(default_factory=set)
+    _digests: dict[Path, str] = field(default_factory=dict)
 
-    def run(self) -> CampaignState:
+    def __post_init__(self) -> None:
+        self._block = max(_BLOCK, _AHEAD_IN_BLOCK * int(getattr(self.executor, "ahead", 0)))
+        self._breasts = Breasts(self.exams)
+        self._recordings = Alike(self._breasts, "recording")
+
+    def result(self, step: str, name: str) -> steps.Result:
+        """Result of a step of an exam or mass, read from the journal; empty where there is none."""
+        key = self.keys[step].get(name)
+        return {} if key is None or self.store is None else self.store[key]
+
+    def files(self, step: str, name: str) -> Mapping[str, str]:
+        """Digests of the files that a step made of an exam or mass, by their names; empty where it made none."""
+        made: Mapping[str, str] = self.result(step, name).get("files", {})
+        return made
+
+    def run(self) -> None:
         """Run what is missing: maps, estimates and figures by blocks, repeatability, sizes by it, pages, pools, growth.
 
         Where the disk does not take a result (`UsageError`), the cluster is lost (`TactileBayesError`) or on Ctrl-C
         (`BatchInterrupted`), all that is done is kept.
         """
         self._read_sources()
-        sound = [exam for exam in self.exams if exam.name not in self.found.faults]
+        sound = [exam for exam in self.exams if exam.name not in self.faults]
         self.not_pooled = self.not_compared = self._not_over_bodies()
         if len({exam.of_mass for exam in self.exams}) == len(self.exams):
             self.not_pooled = "no mass has several exams at one visit"
@@ -130,7 +126,7 @@ class Campaign:
         learns = steps.taught_by(sound, self.settings) >= steps.FEWEST_MASSES
         grown = 0 if self.not_compared else len(grown_masses(sound))
         self._needed.update(self._steps(len(sound), masses, learns=learns, compared=grown))
-        with self._bar("steps") as self._tell:
+        with self.bar("steps") as self._tell:
             for block in _blocks_of_patients(sound, self._block):
                 self._size(block)
             sound = [exam for exam in sound if exam.name not in self._repeated]
@@ -143,7 +139,6 @@ class Campaign:
             if grown:
                 growing = grown_masses(self._estimated(sound))
                 self._of_masses("compare", GROWTH, growing, self._compare_task, masses=len(grown_masses(sound)))
-        return self.found
 
     def _steps(self, exams: int, masses: int, *, learns: bool = False, compared: int = 0) -> dict[str, int]:
         """Steps that so many exams and masses take, done or not.
@@ -162,28 +157,28 @@ class Campaign:
         Of so many exams or masses those without a task have no inputs: in a plan they will need the step, in a run they
         failed before it. Results of earlier runs are kept where their files are still what they were, else forgotten.
         """
-        kept, values = list[steps.Task](), {} if self._store is None else self._store
+        kept, values = list[steps.Task](), {} if self.store is None else self.store
         for task in tasks:
             if task.key in values and unchanged(task.folder, values[task.key]):
                 kept.append(task)
-                self.found.results[step].data[task.name] = task.key
+                self.keys[step][task.name] = task.key
             elif task.key in values:
                 del values[task.key]
         done, without = {task.key for task in kept}, of - len(tasks)
         missing = [task for task in tasks if task.key not in done]
-        self.found.kept[step] += len(kept)
-        self.found.todo[step] += len(missing) + (without if self._dry else 0)
-        self.found.names[step] += [task.name for task in missing[: FEW - len(self.found.names[step])]]
+        self.kept[step] += len(kept)
+        self.todo[step] += len(missing) + (without if self.dry else 0)
+        self.names[step] += [task.name for task in missing[: FEW - len(self.names[step])]]
         self._needed[step] -= len(kept) + without
-        if self._dry:
+        if self.dry:
             return
         for task, outcome in zip(missing, self._outcomes(missing), strict=True):
             if outcome.value is not None:
-                self.found.results[step].data[task.name] = task.key
+                self.keys[step][task.name] = task.key
             elif outcome.error == CLUSTER_LOST:
                 raise TactileBayesError(f"{CLUSTER_LOST}; what is done is kept")
             else:
-                self.found.faults[task.name] = Fault(step, outcome.error)
+                self.faults[task.name] = Fault(step, outcome.error)
         self._done += len(missing)
         self._needed[step] -= len(missing)
 
@@ -194,35 +189,35 @@ class Campaign:
                 steps.run_step,
                 tasks,
                 key=attrgetter("key"),
-                executor=self._executor,
-                store=self._store,
+                executor=self.executor,
+                store=self.store,
                 progress=lambda done, _total: self._tell(before + done, total),
             )
         except BatchInterrupted as stop:
-            path = None if self._store is None else self._store.path
+            path = None if self.store is None else self.store.path
             raise BatchInterrupted(stop.outcomes, total=total, store=path, before=before) from None
 
     def _read_sources(self) -> None:
         """Digests of all files: two exams of one file are found before any is mapped."""
-        with self._bar("files read") as tell:
+        with self.bar("files read") as tell:
             self._digests, faults = read_sources(
-                self.exams, store=self._store, keep=not self._dry, executor=self._executor, progress=tell
+                self.exams, store=self.store, keep=not self.dry, executor=self.executor, progress=tell
             )
         for exam in self.exams:
             if exam.path in faults:
-                self.found.faults[exam.name] = Fault(READ, faults[exam.path])
+                self.faults[exam.name] = Fault(READ, faults[exam.path])
                 self.unread.add(exam.name)
         bytes_of = {exam: [self._digests[exam.path]] for exam in self.exams if exam.path in self._digests}
         for name, reason in Alike(self._breasts, "bytes").faults(bytes_of).items():
-            self.found.faults[name] = Fault(READ, reason)
+            self.faults[name] = Fault(READ, reason)
 
     def _size(self, exams: Sequence[Exam]) -> None:
         """Maps, estimates and figures of some exams."""
         known = [exam for exam in exams if exam.path in self._digests]  # a plan fetches nothing from a store
         self._run("map", [self._map_task(exam) for exam in known], of=len(exams))
         exams = self._recorded_once(exams)
-        mapped = [exam for exam in exams if exam.name in self.found.results["map"]]
-        mapped = mapped if self._dry else self._placed(mapped)
+        mapped = [exam for exam in exams if exam.name in self.keys["map"]]
+        mapped = mapped if self.dry else self._placed(mapped)
         self._run("estimate", [self._estimate_task(exam, "estimate") for exam in mapped], of=len(exams))
         if self.settings.figures:
             tasks = [self._estimate_task(exam, "figures") for exam in self._estimated(mapped)]
@@ -231,15 +226,14 @@ class Campaign:
 
     def _estimated(self, exams: Sequence[Exam]) -> list[Exam]:
         """Those that have an estimate."""
-        return [exam for exam in exams if exam.name in self.found.results["estimate"]]
+        return [exam for exam in exams if exam.name in self.keys["estimate"]]
 
     def _recorded_once(self, exams: Sequence[Exam]) -> list[Exam]:
         """The exams without those of a recording that another exam has, in whatever file: they are no repeats."""
-        made = self.found.results["map"]
-        marks = {exam: recordings(made[exam.name].get("scans", ())) for exam in exams if exam.name in made}
-        faults = self._recordings.faults({exam: list(found) for exam, found in marks.items()})
+        marks = {exam: list(recordings(self.result("map", exam.name).get("scans", ()))) for exam in exams}
+        faults = self._recordings.faults(marks)
         for name, reason in faults.items():
-            self.found.faults[name] = Fault("map", reason)
+            self.faults[name] = Fault("map", reason)
         self._repeated |= faults.keys()
         left = [exam for exam in exams if exam.name not in faults]
         spared = self._steps(len(exams) - len(left), 0)
@@ -249,35 +243,38 @@ class Campaign:
     def _copy(self, kind: str, names: Sequence[str], *, made_by: Sequence[str]) -> None:
         """Copy what steps made of exams or masses into the object store."""
         if self.settings.copy_to:
-            results = [self.found.results[step] for step in made_by]
-            tasks = steps.copy_tasks(self.folder / kind, names, results, to=f"{self.settings.copy_to}/{kind}")
+            tasks = []
+            for name in names:
+                files = {file: digest for step in made_by for file, digest in self.files(step, name).items()}
+                to = f"{self.settings.copy_to}/{kind}/{name}"
+                make = partial(steps.copy_files, self.folder / kind / name, list(files), to=to)
+                tasks += [self._task("copy", name, {"to": to, "files": files}, make, kind)] if files else []
             self._run("copy", tasks, of=len(names))
 
     def _folder_of(self, exam: Exam) -> Path:
         return self.folder / EXAMS / exam.name
 
-    def _task(self, step: str, exam: Exam, key: object, make: Callable[[], steps.Made]) -> steps.Task:
-        """A step of an exam; `key` is all that its files depend on."""
-        return steps.Task(step, exam.name, self._folder_of(exam), steps.digest_of(key), make)
+    def _task(self, step: str, name: str, key: object, make: Callable[[], steps.Made], kind: str = EXAMS) -> steps.Task:
+        """A step of an exam or mass; `key` is all that its files depend on."""
+        return steps.Task(step, name, self.folder / kind / name, steps.digest_of(key), make)
 
     def _map_task(self, exam: Exam) -> steps.Task:
         given: dict[str, Any] = {"expected": self._expected(exam), "normalise": self.settings.normalise}
         digest = self._digests[exam.path]
         make = partial(steps.make_map, exam.path, source_sha256=digest, address=exam.address, **given)
-        return self._task("map", exam, {"scan": digest, **given}, make)
+        return self._task("map", exam.name, {"scan": digest, **given}, make)
 
     def _estimate_task(self, exam: Exam, step: str) -> steps.Task:
         """Task of the estimate, or of its figures."""
-        made = self.found.results["map"]
-        settings, normalise = self.settings.of(exam), made[exam.name]["normalise"]
-        key = {"map": made[exam.name]["files"][MAP], **self._settings_key(settings, normalise)}
+        settings = self.settings.of(exam)
+        key = {"map": self._file("map", exam.name, MAP), **self._settings_key(settings, self._normalise(exam))}
         places, match = self._places(exam), None
         if places:
             match = Match(exam.mass, places, self.settings.match_mm)
-            told = [[one.mass, one.exam, made[one.exam]["files"][MAP], one.centre_mm] for one in places]
+            told = [[one.mass, one.exam, self._file("map", one.exam, MAP), one.centre_mm] for one in places]
             key["match"] = {"mass": exam.mass, "most_mm": match.most_mm, "places": told}
         make = steps.make_estimate if step == "estimate" else steps.make_figures
-        return self._task(step, exam, key, partial(make, self._folder_of(exam), settings, match))
+        return self._task(step, exam.name, key, partial(make, self._folder_of(exam), settings, match))
 
     def _placed(self, mapped: Sequence[Exam]) -> list[Exam]:
         """The exams without those whose mass is named by a place on a map that could not be made."""
@@ -285,14 +282,14 @@ class Campaign:
         for exam in lost:
             named = ", ".join(one.name for one in self._breasts.named(exam) if one.mass == exam.mass)
             reason = f"the place of its mass is on the map of {named}, which was not made"
-            self.found.faults[exam.name] = Fault("estimate", reason)
+            self.faults[exam.name] = Fault("estimate", reason)
         return [exam for exam in mapped if exam not in lost]
 
     def _places(self, exam: Exam) -> tuple[NamedPlace, ...]:
         """Places of the breast's masses that other exams name, where this one names none."""
         return tuple(
             NamedPlace(one.mass, one.name, self._folder_of(one) / MAP, one.centre_mm)
-            for one in self._breasts.named(exam, of=self.found.results["map"])
+            for one in self._breasts.named(exam, of=self.keys["map"])
             if one.centre_mm is not None
         )
 
@@ -320,23 +317,23 @@ class Campaign:
     def _learn_repeatability(self, sound: Sequence[Exam]) -> None:
         """Learn the spread between exams from the repeats, and size every exam by it from what its estimate left."""
         estimated, needed = self._estimated(sound), self._needed
-        masses = steps.taught_by(sound if self._dry else estimated, self.settings)
+        masses = steps.taught_by(sound if self.dry else estimated, self.settings)
         if masses < steps.FEWEST_MASSES:
             if masses:
                 have = "mass has" if masses == 1 else "masses have"
                 self.not_learned = f"{masses} {have} repeated exams, and it takes {steps.FEWEST_MASSES}"
             needed["repeatability"] = needed["size"] = 0
             return
-        complete = not self._dry or len(estimated) == len(sound)
+        complete = not self.dry or len(estimated) == len(sound)
         tasks = [self._repeatability_task(estimated)] if complete else []
         self._run("repeatability", tasks, of=1)
-        result = self.found.of("repeatability", SITE)
-        if result is None and self._dry:
+        result = self.result("repeatability", SITE)
+        if not result and self.dry:
             self._sizes_unknown = True
             self._run("size", [], of=len(sound))
             return
-        if result is None:
-            fault = self.found.faults.pop(SITE, None)
+        if not result:
+            fault = self.faults.pop(SITE, None)
             self.not_learned = "" if fault is None else fault.reason
         elif steps.NOT_LEARNED in result:
             self.not_learned = result[steps.NOT_LEARNED]
@@ -346,7 +343,7 @@ class Campaign:
         needed["size"] = len(again)
         for block in _blocks(again, self._block):
             tasks = [task for exam in block if (task := self._size_task(exam)) is not None]
-            self._run("size", tasks, of=len(tasks) if self._dry else len(block))
+            self._run("size", tasks, of=len(tasks) if self.dry else len(block))
 
     def _make_pages(self, sound: Sequence[Exam]) -> None:
         """The page of every exam that was estimated, with its size by the repeatability where it has one."""
@@ -356,12 +353,13 @@ class Campaign:
             self._copy(EXAMS, [exam.name for exam in block], made_by=("size", "page"))
 
     def _page_task(self, exam: Exam) -> steps.Task:
-        sized = self._file("size", exam, SIZED)
+        sized = self._file("size", exam.name, SIZED)
         day = "" if exam.day is None else exam.day.isoformat()
         told = self._expected(exam) | {"replicate": str(exam.replicate), "date": day}
-        key = {"map": self._file("map", exam, MAP), "size": sized or self._file("estimate", exam, ESTIMATE)}
+        size = sized or self._file("estimate", exam.name, ESTIMATE)
+        key = {"map": self._file("map", exam.name, MAP), "size": size, "told": told}
         make = partial(steps.make_page, self._folder_of(exam), told, report=ESTIMATE if sized is None else SIZED)
-        return self._task("page", exam, {**key, "told": told}, make)
+        return self._task("page", exam.name, key, make)
 
     def _expected(self, exam: Exam) -> dict[str, str]:
         """What the table says of the exam, as far as it does."""
@@ -369,23 +367,23 @@ class Campaign:
         return {name: value for name in columns if (value := getattr(exam, name)) is not None}
 
     def _repeatability_task(self, exams: Sequence[Exam]) -> steps.Task:
-        files = [[exam.name, *(self._file("estimate", exam, file) for file in (ESTIMATE, SHAPE))] for exam in exams]
-        repeats = [
-            ExamFolder(exam.name, exam.of_mass, f"{exam.patient} {exam.mass}", self._folder_of(exam)) for exam in exams
-        ]
+        files, repeats = [], []
+        for exam in exams:
+            files.append([exam.name, *(self._file("estimate", exam.name, file) for file in (ESTIMATE, SHAPE))])
+            mass = f"{exam.patient} {exam.mass}"
+            repeats.append(ExamFolder(exam.name, exam.of_mass, mass, self._folder_of(exam)))
         digest = steps.digest_of([steps.FEWEST_MASSES, files])
         return steps.Task("repeatability", SITE, self.folder, digest, partial(steps.learn_repeatability, repeats))
 
     def _size_task(self, exam: Exam) -> steps.Task | None:
         """Task of a size by the repeatability; None where the exam has no draws, or another calibration."""
-        made = self.found.results["map"][exam.name]
-        settings = self._by_repeatability(self.settings.of(exam), made["normalise"])
-        shape, figures = self._file("estimate", exam, SHAPE), self.settings.figures
-        if settings.repeatability is None or shape is None:
+        normalise, name, figures = self._normalise(exam), exam.name, self.settings.figures
+        settings = self._by_repeatability(self.settings.of(exam), normalise)
+        files = [self._file(step, name, file) for step, file in _POOLED_FROM]
+        if settings.repeatability is None or None in files:
             return None
-        files = [made["files"][MAP], self._file("estimate", exam, ESTIMATE), shape]
-        key = {"files": files, "figures": figures, **self._settings_key(settings, made["normalise"])}
-        return self._task("size", exam, key, partial(steps.make_size, self._folder_of(exam), settings, figures=figures))
+        key = {"files": files, "figures": figures, **self._settings_key(settings, normalise)}
+        return self._task("size", name, key, partial(steps.make_size, self._folder_of(exam), settings, figures=figures))
 
     def _by_repeatability(self, settings: Settings, normalise: str) -> Settings:
         """Settings with the learned repeatability, where it is for the calibration that they lead to."""
@@ -431,14 +429,14 @@ class Campaign:
     def _pool_task(self, name: str, exams: Sequence[Exam]) -> steps.Task:
         settings, key = self._of_one_mass(exams)
         make = partial(steps.make_pool, self.folder / EXAMS, [exam.name for exam in exams], settings)
-        return steps.Task("pool", name, self.folder / MASSES / name, steps.digest_of(key), make)
+        return self._task("pool", name, key, make, MASSES)
 
     def _of_one_mass(self, exams: Sequence[Exam]) -> tuple[Settings, dict[str, Any]]:
         """Settings by which exams are sized together, and all that the result depends on."""
-        normalise = self.found.results["map"][exams[0].name]["normalise"]
+        normalise = self._normalise(exams[0])
         settings = replace(self.settings.of(exams[0]), centre_mm=self.settings.estimate.centre_mm)
         settings = self._by_repeatability(settings, normalise)
-        files = [[exam.name, *(self._file(step, exam, file) for step, file in _POOLED_FROM)] for exam in exams]
+        files = [[exam.name, *(self._file(step, exam.name, file) for step, file in _POOLED_FROM)] for exam in exams]
         return settings, {"exams": files, **self._settings_key(settings, normalise)}
 
     def _compare_task(self, name: str, visits: Visits) -> steps.Task:
@@ -450,18 +448,21 @@ class Campaign:
         first = next(iter(visits.values()))[0]
         course = Course("", "", first.patient, first.side or "", first.mass, tuple(visits), dates if any(dates) else ())
         counts = [len(exams) for exams in visits.values()]
-        digest = steps.digest_of({**key, "visits": counts, "days": days, "figures": figures, "course": repr(course)})
+        key |= {"visits": counts, "days": days, "figures": figures, "course": repr(course)}
         names = [[exam.name for exam in exams] for exams in visits.values()]
         make = partial(
             steps.make_growth, self.folder / EXAMS, names, settings, days=days, course=course, figures=figures
         )
-        return steps.Task("compare", name, self.folder / GROWTH / name, digest, make)
+        return self._task("compare", name, key, make, GROWTH)
 
-    def _file(self, step: str, exam: Exam, file: str) -> str | None:
-        return self.found.files(step, exam.name).get(file)
+    def _file(self, step: str, name: str, file: str) -> str | None:
+        return self.files(step, name).get(file)
+
+    def _normalise(self, exam: Exam) -> str:
+        """How the exam's map was normalised."""
+        return str(self.result("map", exam.name)["normalise"])
 
 
-SITE: Final = "site"  #: Name of the one step that is of no exam or mass.
 _POOLED_FROM: Final = (("map", MAP), ("estimate", ESTIMATE), ("estimate", SHAPE))
 
 

@@ -8,7 +8,6 @@ import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -369,22 +368,6 @@ def _answer(folder: Path) -> Answer:
         fingerprint=tactile_map.fingerprint,
         head=tactile_map.head,
     )
-
-
-def copy_tasks(folder: Path, names: Sequence[str], results: Sequence[Mapping[str, Result]], *, to: str) -> list[Task]:
-    """Tasks that copy what steps made of exams or of masses, keyed by the files' digests and by where they go.
-
-    The folder, and the address, hold a folder for each of the names.
-    """
-    tasks = []
-    for name in names:
-        made = [found[name]["files"] for found in results if name in found]
-        files = {file: digest for one in made for file, digest in one.items()}
-        if files:
-            digest = digest_of({"to": f"{to}/{name}", "files": files})
-            make = partial(copy_files, folder / name, list(files), to=f"{to}/{name}")
-            tasks.append(Task("copy", name, folder / name, digest, make))
-    return tasks
 
 
 def copy_files(folder: Path, files: Sequence[str], *, to: str) -> Made:

@@ -16,9 +16,7 @@ _FILE = options.FilePath()
 @click.argument("trial", metavar="TRIAL.csv", type=_FILE)
 @options.path_option("--excision", "EX.csv", "Sizes measured after excision.", required=True)
 @options.path_option("--columns", "MAP.toml", "Layout of a wide TRIAL.csv: which column holds which reading.")
-@options.takes(TrialSettings, "intervals", "resamples", "seed", "error_ratio")
-@options.takes(TrialSettings, "check_intervals", show_default=False)
-@options.takes(TrialSettings, "bayes")
+@options.takes(TrialSettings, "intervals", "resamples", "seed", "error_ratio", "bayes")
 @click.option(
     "-v",
     "--methods",

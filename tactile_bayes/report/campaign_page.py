@@ -13,8 +13,7 @@ from tactile_bayes.declarations import Record, field
 from tactile_bayes.findings import SEVERITIES, Finding, finding_lines
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.compare import Growth
-from tactile_bayes.report.pages import TEMPLATES, page
+from tactile_bayes.report.pages import TEMPLATES, Growth, page
 from tactile_bayes.report.svg import THUMB_ENDS, THUMB_SCALE, colour_steps
 
 STATUSES: Final = ("failed", "without a size", "sized")

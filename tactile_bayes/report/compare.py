@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from typing import Annotated, Any, Final, Literal
 
@@ -12,13 +11,14 @@ from scipy.special import ndtri
 from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, field
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import Chance, Entries, EstimateReport, Interval, Judgement, Number1, Report
-from tactile_bayes.findings import Finding, capital, finding_lines, finding_summary
+from tactile_bayes.findings import capital, finding_lines, finding_summary
 from tactile_bayes.findings import verdict as verdict_of
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.options import Above0, Comparing, Least0
 from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import share_words
+from tactile_bayes.report.pages import Growth, signed
 from tactile_bayes.size.pooling import Repeatability
 from tactile_bayes.size.visits import VOLUME, Change, Compared, JointSizes, straight_line
 
@@ -159,42 +159,8 @@ class CompareReport(Report, kw_only=True):
     provenance: dict[str, Any]
 
 
-# --- Growth of masses between visits, as `compare` told it: rows of a table and a section of a page.
-
-_VERDICTS: Final = {"grown": "grown", "shrunk": "shrunk", "no_change_shown": "no change shown"}
 _ALIKE_ONLY: Final = "if exams repeat as simulated ones do; if they differ as those of patients did, no change is shown"
 """What a verdict rests on where the site has not learned how its own exams repeat."""
-
-
-class Growth(Record, eq=False):
-    """Change of one mass from its first visit to a later one."""
-
-    patient: str
-    mass: str
-    earlier: str
-    later: str
-    """`patient`, `mass`, `earlier`, `later`: Codes; `later` is blank where the visits could not be compared."""
-    status: str
-    reason: str = ""
-    """`status`, `reason`: As `compare` has them, or ``failed``."""
-    days: float | None = None  #: Between the visits; None where it is not known.
-    sizes_mm: tuple[Quantity, ...] = ()  #: Largest size at both visits; empty without a comparison.
-    percent: Quantity | None = None  #: Change of the diameter, likewise; None without one.
-    verdict: str = ""
-    """``grown``, ``shrunk`` or ``no_change_shown``; empty without one."""
-    findings: tuple[Finding, ...] = ()  #: What speaks against the comparison.
-    link: str = ""  #: File of the comparison from the page's folder; empty for none.
-
-    @property
-    def outcome(self) -> str:
-        """What became of the mass, or why nothing is known of it."""
-        told = _VERDICTS.get(self.verdict)
-        return ", ".join(filter(None, (told, self.reason))) if told else f"not compared: {self.reason}"
-
-    @property
-    def words(self) -> str:
-        """The same with what speaks against it."""
-        return ". ".join([self.outcome, *finding_lines(self.findings, paper=True)])
 
 
 def growths(patient: str, mass: str, visits: Sequence[str], report: CompareReport, link: str) -> list[Growth]:
@@ -211,16 +177,6 @@ def growths(patient: str, mass: str, visits: Sequence[str], report: CompareRepor
         )
         for change in report.changes
     ]  # fmt: skip
-
-
-def growth_line(rows: Sequence[Growth], table: str) -> str:
-    """Each mass by its last visit, in one sentence; empty without any."""
-    if not rows:
-        return ""
-    last = {(row.patient, row.mass): row.verdict for row in rows}
-    counts = Counter(_VERDICTS.get(found, "not compared") for found in last.values())
-    told = ", ".join(f"{counts[words]} {words}" for words in (*_VERDICTS.values(), "not compared") if counts[words])
-    return f"growth of {len(last)} mass{'es' * (len(last) > 1)} with several visits: {told} ({table})"
 
 
 # --- The report of a comparison made.
@@ -485,8 +441,3 @@ def _model_line(report: CompareReport) -> str:
     told = len(known) == len(report.visits)
     depth = f"; fat under the head {', '.join(f'{one:.1f}' for one in known)} mm deep by visit" if told else ""
     return f"Model: one body, whose hidden properties cancel in the change; {spread}{depth}."
-
-
-def signed(percent: float) -> str:
-    """Whole percent with its sign; none has no sign."""
-    return f"{round(percent):+d}" if round(percent) else "0"

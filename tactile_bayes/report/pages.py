@@ -7,7 +7,8 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,8 +18,9 @@ from tactile_bayes import __version__
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import check_suffix, refuse_existing, same_file, write_all
+from tactile_bayes.findings import Finding, finding_lines
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.compare import signed
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -54,6 +56,11 @@ def foot(scans: Iterable[Mapping[str, str]], more: str = "") -> str:
     return f"{made}. Sizes come from simulated bodies; no scan of a person has been used. {RESEARCH_USE}"
 
 
+def signed(percent: float) -> str:
+    """Whole percent with its sign; none has no sign."""
+    return f"{round(percent):+d}" if round(percent) else "0"
+
+
 @cache
 def _environment() -> Environment:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined  # only where a page is made
@@ -68,6 +75,52 @@ def _environment() -> Environment:
     )
     made.filters |= {"cut": cut, "signed": signed}
     return made
+
+
+# --- Growth of masses between visits, as `compare` told it: rows of a table and a section of a page.
+
+_VERDICTS: Final = {"grown": "grown", "shrunk": "shrunk", "no_change_shown": "no change shown"}
+
+
+class Growth(Record, eq=False):
+    """Change of one mass from its first visit to a later one."""
+
+    patient: str
+    mass: str
+    earlier: str
+    later: str
+    """`patient`, `mass`, `earlier`, `later`: Codes; `later` is blank where the visits could not be compared."""
+    status: str
+    reason: str = ""
+    """`status`, `reason`: As `compare` has them, or ``failed``."""
+    days: float | None = None  #: Between the visits; None where it is not known.
+    sizes_mm: tuple[Quantity, ...] = ()  #: Largest size at both visits; empty without a comparison.
+    percent: Quantity | None = None  #: Change of the diameter, likewise; None without one.
+    verdict: str = ""
+    """``grown``, ``shrunk`` or ``no_change_shown``; empty without one."""
+    findings: tuple[Finding, ...] = ()  #: What speaks against the comparison.
+    link: str = ""  #: File of the comparison from the page's folder; empty for none.
+
+    @property
+    def outcome(self) -> str:
+        """What became of the mass, or why nothing is known of it."""
+        told = _VERDICTS.get(self.verdict)
+        return ", ".join(filter(None, (told, self.reason))) if told else f"not compared: {self.reason}"
+
+    @property
+    def words(self) -> str:
+        """The same with what speaks against it."""
+        return ". ".join([self.outcome, *finding_lines(self.findings, paper=True)])
+
+
+def growth_line(rows: Sequence[Growth], table: str) -> str:
+    """Each mass by its last visit, in one sentence; empty without any."""
+    if not rows:
+        return ""
+    last = {(row.patient, row.mass): row.verdict for row in rows}
+    counts = Counter(_VERDICTS.get(found, "not compared") for found in last.values())
+    told = ", ".join(f"{counts[words]} {words}" for words in (*_VERDICTS.values(), "not compared") if counts[words])
+    return f"growth of {len(last)} mass{'es' * (len(last) > 1)} with several visits: {told} ({table})"
 
 
 # --- A page as files: HTML, and printed to PDF.

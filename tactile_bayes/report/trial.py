@@ -203,7 +203,6 @@ def trial_text(report: TrialReport, *, left_out: Sequence[str] = (), methods: bo
         "",
         *_notes(report),
         *(["", *_methods(report)] if methods else []),
-        *_check_lines(report),
         *([] if report.next_mass is UNSET else report.next_mass.lines()),
         *([] if methods else [MORE]),
         report.research_use,
@@ -279,15 +278,6 @@ def _methods(report: TrialReport) -> Iterator[str]:
         "CRPS: continuous ranked probability score. r2: centred, 1 - SSE0/SST (sums of squares about the line through "
         "0 and about the mean), below 0 where the line fails."
     )
-
-
-def _check_lines(report: TrialReport) -> Iterator[str]:
-    for name, check in () if report.interval_check is UNSET else report.interval_check.items():
-        low, high = check.share_interval
-        yield (
-            f"{name}: in {check.trials} simulated trials of this size {check.share:.1%} [{low:.1%}, {high:.1%}] of the "
-            f"intervals of the error in percent covered the true one; {check.above} were above it, {check.below} below"
-        )
 
 
 def _notes(report: TrialReport) -> Iterator[str]:

@@ -16,9 +16,8 @@ from scipy.special import ndtr
 
 from tactile_bayes.options import Aim
 from tactile_bayes.report import trial as trial_words
-from tactile_bayes.report.compare import Growth
 from tactile_bayes.report.figure_file import FORMATS, figure_file, finish, plain_matplotlib
-from tactile_bayes.report.pages import page
+from tactile_bayes.report.pages import Growth, page
 from tactile_bayes.trial.calibration import BINS, Calibration, Prediction, prediction_of
 from tactile_bayes.trial.figures import Figures
 from tactile_bayes.trial.method_comparison import MethodComparison

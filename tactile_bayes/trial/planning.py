@@ -1,9 +1,9 @@
-"""Planning a trial, and how often intervals cover."""
+"""Planning a trial by simulation: power, widths of intervals, the value of more maps per mass, and patients needed."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
@@ -14,119 +14,9 @@ from tactile_bayes.declarations import Meta, Record
 from tactile_bayes.options import MOST_PATIENTS, Aim
 from tactile_bayes.presets import INTERVAL
 from tactile_bayes.trial.accuracy import mape_figure, mape_percent, mape_ratio, sign_flip
-from tactile_bayes.trial.figures import MIN_PATIENTS, Ends, Intervals, Share, UndefinedError, clopper_pearson, figure
+from tactile_bayes.trial.figures import MIN_PATIENTS, Ends, Intervals, UndefinedError, clopper_pearson, figure
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 from tactile_bayes.trial.replicates import log_sd_within
-
-# --- Coverage of the chosen intervals in simulated trials with this trial's size and errors.
-
-
-class ErrorModel(Record):
-    """Errors of one modality in log size: normal, partly shared by the masses of a patient."""
-
-    bias: float  #: Mean of ln(size / ex vivo).
-    mass_sd: float  #: SD of the mass's own part.
-    patient_sd: float = 0.0  #: SD of the part that a patient's masses share.
-    miss: float = 0.0  #: Probability that a mass is not found.
-
-    @property
-    def true_mape_percent(self) -> float:
-        r"""Expected percent error; a miss counts as 100 %.
-
-        .. math:: E|e^X - 1| = e^{b + s^2/2}(2\Phi(b/s + s) - 1) - (2\Phi(b/s) - 1)
-        """
-        s = math.hypot(self.mass_sd, self.patient_sd)
-        if s == 0:
-            return 100 * ((1 - self.miss) * abs(math.expm1(self.bias)) + self.miss)
-        found = math.exp(self.bias + s * s / 2) * math.erf((self.bias / s + s) / math.sqrt(2))
-        return 100 * ((1 - self.miss) * (found - math.erf(self.bias / s / math.sqrt(2))) + self.miss)
-
-
-class IntervalCheck(Record):
-    """Coverage of the percent error's intervals in simulated trials."""
-
-    trials: Annotated[int, Meta(ge=1)]  #: Simulated trials with an interval.
-    covered: Annotated[int, Meta(ge=0)]  #: Trials whose interval holds the true error.
-    share: Share
-    share_interval: Ends
-    above: Annotated[int, Meta(ge=0)]  #: Trials whose interval lies above the true error.
-    below: Annotated[int, Meta(ge=0)]  #: Trials whose interval lies below it.
-    undefined: Annotated[int, Meta(ge=0)]  #: Trials without an interval.
-    median_width_ratio: float  #: Median of the upper over the lower end.
-    model: ErrorModel
-    true_mape_percent: float
-
-
-def observed_errors(sizes: ModalitySizes) -> ErrorModel | None:
-    """Error model of a trial: mean and SD of log ratios of found masses, share of missed masses."""
-    found = sizes.only_detected()
-    if len(found.size_mm) < 3:
-        return None
-    logs = np.log(found.size_mm) - np.log(found.ex_vivo_mm)
-    return ErrorModel(float(logs.mean()), float(logs.std(ddof=1)), miss=1 - len(logs) / len(sizes.size_mm))
-
-
-def simulate(
-    patient: np.ndarray[tuple[int], np.dtype[np.int64]],
-    ex_vivo_mm: FloatArray,
-    model: ErrorModel,
-    *,
-    rng: np.random.Generator,
-) -> ModalitySizes:
-    """Simulate one trial of these patients and masses with errors from the model."""
-    n = len(ex_vivo_mm)
-    _, index = np.unique(patient, return_inverse=True)
-    shared = rng.normal(0, model.patient_sd, index.max() + 1)[index] if model.patient_sd else 0.0
-    size = ex_vivo_mm * np.exp(model.bias + shared + rng.normal(0, model.mass_sd, n))
-    size[rng.random(n) < model.miss] = 0.0
-    return ModalitySizes("tactile", patient, ex_vivo_mm, size, (np.zeros(0),) * n)
-
-
-def check_intervals(
-    sizes: ModalitySizes, model: ErrorModel, *, intervals: Intervals, trials: int, seed: int
-) -> IntervalCheck | None:
-    """Count how often intervals of the percent error, by their method, cover the true one.
-
-    Patients and ex-vivo sizes stay as they are; `observed_errors` gives the model of a trial. None below `MIN_PATIENTS`
-    patients, where no intervals are given.
-    """
-    if len(sizes.patients) < MIN_PATIENTS:
-        return None
-    truth, rng = model.true_mape_percent, np.random.default_rng([seed, len(sizes.size_mm)])
-    made = (simulate(sizes.patient, sizes.ex_vivo_mm, model, rng=rng) for _ in range(trials))
-    ends = np.array([mape_figure(one, intervals=intervals).interval or (math.nan, math.nan) for one in made])
-    defined = ends[np.isfinite(ends[:, 0])]
-    if len(defined) == 0:
-        return None
-    below, above = int(np.sum(defined[:, 1] < truth)), int(np.sum(defined[:, 0] > truth))
-    covered = len(defined) - below - above
-    return IntervalCheck(
-        trials=len(defined),
-        covered=covered,
-        share=covered / len(defined),
-        share_interval=clopper_pearson(covered, len(defined), confidence=0.95),
-        above=above,
-        below=below,
-        undefined=trials - len(defined),
-        median_width_ratio=float(np.median(defined[:, 1] / np.maximum(defined[:, 0], 1e-300))),
-        model=model,
-        true_mape_percent=truth,
-    )
-
-
-def check_all(
-    sizes: Mapping[str, ModalitySizes], *, intervals: Intervals, trials: int, seed: int
-) -> dict[str, IntervalCheck]:
-    """Run `check_intervals` for every modality with errors to simulate."""
-    checks = {
-        name: check_intervals(one, model, intervals=intervals, trials=trials, seed=seed)
-        for name, one in sizes.items()
-        if (model := observed_errors(one)) is not None
-    }
-    return {name: check for name, check in checks.items() if check is not None}
-
-
-# --- Trial planning by simulation: power, widths of intervals and the value of more maps per mass.
 
 # Ex-vivo sizes, log-normal: median and SD of the logarithm, near those that the paper's figures imply.
 MEDIAN_MM, SIZE_LOG_SD = 16.0, 0.38
@@ -357,18 +247,24 @@ def assumptions_from(
     than 3 masses; without ``map_sd`` and ``mass_sd`` when the pilot has no replicates and none is given, for then the
     two cannot be told apart.
     """
-    mine, theirs = observed_errors(tactile), observed_errors(other)
-    if mine is None or theirs is None:
+    mine, theirs = _log_errors(tactile.only_detected()), _log_errors(other.only_detected())
+    if len(mine) < 3 or len(theirs) < 3:
         return None
-    found = {
-        "tactile_bias": mine.bias,
-        "other_bias": theirs.bias,
-        "other_sd": theirs.mass_sd,
-        "other_miss": theirs.miss,
+    errors = {
+        "tactile_bias": float(mine.mean()),
+        "other_bias": float(theirs.mean()),
+        "other_sd": float(theirs.std(ddof=1)),
+        "other_miss": 1 - len(theirs) / len(other.size_mm),
     }
     single = figure(log_sd_within, tactile.only_replicated()).value if map_sd is None else map_sd
     if single is None:
-        return found
-    replicates = [len(group) for group in tactile.replicates_mm if len(group)]
-    shared = mine.mass_sd**2 - single**2 / float(np.mean(replicates))
-    return found | {"mass_sd": math.sqrt(max(shared, 0.0)), "map_sd": single}
+        return errors
+    shared = float(mine.std(ddof=1)) ** 2 - single**2 / float(
+        np.mean([len(one) for one in tactile.replicates_mm if len(one)])
+    )
+    return errors | {"mass_sd": math.sqrt(max(shared, 0.0)), "map_sd": single}
+
+
+def _log_errors(found: ModalitySizes) -> FloatArray:
+    """(n,) logarithms of the ratios of detected sizes to those after excision."""
+    return np.log(found.size_mm) - np.log(found.ex_vivo_mm)

@@ -26,7 +26,6 @@ from tactile_bayes.trial.figures import (
 )
 from tactile_bayes.trial.method_comparison import MethodComparison, compare_methods
 from tactile_bayes.trial.next_mass import NextMass
-from tactile_bayes.trial.planning import IntervalCheck
 from tactile_bayes.trial.readings import ModalitySizes, Trial, unit_doubts
 from tactile_bayes.trial.replicates import ReplicateFigures, reader_components, replicate_figures, spread_figures
 
@@ -148,8 +147,6 @@ class TrialReport(Record, kw_only=True):
     ]  #: Every pair of modalities on the masses that both looked for.
     doubts: tuple[str, ...]  #: What looks like another unit than mm.
     conventions: dict[str, str]
-    interval_check: dict[str, IntervalCheck] | UnsetType = UNSET
-    """Simulated coverage of the intervals of mape_percent, by modality."""
     next_mass: NextMass | UnsetType = UNSET  #: Errors-in-variables model: what the next mass may bring.
     provenance: dict[str, Any]
     research_use: Annotated[str, Meta(min_length=1)]

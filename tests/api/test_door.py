@@ -78,7 +78,7 @@ def test_the_defaults_are_the_command_lines() -> None:
     from_file = set(load_schema("settings.schema.json")["properties"])
     assert set(given) - shared == {"tactile_map", "progress", *from_file}
     trial, shown = TrialSettings(), defaults_of("validate", "t.csv", "--excision", "e.csv")
-    for name in ("intervals", "resamples", "seed", "error_ratio", "check_intervals", "bayes"):
+    for name in ("intervals", "resamples", "seed", "error_ratio", "bayes"):
         assert getattr(trial, name) == shown[name]
     shown = defaults_of("map", "s.mcap", "-o", "m.nc")
     assert MapOptions(**{name: shown[name] for name in names_of(MapOptions)}) == MapOptions()

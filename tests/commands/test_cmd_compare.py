@@ -23,7 +23,8 @@ from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.geometry import rigid
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.compare import CompareReport, compare_summary, growths, signed, verdict
+from tactile_bayes.report.compare import CompareReport, compare_summary, growths, verdict
+from tactile_bayes.report.pages import signed
 from tactile_bayes.size.visits import Change
 
 FAST = ("--method", "laplace")

@@ -17,7 +17,7 @@ import tactile_bayes as tb
 from tactile_bayes.commands.trial import plan_command as command
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.trial.planning import ErrorModel
+from validation.simulated_trials import ErrorModel
 
 DEMO = Path(tb.__file__).parent / "demo"
 SMALL = ("--patients", 12, "--maps", 1, "--maps", 3, "--trials", 50)

@@ -84,7 +84,7 @@ def test_a_grid_may_say_its_seats(run_cli: Run, tmp_path: Path) -> None:
 def test_an_interrupted_study_goes_on_where_it_stopped(folder: Path, run_cli: Run, tmp_path: Path) -> None:
     """The store of a killed run: two geometries, and a third half written."""
     from tactile_bayes.actions.study import study_settings
-    from tactile_bayes.batch_store import open_store
+    from tactile_bayes.batch import open_store
     from tactile_bayes.options import SectionOptions, StudyOptions
 
     settings = study_settings(StudyOptions(fineness=1), SectionOptions())
@@ -105,7 +105,7 @@ def test_an_interrupted_study_goes_on_where_it_stopped(folder: Path, run_cli: Ru
 
 
 def test_a_store_of_other_settings_is_refused(run_cli: Run, tmp_path: Path) -> None:
-    from tactile_bayes.batch_store import open_store
+    from tactile_bayes.batch import open_store
 
     (tmp_path / "grid.csv").write_text(GRID)
     with open_store(tmp_path / "study.csv.unfinished", settings={"poisson": 0.3}):

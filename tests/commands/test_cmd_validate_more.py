@@ -223,19 +223,6 @@ def test_the_second_table_is_printed_when_asked_for() -> None:
         assert words not in plain.stdout
 
 
-@pytest.mark.long
-def test_the_check_of_intervals_is_reported(tmp_path: Path) -> None:
-    found = document(TRIAL, "--excision", EXCISION, "--check-intervals", 200)["interval_check"]
-    assert found["tactile"]["trials"] == 200
-    assert 0.88 < found["tactile"]["share"] <= 1
-    page = tmp_path / "r.html"
-    assert (
-        "covered the true one"
-        in validate(TRIAL, "--excision", EXCISION, "--check-intervals", 50, "--html", page).stdout
-    )
-    assert "Simulated coverage of the intervals" in page.read_text()
-
-
 def test_the_page_needs_nothing_else_and_is_the_same_every_time(tmp_path: Path) -> None:
     for name in ("a.html", "b.html"):
         assert validate(TRIAL, "--excision", EXCISION, "--html", tmp_path / name).exit_code == 0

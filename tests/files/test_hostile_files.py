@@ -17,7 +17,7 @@ from map_files import read_grid
 
 from tactile_bayes.actions.show import describe
 from tactile_bayes.api.settings import read_settings
-from tactile_bayes.batch_store import open_store
+from tactile_bayes.batch import open_store
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.column_map import read_mapping, read_wide

@@ -221,7 +221,7 @@ def _checkpoint(folder: Path) -> bytes:
 
 
 def _store(folder: Path) -> bytes:
-    from tactile_bayes.batch_store import open_store
+    from tactile_bayes.batch import open_store
 
     with open_store(folder / "b.jsonl", settings={"seed": 1}) as store:
         for number in range(6):
@@ -378,7 +378,7 @@ def _read_checkpoint(path: Path) -> object:
 
 
 def _read_store(path: Path) -> object:
-    from tactile_bayes.batch_store import open_store
+    from tactile_bayes.batch import open_store
 
     copy = path.with_suffix(".copy")
     shutil.copyfile(path, copy)  # opening a store may shorten it

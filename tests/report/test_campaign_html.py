@@ -32,8 +32,8 @@ from tactile_bayes.report.campaign_page import (
     campaign_html,
     worst,
 )
-from tactile_bayes.report.compare import Growth
 from tactile_bayes.report.exam_words import exam_map, reason_on_paper
+from tactile_bayes.report.pages import Growth
 from tactile_bayes.report.svg import THUMB_SCALE, thumbnail_svg
 
 SVG = "{http://www.w3.org/2000/svg}"

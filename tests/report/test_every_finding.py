@@ -47,10 +47,11 @@ from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.mapping.select import scan_findings
 from tactile_bayes.report.campaign_page import ExamEntry, MassRow, VisitEntry, campaign_html
-from tactile_bayes.report.compare import Growth, compare_summary, compare_text, growths
+from tactile_bayes.report.compare import compare_summary, compare_text, growths
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.growth_page import DrawnMap, draw_comparison
 from tactile_bayes.report.map import map_figure, map_summary, map_text
+from tactile_bayes.report.pages import Growth
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
 
 FAST = Settings(method="laplace")

@@ -11,8 +11,8 @@ from scipy import stats
 from tactile_bayes.trial.accuracy import mape_figure, mape_ratios, share_interval
 from tactile_bayes.trial.figures import JACKKNIFE, Intervals, effective_number, interval_from_values, kurtosis_freedom
 from tactile_bayes.trial.method_comparison import compare_methods, limit_figures, limits, limits_unlinked
-from tactile_bayes.trial.planning import ErrorModel, check_intervals
 from tactile_bayes.trial.readings import ModalitySizes, Reading, gather
+from validation.simulated_trials import ErrorModel, check_intervals
 
 CORRECTED = Intervals(0.95, method="corrected")
 SINGLE_MISS = ErrorModel(0.0, 0.2, miss=0.04)

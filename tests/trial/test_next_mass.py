@@ -15,9 +15,9 @@ from tactile_bayes.inference.importance import ImportanceOptions, importance
 from tactile_bayes.inference.modes import mode_and_covariance
 from tactile_bayes.trial import next_mass as model_of
 from tactile_bayes.trial.next_mass import LogModel, draw, expected_error_percent, next_mass, variances
-from tactile_bayes.trial.planning import ErrorModel
 from tactile_bayes.trial.readings import ModalitySizes, Reading, Trial
 from validation.next_mass_coverage import DESIGNS, Design, half_normal_log_prior, ranks
+from validation.simulated_trials import ErrorModel
 
 CALIPER = 0.05
 

@@ -23,18 +23,9 @@ from tactile_bayes.trial.figures import (
     draw_patients,
     figure,
 )
-from tactile_bayes.trial.planning import (
-    ErrorModel,
-    PlanCase,
-    assumptions_from,
-    check_all,
-    check_intervals,
-    map_gains,
-    observed_errors,
-    run_case,
-    simulate,
-)
+from tactile_bayes.trial.planning import PlanCase, assumptions_from, map_gains, run_case
 from tactile_bayes.trial.readings import ModalitySizes
+from validation.simulated_trials import ErrorModel, check_intervals, simulate
 
 
 def sizes(
@@ -180,11 +171,13 @@ def test_the_true_error_of_a_model_is_its_mean(bias: float, sd: float, miss: flo
 
 
 def test_simulated_trials_have_the_trials_shape_and_errors() -> None:
-    one = trial(10, 200)
-    model = observed_errors(one)
+    one, model = trial(10, 200), ErrorModel(0.1, 0.3, miss=0.1)
     again = simulate(one.patient, one.ex_vivo_mm, model, rng=np.random.default_rng(0))
-    assert observed_errors(again).mass_sd == pytest.approx(model.mass_sd, rel=0.2)
-    assert observed_errors(sizes("x", [11, 0, 12])) is None
+    errors = assumptions_from(again, again)
+    assert errors["tactile_bias"] == pytest.approx(0.1, abs=0.07)
+    assert errors["other_sd"] == pytest.approx(0.3, rel=0.2)
+    assert errors["other_miss"] == pytest.approx(0.1, abs=0.06)
+    assert assumptions_from(one, sizes("x", [11, 0, 12])) is None
 
 
 def test_intervals_are_checked_and_half_intervals_found_out() -> None:
@@ -195,7 +188,6 @@ def test_intervals_are_checked_and_half_intervals_found_out() -> None:
     assert dishonest.share < 0.75
     assert honest.covered + honest.above + honest.below == honest.trials == 400
     assert check_intervals(sizes("x", [11.0] * 4), model, intervals=JACKKNIFE, trials=10, seed=1) is None
-    assert set(check_all({"tactile": one}, intervals=JACKKNIFE, trials=20, seed=1)) == {"tactile"}
 
 
 def case(**changes: float) -> PlanCase:

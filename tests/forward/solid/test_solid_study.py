@@ -299,7 +299,7 @@ def test_a_level_that_is_neither_is_refused() -> None:
 
 @pytest.mark.parametrize("option", [{"background": "fixed"}, {"flat_field": False}])
 def test_a_store_of_another_fit_is_refused(option: dict[str, Any], run_cli: Run, tmp_path: Path) -> None:
-    from tactile_bayes.batch_store import open_store
+    from tactile_bayes.batch import open_store
 
     (tmp_path / "grid.csv").write_text(GRID)
     with open_store(tmp_path / "study.csv.unfinished", settings=replace(SETTINGS, **option).as_dict()):
@@ -311,7 +311,7 @@ def test_a_store_of_another_fit_is_refused(option: dict[str, Any], run_cli: Run,
 
 
 def test_a_store_of_the_other_model_is_refused(run_cli: Run, tmp_path: Path) -> None:
-    from tactile_bayes.batch_store import open_store
+    from tactile_bayes.batch import open_store
     from tactile_bayes.studies.paper import StudySettings
 
     (tmp_path / "grid.csv").write_text(GRID)
@@ -324,7 +324,7 @@ def test_a_store_of_the_other_model_is_refused(run_cli: Run, tmp_path: Path) -> 
 
 @pytest.mark.long
 def test_an_interrupted_study_goes_on_where_it_stopped(folder: Path, run_cli: Run, tmp_path: Path) -> None:
-    from tactile_bayes.batch_store import open_store
+    from tactile_bayes.batch import open_store
 
     (tmp_path / "grid.csv").write_text("d_mm,depth_ratio,stiffness_ratio\n10,1,100\n10,0.8,100\n")
     marked = {"seat": "centred", "d_mm": 10.0, "depth_ratio": 1.0, "stiffness_ratio": 100.0, "amplitude": 0.123}
