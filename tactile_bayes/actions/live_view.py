@@ -40,8 +40,7 @@ from tactile_bayes.hardware.live import (
     fed,
     grey_levels,
 )
-from tactile_bayes.mapping.map import TactileMap, block_sums
-from tactile_bayes.mapping.places import Orientation, orientation_of
+from tactile_bayes.mapping.map import Orientation, TactileMap, block_sums, orientation_of
 from tactile_bayes.posterior.bump import candidate_centres
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map

@@ -18,8 +18,7 @@ from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.places import orientation_of
+from tactile_bayes.mapping.map import TactileMap, orientation_of
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import no_estimate_line
 from tactile_bayes.report.figure_file import plain_matplotlib

@@ -22,7 +22,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.findings import Finding, FindingEntry, Verdict
 from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.mapping.places import Position
+from tactile_bayes.mapping.clock import Position
 from tactile_bayes.options import Above0, Least0
 
 ESTIMATE: Final = "tactile-bayes/estimate/1"

@@ -32,8 +32,7 @@ from tactile_bayes.hardware.readings import CountArray, PoseReading
 from tactile_bayes.hardware.recorder import Observer, Report
 from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.cells import FramePoses, HeadMoments, distinct_poses, head_moments, poses_at
-from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.places import orientation_of
+from tactile_bayes.mapping.map import TactileMap, orientation_of
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, TrackerPoses
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.findings import Finding, finding_lines
-from tactile_bayes.geometry import FloatArray, IndexArray, apply, inverse, principal_axes
+from tactile_bayes.geometry import FloatArray, apply, inverse, principal_axes
 from tactile_bayes.mapping.cells import FramePoses, poses_at
 from tactile_bayes.mapping.convention import (
     CONVENTIONS,
@@ -77,6 +77,8 @@ _SWAYS_TRIED, _SWAY_STEPS = 4, 5
 _LEAST_SWAY_START: Final = 0.03
 """Of the squared errors, what the first step must take off for more: it does in 22 of 88 right scans whose errors last,
 and in all of 32 that breathe."""
+_LEAST_SWAY_HALFWAY: Final = 0.1
+"""Gain after two steps, for more: 25 scans of bodies that breathe and come to `LEAST_SWAY_GAIN` have 0.14 by then."""
 _SWAY_NUMBERS: Final = 5  # that are fitted: a rate, and cosine and sine along two axes
 _LEAST_OTHERS: Final = 2  #: Readings of other times that predict one.
 NOTHING_SHOWN: Final = "too little stands out to show that array, lever arm and quaternions are as stated"
@@ -430,20 +432,6 @@ def _moves(course: FloatArray, slope: FloatArray, error: FloatArray) -> tuple[fl
     return float(pull @ moves), moves.reshape(-1, 2)
 
 
-class _Array(Record, eq=False):
-    """Averaged frames of a scan in one order of the array."""
-
-    coarse: CoarseFrames
-    varying: FloatArray
-    """(m, k) averaged readings without what frames and taxels add: what they say of the breast, and noise."""
-    taxels: IndexArray  #: Flat indices of the good ones.
-
-    @classmethod
-    def of(cls, selection: SelectedFrames, frames: IndexArray) -> _Array:
-        coarse = CoarseFrames.of(selection, frames)
-        return cls(coarse, coarse.without_head(coarse.pressure), np.flatnonzero(selection.good_taxels))
-
-
 _Fit = tuple[Arrangement, Cells, FloatArray, FloatArray]
 
 
@@ -452,9 +440,7 @@ class _Overlap(Record, eq=False, dict=True):
 
     selection: SelectedFrames  #: Of a scan with distinct poses.
     latency_ms: float
-    array: _Array  #: As it is stated.
-    block: IndexArray
-    """(m,) stretch of 0.2 s that each averaged frame lies in."""
+    array: CoarseFrames  #: As it is stated.
     rough: bool  #: True for fewer frames, whose map is fitted less closely.
     paths: dict[Corrections, FramePoses] = field(default_factory=dict)
     """Mean pose of the tracker at each averaged frame, for the corrections of rotations asked so far."""
@@ -466,22 +452,26 @@ class _Overlap(Record, eq=False, dict=True):
         if not len(used):
             return None
         every = thinning([all_s[used]], most=_ROUGH_FRAMES if rough else MOST_FRAMES)
-        array = _Array.of(selection, used[every_stretch(all_s[used], every)])
-        found = cls(selection, latency_ms, array, array.coarse.blocks(all_s), rough)
+        found = cls(selection, latency_ms, CoarseFrames.of(selection, used[every_stretch(all_s[used], every)]), rough)
         return found if found.stretches >= _LEAST_BLOCKS else None
 
     @property
     def stretches(self) -> int:
         """Stretches of 0.2 s that hold frames."""
-        return int(self.block.max()) + 1
+        return int(self.array.block.max()) + 1
 
     @cached_property
-    def transposed(self) -> _Array:
+    def transposed(self) -> CoarseFrames:
         """The array read in the other order."""
         bad = np.argwhere(~_rearranged(self.selection.good_taxels, "transposed")).tolist()
         faults = tuple(TaxelFault(row, column, "left out") for row, column in bad)
         scan = corrected(self.selection.scan, ["transposed"])
-        return _Array.of(replace(self.selection, scan=scan, faults=faults), self.array.coarse.frames)
+        return CoarseFrames.of(replace(self.selection, scan=scan, faults=faults), self.array.frames)
+
+    @cached_property
+    def stated_places(self) -> tuple[FloatArray, float]:
+        """As `_places_mm` has them without corrections: a body that moves is held against them many times."""
+        return self._places_mm(())
 
     @cached_property
     def still(self) -> _Fit:
@@ -500,8 +490,8 @@ class _Overlap(Record, eq=False, dict=True):
 
         None where the first step takes off little.
         """
-        coarse, (_, cells, levelled, error) = self.array.coarse, self.still
-        time_s = block_means(self.selection.scan.frames.time_s[coarse.frames, None], coarse.first)
+        array, (_, cells, levelled, error) = self.array, self.still
+        time_s = block_means(self.selection.scan.frames.time_s[array.frames, None], array.first)
         slope = cells.gradient(levelled)
         waves = {rate: np.hstack([np.cos(turn := 2 * np.pi * rate * time_s), np.sin(turn)]) for rate in _SWAYS_HZ}
         gains = {rate: _moves(wave, slope, error)[0] for rate, wave in waves.items()}
@@ -509,7 +499,7 @@ class _Overlap(Record, eq=False, dict=True):
             return None
         found = []
         for rate in sorted(gains, key=gains.__getitem__)[-_SWAYS_TRIED:]:
-            made, sway = self._moving(waves[rate])
+            made, sway = self._moving(waves[rate], least=_LEAST_SWAY_HALFWAY)
             found.append(replace(made, sway_mm=2 * float(np.linalg.norm(sway, 2)), sways_a_minute=60 * rate))
         return min(found, key=lambda one: one.spread)
 
@@ -519,25 +509,31 @@ class _Overlap(Record, eq=False, dict=True):
         What a head feels follows its strokes by up to a fifth of their way, and where strokes are as slow as breaths
         the body seems to move.
         """
-        path = self._places_mm(())[0].mean(axis=1)
+        path = self.stated_places[0].mean(axis=1)
         strokes = (path - path.mean(axis=0)) @ principal_axes(path)[:, [-1]]
         return self._moving(strokes)[0]
 
-    def _moving(self, course: FloatArray) -> tuple[Arrangement, FloatArray]:
-        """What is stated, of a body that moves with (m, a) courses, by Gauss-Newton steps; and its (a, 2) moves, mm."""
+    def _moving(self, course: FloatArray, *, least: float = -np.inf) -> tuple[Arrangement, FloatArray]:
+        """What is stated, of a body that moves with (m, a) courses, by Gauss-Newton steps; and its (a, 2) moves, mm.
+
+        Two steps where they gain less than `least`.
+        """
         moves, (made, cells, levelled, error) = np.zeros((course.shape[1], 2)), self.still
-        for _ in range(_SWAY_STEPS):
+        for step in range(1, _SWAY_STEPS + 1):
             moves += _moves(course, cells.gradient(levelled), error)[1]
             made, cells, levelled, error = self._fitted((), (course @ moves)[:, None])
+            if step == 2 and made.gain_over(self.still[0]) < least:
+                break
         return made, moves
 
     def _fitted(self, corrections: Corrections, moves_mm: FloatArray | float = 0.0) -> _Fit:
         """The arrangement judged with places moved by (m, 1, 2), the cells, levelled readings, and their errors."""
-        array, (places, agreement) = self._array(corrections), self._places_mm(corrections)
+        array = self.transposed if "transposed" in corrections else self.array
+        places, agreement = self._places_mm(corrections) if corrections else self.stated_places
         varying, cells = array.varying, Cells.of([places + moves_mm])
-        values, block = varying.reshape(-1), np.repeat(self.block, varying.shape[1])
+        values, block = varying.reshape(-1), np.repeat(array.block, varying.shape[1])
         tolerance = _ROUGH_TOLERANCE if self.rough else COMPARED
-        rest, levelled = map_fit([array.coarse], values, cells, tolerance=tolerance, within=not self.rough)
+        rest, levelled = map_fit([array], values, cells, tolerance=tolerance, within=not self.rough)
         # by another clock the first or last frames have no pose: kept at one place they would seem to agree
         placed = np.repeat(self._path(corrections).known.astype(np.float64), varying.shape[1])
         cell = cells.number
@@ -558,18 +554,15 @@ class _Overlap(Record, eq=False, dict=True):
         )
         return made, cells, levelled, error
 
-    def _array(self, corrections: Corrections) -> _Array:
-        return self.transposed if "transposed" in corrections else self.array
-
     def _places_mm(self, corrections: Corrections) -> tuple[FloatArray, float]:
         """(m, k, 2) places of the averaged readings on the plane in which they lie, and how the face agrees with it."""
-        array, scan = self._array(corrections), self.selection.scan
+        array, scan = self.transposed if "transposed" in corrections else self.array, self.selection.scan
         surface = scan.head.surface_mm
         for name in set(corrections) & {"rows-reversed", "columns-reversed", "half-turn"}:
             surface = np.stack([_rearranged(surface[..., i], name) for i in range(3)], axis=-1)
         mounted = corrected(scan, (name for name in corrections if name.startswith(("lever", "quarter"))))
         tracker_from_head = inverse(mounted.head.scanhead_from_tracker)
-        on_tracker = array.coarse.weight.T @ apply(tracker_from_head, surface.reshape(-1, 3)[array.taxels])
+        on_tracker = array.weight.T @ apply(tracker_from_head, surface.reshape(-1, 3)[array.taxels])
         middle, path = on_tracker.mean(axis=0), self._path(corrections)
         centre, around = path.places_mm(middle), on_tracker - middle
         spread = len(around) * np.cov(centre.T, bias=True) + np.mean(
@@ -585,8 +578,8 @@ class _Overlap(Record, eq=False, dict=True):
         """Mean poses of the tracker at the averaged frames; known where all lie between its first and its last."""
         rotations = tuple(name for name in corrections if name in _ROTATIONS[-1])
         if rotations not in self.paths:
-            scan, coarse = corrected(self.selection.scan, rotations), self.array.coarse
-            time_s, first = scan.frames.time_s[coarse.frames], coarse.first
+            scan, first = corrected(self.selection.scan, rotations), self.array.first
+            time_s = scan.frames.time_s[self.array.frames]
             poses = poses_at(scan.poses, time_s, latency_ms=self.latency_ms, max_gap_ms=np.inf)
             means = block_means(poses.rotation.reshape(-1, 9), first).reshape(-1, 3, 3)
             known = np.logical_and.reduceat(poses.known, first)

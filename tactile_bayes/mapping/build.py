@@ -24,7 +24,8 @@ from tactile_bayes.mapping.accumulate import flat_field as find_flat_field
 from tactile_bayes.mapping.arrangement import check_arrangement
 from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, CellSums, HeadMoments, head_moments
 from tactile_bayes.mapping.convention import check_convention, convention_findings, hint
-from tactile_bayes.mapping.latency import estimate_latency
+from tactile_bayes.mapping.latency import StrokeShift, estimate_latency, mobility, stroke_count, stroke_lag_figures
+from tactile_bayes.mapping.latency import register_strokes as find_shifts
 from tactile_bayes.mapping.map import FEW_READINGS, MapRecipe, TactileMap, broken_assumptions, handling_findings, smooth
 from tactile_bayes.mapping.plausibility import exam_figures, exam_findings, map_findings, with_cause
 from tactile_bayes.mapping.profile import evenness_figures, head_profile_figures, motion, pose_noise_figures
@@ -37,8 +38,6 @@ from tactile_bayes.mapping.select import (
     select_frames,
     timing_figures,
 )
-from tactile_bayes.mapping.strokes import StrokeShift, mobility, stroke_count, stroke_lag_figures
-from tactile_bayes.mapping.strokes import register_strokes as find_shifts
 from tactile_bayes.options import MapOptions
 from tactile_bayes.progress import Progress, untold
 from tactile_bayes.scans import HeadShape, Scan

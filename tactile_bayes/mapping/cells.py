@@ -418,39 +418,38 @@ class Projection(Record, eq=False):
         return np.asarray(rows @ self.taxels)
 
 
-class Projector:
-    """The constants of a projection of the taxels in a (rows, columns) bool array, in row order; the same for all
-    frames."""
+class Projector(Record, eq=False):
+    """Projects taxels, in row order, onto the cells of a plane."""
 
-    def __init__(self, head: HeadGeometry, *, plane_from_base: FloatArray, taxels: BoolArray, cell_mm: float) -> None:
-        self._rows = plane_from_base[:2, :3].tolist()
-        self._origin_mm = inverse(plane_from_base)[:3, 3]
-        self._cell_mm = cell_mm
-        tracker_from_head = inverse(head.scanhead_from_tracker)
-        middle = apply(tracker_from_head, head.surface_mm.reshape(-1, 3).mean(axis=0))
-        centres = apply(tracker_from_head, head.surface_mm[taxels]) - middle
-        self._middle = middle.tolist()
-        steps = np.rint(centres * (1.0 / _TAXEL_STEP_MM)).T
-        self._taxels = np.vstack([steps * _TAXEL_STEP_MM, np.ones(len(centres))])
+    head: HeadGeometry
+    plane_from_base: FloatArray
+    taxels: BoolArray  #: (rows, columns): Those to project.
+    cell_mm: float
 
     def at(self, poses: FramePoses) -> Projection:
-        """Project the frames at `poses` onto the cells of the plane.
+        """Project the frames at `poses`.
 
         Term by term and not by matrix products: the bits of a frame do not depend on how many others there are.
         """
+        tracker_from_head = inverse(self.head.scanhead_from_tracker)
+        middle = apply(tracker_from_head, self.head.surface_mm.reshape(-1, 3).mean(axis=0))
+        centres = apply(tracker_from_head, self.head.surface_mm[self.taxels]) - middle
+        steps = np.rint(centres * (1.0 / _TAXEL_STEP_MM)).T
         r = poses.rotation.transpose(1, 2, 0).copy()
-        x, y, z = (poses.position_mm - self._origin_mm).T.copy()  # first of all: bases may lie far away
-        (m0, m1, m2), columns = self._middle, []
-        for a, b, c in self._rows:
+        # first of all: bases may lie far away
+        x, y, z = (poses.position_mm - inverse(self.plane_from_base)[:3, 3]).T.copy()
+        (m0, m1, m2), columns = middle.tolist(), []
+        for a, b, c in self.plane_from_base[:2, :3].tolist():
             t0, t1, t2 = (a * r[0][j] + b * r[1][j] + c * r[2][j] for j in range(3))
             columns += [t0, t1, t2, a * x + b * y + c * z + (t0 * m0 + t1 * m1 + t2 * m2)]
         matrix = np.array(columns).reshape(2, 4, -1)
-        matrix /= self._cell_mm
+        matrix /= self.cell_mm
         matrix[:, 3] += 0.5
         matrix *= 1.0 / _MATRIX_STEPS
         np.rint(matrix, out=matrix)
         matrix *= _MATRIX_STEPS
-        return Projection(self._taxels, np.ascontiguousarray(matrix.transpose(2, 0, 1)), self._cell_mm)
+        taxels = np.vstack([steps * _TAXEL_STEP_MM, np.ones(len(centres))])
+        return Projection(taxels, np.ascontiguousarray(matrix.transpose(2, 0, 1)), self.cell_mm)
 
 
 # --- Conversion of counts to pressures in whole multiples of a tiny step, so that sums have no rounding error.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
 from itertools import pairwise
 from typing import Final
 
@@ -49,14 +50,16 @@ def _slot(time_s: FloatArray) -> FloatArray:
     return np.asarray(np.floor(time_s / POOL_S))
 
 
-class CoarseFrames(Record, eq=False):
+class CoarseFrames(Record, eq=False, dict=True):
     """Some frames of one scan, averaged."""
 
     pressure: FloatArray
     """(m, k) array: Mean over a block of frames and a block of taxels, each frame over its own mean."""
     frames: IndexArray  #: (n,) int array: The scan's frames that were averaged.
     first: IndexArray  #: (m,) int array: Where each block of frames begins among them.
-    weight: FloatArray  #: (t, k) array: Share of each good taxel in each block of taxels; columns add up to 1.
+    block: IndexArray  #: (m,) int array: Which stretch of `SHARED_S` each of these lies in.
+    taxels: IndexArray  #: (t,) int array: Flat indices of the good taxels.
+    weight: FloatArray  #: (t, k) array: Share of each in each block of taxels; columns add up to 1.
     row: IndexArray  #: (k,) int array: Which rows of the head a block of taxels is of.
     basis: FloatArray  #: (k, 6) array: Orthonormal: a level, two slopes and three curvatures over the head's blocks.
 
@@ -64,21 +67,23 @@ class CoarseFrames(Record, eq=False):
     def of(cls, selection: SelectedFrames, frames: IndexArray) -> CoarseFrames:
         """Average the given frames of a scan, in the order of time; the few saturated readings count as their frame's
         mean."""
-        good, scan = selection.good_taxels, selection.scan
-        readout = selection.readout
-        weight, row, basis = _taxel_blocks(good)
+        scan, readout = selection.scan, selection.readout
+        weight, row, basis = _taxel_blocks(selection.good_taxels)
         first = np.flatnonzero(np.diff(stretches(scan.frames.time_s[frames]), prepend=-1))
+        shared = np.floor(scan.frames.time_s[frames[first]] / SHARED_S)
+        block = np.unique(shared, return_inverse=True)[1]
         pooled = np.empty((len(frames), weight.shape[1]))
         for part in chunks(len(frames), _CHUNK):
             chosen = frames[part]
             pressure, valid = readout.pressure_kpa(readout.counts(scan.frames.counts[chosen]))
             pressure /= selection.level_kpa[chosen, None]
             pooled[part] = (pressure if valid is None else np.where(valid, pressure, 1.0)) @ weight
-        return cls(block_means(pooled, first), frames, first, weight, row, basis)
+        return cls(block_means(pooled, first), frames, first, block, readout.taxels, weight, row, basis)
 
-    def blocks(self, time_s: FloatArray) -> IndexArray:
-        """(m,) which stretch of `SHARED_S` each averaged frame lies in, from the times of the scan's frames."""
-        return np.unique(np.floor(time_s[self.frames[self.first]] / SHARED_S), return_inverse=True)[1]
+    @cached_property
+    def varying(self) -> FloatArray:
+        """(m, k) readings without what frames and taxels add: what they say of the breast, and noise."""
+        return self.without_head(self.pressure)
 
     def without_head(self, values: FloatArray) -> FloatArray:
         """(m, k) values without a level, slopes and curvatures of each frame and an offset of each block of taxels.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record
@@ -161,9 +160,8 @@ class ProfileReader(Record, eq=False):
     def of(cls, good: BoolArray) -> ProfileReader:
         """Prepare for the good taxels of an array, True in (rows, columns)."""
         # at the taxels' centres, the array's ends at -1 and 1
-        centres = ((2.0 * np.arange(n) + 1.0) / n - 1.0 for n in good.shape)
-        across, along = (legendre.legvander(one, _HIGHEST) for one in centres)
-        terms = np.stack([np.outer(across[:, i], along[:, j])[good] for i, j in _ORDERS], axis=1)
+        across, along = (_legendre((2.0 * np.arange(n) + 1.0) / n - 1.0) for n in good.shape)
+        terms = np.stack([np.outer(across[i], along[j])[good] for i, j in _ORDERS], axis=1)
         if min(np.count_nonzero(good.any(axis=1)), np.count_nonzero(good.any(axis=0))) <= _HIGHEST:
             terms = terms[:0]
         return cls(np.ascontiguousarray(np.linalg.pinv(terms)), terms.T @ terms)
@@ -189,6 +187,14 @@ class ProfileReader(Record, eq=False):
         rows[:, :-1], rows[:, -1] = coefficients, left
         rows /= level_kpa[:, None]
         return rows
+
+
+def _legendre(x: FloatArray) -> list[FloatArray]:
+    """Legendre polynomials up to `_HIGHEST` by their recurrence: importing those of numpy takes longer than a scan."""
+    values = [np.ones_like(x), x]
+    for n in range(2, _HIGHEST + 1):
+        values.append((values[n - 1] * x * (2 * n - 1) - values[n - 2] * (n - 1)) / n)
+    return values
 
 
 # --- Figures of how even a scan's surroundings were: the head's profile from place to place and stroke to stroke.

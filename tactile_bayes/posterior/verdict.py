@@ -11,8 +11,7 @@ import numpy as np
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import CANNOT_SHOW, Abstention, UsageError
 from tactile_bayes.geometry import BoolArray, FloatArray
-from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.places import orientation_of
+from tactile_bayes.mapping.map import TactileMap, orientation_of
 from tactile_bayes.mapping.plausibility import against_no_lump
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import covered_share, map_ends, on_map, trusted, value_scale, window_cells

@@ -16,8 +16,8 @@ from tactile_bayes.files.reports import EstimateReport, MassReport
 from tactile_bayes.findings import Finding, capital, verdict
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.inference.draws import Quantity, summarise
+from tactile_bayes.mapping.clock import SIDES, ClockPosition, Position, clock_position, clock_text
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.places import SIDES, ClockPosition, Position, clock_position, clock_text
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.draw import MapPosterior
 from tactile_bayes.posterior.fit import SceneChoice, Structure

@@ -16,8 +16,8 @@ from tactile_bayes.files.reports import EstimateReport, MassReport, Place, Point
 from tactile_bayes.findings import capital
 from tactile_bayes.geometry import apply
 from tactile_bayes.inference.draws import Quantity
+from tactile_bayes.mapping.clock import ClockPosition, clock_position, clock_text
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
-from tactile_bayes.mapping.places import ClockPosition, clock_position, clock_text
 from tactile_bayes.mapping.plausibility import WHY_NOT
 from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.report.estimate_document import from_xiphoid, others, patient_mm, share_words, size_words

@@ -14,8 +14,7 @@ from tactile_bayes.files.reports import EstimateReport, centre_of
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.places import PATIENT_WORDS, Orientation, orientation_of
+from tactile_bayes.mapping.map import PATIENT_WORDS, Orientation, TactileMap, orientation_of
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report import svg
 from tactile_bayes.report.compare import (

@@ -12,8 +12,7 @@ import numpy as np
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding, finding_lines, verdict
 from tactile_bayes.mapping.accumulate import LEAST_SHARE
-from tactile_bayes.mapping.map import FEW_READINGS, TactileMap, advise_cell, skewed
-from tactile_bayes.mapping.places import Orientation, orientation_of
+from tactile_bayes.mapping.map import FEW_READINGS, Orientation, TactileMap, advise_cell, orientation_of, skewed
 from tactile_bayes.mapping.plausibility import WHY_NOT
 from tactile_bayes.mapping.profile import SPAN_MM
 from tactile_bayes.presets import CELL_PER_SIGMA, RESEARCH_USE

@@ -16,8 +16,7 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.files.reports import SmallestLump, centre_of
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.places import Orientation, orientation_of
+from tactile_bayes.mapping.map import Orientation, TactileMap, orientation_of
 from tactile_bayes.presets import VIRIDIS
 from tactile_bayes.report.exam_words import ExamMap, ExamMass
 

@@ -13,8 +13,7 @@ from tactile_bayes.actions.live_view import live_text
 from tactile_bayes.declarations import replace
 from tactile_bayes.hardware.live import LiveMap, LiveState, document
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.map import MapRecipe, TactileMap
-from tactile_bayes.mapping.places import orientation_of
+from tactile_bayes.mapping.map import MapRecipe, TactileMap, orientation_of
 from tactile_bayes.posterior.verdict import missing_strokes
 from tactile_bayes.report.map import map_figure
 from tactile_bayes.scans import Landmarks, Scan

@@ -272,7 +272,7 @@ def test_few_frames_rule_out_nothing_that_all_frames_do_not(late_ms):
     all_frames, few = (_Overlap.of(select(scan), 0.0, rough=rough) for rough in (False, True))
     assert all_frames is not None
     assert few is not None
-    assert len(few.block) < len(all_frames.block) / 2
+    assert len(few.array.block) < len(all_frames.array.block) / 2
     trials = [((name,), 0.0) for name in CORRECTIONS] + [((), float(ms)) for ms in (-300, -100, -30, 30, 100, 300)]
     close, excluded = _screened(few, trials, stretches=all_frames.stretches)
     assert 0 < len(close) < len(trials) / 2

@@ -11,8 +11,8 @@ from mapping_scans import gaussian, make_scan, strokes
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.mapping.build import build_map
+from tactile_bayes.mapping.clock import NIPPLE_SD_MM, ClockPosition, clock_position, clock_text
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.places import NIPPLE_SD_MM, ClockPosition, clock_position, clock_text
 from tactile_bayes.scans import Landmarks
 
 INTO_BODY = np.array([0.0, 0.0, 1.0])  # of `make_scan`: its head's z axis is the base's

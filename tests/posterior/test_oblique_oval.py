@@ -10,8 +10,8 @@ from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.inference.ensemble import convergence
+from tactile_bayes.mapping.clock import ClockPosition
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.mapping.places import ClockPosition
 from tactile_bayes.posterior.bump import cell_mean_gaussian, covariance_from_log_widths, drawn_widths, principal_widths
 
 WIDE, NARROW = 7.0, 4.0

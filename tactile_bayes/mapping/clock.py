@@ -1,119 +1,16 @@
-"""Places on a map in the patient: orientation and the clock face."""
+"""Place of a lump as clinicians tell it: by the clock about the nipple, and by its distance from the nipple."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from statistics import NormalDist
-from typing import Any, Final, Literal, get_args
+from typing import Final, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from tactile_bayes.declarations import Record, rounded
-from tactile_bayes.findings import capital
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
-
-# --- Orientation of a map on the screen: one rule for every picture.
-
-PATIENT_WORDS: Final = "seen facing the patient: head up, patient's left on the right"
-PLANE_WORDS: Final = "no landmarks: seen from outside, y (along the head) up, x to the left"
-GRID_WORDS: Final = "as the imported file reads: first row on top, x to the right, y down"
-_PATIENT_SIDES: Final = {
-    "R": "the patient's right",
-    "L": "the patient's left",
-    "H": "the patient's head",
-    "F": "the patient's feet",
-}
-
-
-class Orientation(Record):
-    """Which axes of the plane point right and up on the screen."""
-
-    right: str
-    up: str
-    """`right`, `up`: ``"+x"``, ``"-x"``, ``"+y"`` or ``"-y"``. Of the eight pairs only four are used: z, into the
-    tissue, always points away from the viewer."""
-    words: str  #: The orientation in a phrase, for captions.
-    notch: tuple[float, float] | None = None
-    """(2,) tuple or None: Unit vector to the sternal notch on the screen (to the right, upwards); None without
-    landmarks."""
-
-    @property
-    def swapped(self) -> bool:
-        """True where y, not x, runs across the screen."""
-        return self.right[1] == "y"
-
-    @property
-    def edges(self) -> Mapping[str, str]:
-        """Labels of the picture's edges: the patient's R, L, H (head), F (feet), or else an axis."""
-        if self.notch is not None:
-            return {"left": "R", "right": "L", "top": "H", "bottom": "F"}
-        return {"left": _opposite(self.right), "right": self.right, "top": self.up, "bottom": _opposite(self.up)}
-
-    @property
-    def sentence(self) -> str:
-        """The orientation with what the letters at the edges stand for, for pages."""
-        sides = "; R, L: the patient's right and left; H: head, F: feet" if self.notch is not None else ""
-        return f"{capital(self.words)}{sides}."
-
-    def side_words(self, axis: str) -> str:
-        """Name a side of the map ("+x", "-x", "+y", "-y"): the patient's with landmarks, else the picture's."""
-        screen = {self.right: "right", _opposite(self.right): "left", self.up: "top", _opposite(self.up): "bottom"}
-        side = screen[axis]
-        words = f"the picture's {side}" if self.notch is None else _PATIENT_SIDES[self.edges[side]]
-        return f"{words} ({axis})"
-
-    def screen(self, values: NDArray[Any]) -> NDArray[Any]:
-        """The (ny, nx) values of a map as the rows of a picture: row 0 on top, column 0 on the left."""
-        across = values if not self.swapped else values.T
-        columns = across if self.right[0] == "+" else across[:, ::-1]
-        return columns[::-1] if self.up[0] == "+" else columns
-
-    def place(self, tactile_map: TactileMap, centre_mm: tuple[float, float]) -> tuple[float, float]:
-        """Position of a point of the plane in the picture, in cells from its left and top edges."""
-        axes = {"x": tactile_map.x_mm, "y": tactile_map.y_mm}
-        point = dict(zip("xy", centre_mm, strict=True))
-        half, cell = tactile_map.recipe.cell_mm / 2, tactile_map.recipe.cell_mm
-
-        def along(axis: str) -> float:
-            if axis[0] == "+":
-                return float(point[axis[1]] - axes[axis[1]][0] + half) / cell
-            return float(axes[axis[1]][-1] + half - point[axis[1]]) / cell
-
-        return along(self.right), along(_opposite(self.up))
-
-
-def orientation_of(tactile_map: TactileMap) -> Orientation:
-    """Orientation in which a map is shown.
-
-    The viewer looks along z, into the tissue, as an examiner does who faces the patient. With landmarks the plane is
-    shown by the quarter turn that brings the sternal notch nearest to straight up; the patient's left is then on the
-    viewer's right. Without landmarks y, along the scan head, is up, and x runs to the left. A grid that was imported
-    has no outside and is shown as its file reads: first row on top, first column on the left.
-    """
-    if tactile_map.patient_from_plane is None and tactile_map.plane_from_base is None:
-        return Orientation("+x", "-y", GRID_WORDS)
-    if tactile_map.patient_from_plane is None:
-        return Orientation("-x", "+y", PLANE_WORDS)
-    notch = tactile_map.patient_from_plane[1, :2]
-    length = float(np.hypot(*notch))
-    x, y = (float(value) / length for value in notch) if length > 0 else (0.0, 1.0)
-    along = {"+y": y, "-y": -y, "+x": x, "-x": -x}
-    up = max(along, key=lambda axis: along[axis])
-    return Orientation(_RIGHT_OF_UP[up], up, PATIENT_WORDS, (along[_RIGHT_OF_UP[up]], along[up]))
-
-
-# What runs to the right when an axis is up and z points away from the viewer.
-_RIGHT_OF_UP: Final = {"+y": "-x", "-y": "+x", "+x": "+y", "-x": "-y"}
-
-
-def _opposite(axis: str) -> str:
-    return ("-" if axis[0] == "+" else "+") + axis[1]
-
-
-# --- Place of a lump as clinicians tell it: by the clock about the nipple, and by its distance from the nipple.
 
 Side = Literal["left", "right"]
 SIDES: Final[tuple[Side, ...]] = get_args(Side)
@@ -161,14 +58,14 @@ class ClockPosition(Record):
         if told is None or told.clock_hours.median is None:
             return None
         hours, distance = told.clock_hours, told.distance_mm
-        across = (_known(hours.high) - _known(hours.median)) % 12.0
-        return cls(
-            side=told.side,
-            distance_mm=_known(distance.median),
-            distance_sd_mm=(_known(distance.high) - _known(distance.median)) / _deviations(distance.probability),
-            angle_deg=_known(hours.median) * _DEGREES_PER_HOUR % 360.0,
-            angle_sd_deg=across * _DEGREES_PER_HOUR / _deviations(hours.probability),
-        )
+        assert hours.median is not None
+        assert hours.high is not None
+        assert distance.median is not None
+        assert distance.high is not None
+        reach = (hours.high - hours.median) % 12.0 / _deviations(hours.probability)
+        away = (distance.high - distance.median) / _deviations(distance.probability)
+        turn = hours.median * _DEGREES_PER_HOUR % 360.0
+        return cls(told.side, distance.median, away, turn, reach * _DEGREES_PER_HOUR)
 
     @property
     def hours(self) -> float:
@@ -270,10 +167,4 @@ def _on_clock(hours: float) -> float:
 
 
 def _deviations(probability: float) -> float:
-    return NormalDist().inv_cdf(0.5 + probability / 2.0)
-
-
-def _known(value: float | None) -> float:
-    """A number of a place that has them all."""
-    assert value is not None
-    return value
+    return float(ndtri(0.5 + probability / 2.0))
