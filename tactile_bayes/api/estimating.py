@@ -148,10 +148,12 @@ def estimate_one(
         if isinstance(used, BodyCalibration) and used.site is not None:
             by += f" ({site_words(used.site, math.log(sigma_mm))})"
         words = calibration_line(by, used, sigma_mm=sigma_mm)
-        assert estimate.diagnostics is not None
-        site = "" if settings.repeatability is None else settings.repeatability.words()
-        diagnostics = replace(estimate.diagnostics, calibration=by, size_calibration=words, repeatability=site)
-        estimate = replace(estimate, diagnostics=diagnostics)
+        diagnostics = {**estimate.diagnostics, "size_calibration": words}
+        if settings.repeatability is not None:
+            diagnostics["repeatability"] = settings.repeatability.words()
+        if "convergence" in diagnostics:  # the longest comes last
+            diagnostics["convergence"] = diagnostics.pop("convergence")
+        estimate = replace(estimate, diagnostics=diagnostics, sized_by=by)
     named = settings.calibration_name or (f"{shipped} (shipped)" if calibration is not None else "none")
     used_fit = {"background": options.background, "fit_radius_mm": options.fit_radius_mm, "noise": options.noise}
     recorded = settings.recorded(size_calibration=named, **used_fit)

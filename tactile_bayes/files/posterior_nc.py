@@ -70,7 +70,7 @@ def _draws_of(found: Estimate | SizePosterior) -> tuple[str, dict[str, FloatArra
     draws = {name: getattr(found.map_posterior, name) for name in OF_A_MAP}
     if found.size is not None:
         draws |= {name: getattr(found.size, name) for name in _OF_A_SIZE}
-    return found.draws.method, draws, {} if found.diagnostics is None else found.diagnostics.as_dict()
+    return found.draws.method, draws, found.diagnostics
 
 
 def _with_coordinates(arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]) -> dict[str, Variable]:

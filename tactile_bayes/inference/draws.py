@@ -192,32 +192,23 @@ class Solved:
         self._solve = solve
         self._theta: list[FloatArray] = []
         self._solutions: list[Solution] = []
-        self._index: tuple[FloatArray, Solution] | None = None
 
     def add(self, theta: FloatArray, solution: Solution) -> None:
         """Keep the solution at (m, p) parameter vectors."""
         self._theta.append(theta)
         self._solutions.append(solution)
-        self._index = None
 
     def __call__(self, theta: FloatArray) -> Solution:
         """Solutions at (m, p) parameter vectors: cached where all are known, else computed."""
         if not self._theta:
             return self._solve(theta)
-        points, kept = self._sorted()
-        row = np.minimum(np.searchsorted(points[:, 0], theta[:, 0]), len(points) - 1)
+        points = np.concatenate(self._theta)
+        order = np.argsort(points[:, 0], kind="stable")  # random points never share their first coordinate
+        place = np.searchsorted(points[:, 0], theta[:, 0], sorter=order)
+        row = order[np.minimum(place, len(points) - 1)]
         if not np.array_equal(points[row], theta):
             return self._solve(theta)
-        return tuple(one[row] for one in kept)
-
-    def _sorted(self) -> tuple[FloatArray, Solution]:
-        """All points in order of their first coordinate, which random points never share, and their solutions."""
-        if self._index is None:
-            theta = np.concatenate(self._theta)
-            order = np.argsort(theta[:, 0], kind="stable")
-            together = (np.concatenate(parts) for parts in zip(*self._solutions, strict=True))
-            self._index = theta[order], tuple(one[order] for one in together)
-        return self._index
+        return tuple(np.concatenate(parts)[row] for parts in zip(*self._solutions, strict=True))
 
 
 def distinct_rows(rows: FloatArray) -> tuple[FloatArray, IndexArray]:

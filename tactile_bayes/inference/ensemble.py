@@ -28,15 +28,9 @@ def _arviz() -> Any:
     return arviz
 
 
-def chain_diagnostics(chains: FloatArray) -> dict[str, float]:
-    """Worst R-hat and smallest bulk and tail effective draws over the parameters of (chain, draw, p) draws (Vehtari,
-    Gelman, Simpson, Carpenter & Buerkner 2021, Bayesian Analysis 16:667)."""
-    each = [_agreement(np.ascontiguousarray(chains[:, :, i])) for i in range(chains.shape[2])]
-    return {name: (max if name == "rhat" else min)(one[name] for one in each) for name in each[0]}
-
-
 def _agreement(draws: FloatArray) -> dict[str, float]:
-    """Rank-normalised split R-hat, and bulk and tail effective draws, of (chain, draw) draws."""
+    """Rank-normalised split R-hat, and bulk and tail effective draws, of (chain, draw) draws (Vehtari, Gelman, Simpson,
+    Carpenter & Buerkner 2021, Bayesian Analysis 16:667)."""
     arviz = _arviz()
     figures = {"rhat": float(arviz.rhat(draws, method="rank"))}
     return figures | {f"ess_{part}": float(arviz.ess(draws, method=part)) for part in ("bulk", "tail")}
@@ -131,7 +125,7 @@ def ensemble(
 
     Differential-evolution moves (ter Braak 2006) in emcee (Foreman-Mackey et al. 2013), from the (p,) mode and (p, p)
     approximate covariance or from some of the (n, p) draws in `start`. The first third of each ensemble's steps is
-    dropped. Diagnostics are rank-normalised (Vehtari et al. 2021); when they are not reached in ``max_steps`` a
+    dropped. Diagnostics are of the worst parameter; when they are not reached in ``max_steps`` a
     `NotConvergedError` says about how many steps would do. Progress is effective draws so far and those wanted.
 
     `store` keeps the state after each block, bound to `key`. A run goes on from a state that it finds, and on one
@@ -153,7 +147,8 @@ def ensemble(
                 kept_now = zip(*(one.kept() for one in samplers), strict=True)
                 store.save(key, ChainState(*map(np.stack, kept_now)))
         chains = np.stack([sampler.chain() for sampler in samplers])
-        figures = chain_diagnostics(chains)
+        each = [_agreement(np.ascontiguousarray(chains[:, :, i])) for i in range(chains.shape[2])]
+        figures = {name: (max if name == "rhat" else min)(one[name] for one in each) for name in each[0]}
         least = min(figures["ess_bulk"], figures["ess_tail"])
         if progress is not None:
             progress(int(min(least, options.least_ess)), int(options.least_ess))

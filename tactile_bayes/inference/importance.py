@@ -203,7 +203,11 @@ def fitted_gaussians(
             break
         centre = theta[np.argmax(log_target - log_share)]
         means.append(centre)
-        covariances.append(_covariance_about(theta, weight, centre, whole))
+        # of the nearest points, weighted half by their weights and half alike
+        z = np.linalg.solve(np.linalg.cholesky(whole), (theta - centre).T)
+        near = np.argsort(np.sum(z**2, axis=0), kind="stable")[:ADDED]
+        mixed = weight[near] + 1.0 / len(theta)
+        covariances.append(_covariance(theta[near], mixed / mixed.sum(), centre) + LEAST_VARIANCE * whole)
         points = centre + rng.standard_normal((ADDED, len(centre))) @ np.linalg.cholesky(covariances[-1]).T
         log_share = np.logaddexp(log_share, np.log(ADDED) + Gaussians.one(centre, covariances[-1]).log_density(theta))
         earlier = Gaussians(np.full(number, 1.0 / number), np.array(means[1:]), np.array(covariances[1:]))
@@ -217,14 +221,6 @@ def fitted_gaussians(
 def _covariance(theta: FloatArray, weight: FloatArray, centre: FloatArray) -> FloatArray:
     off = theta - centre
     return np.asarray((weight[:, None] * off).T @ off)
-
-
-def _covariance_about(theta: FloatArray, weight: FloatArray, centre: FloatArray, whole: FloatArray) -> FloatArray:
-    """Covariance of the nearest points about one, weighted half by their weights and half alike."""
-    z = np.linalg.solve(np.linalg.cholesky(whole), (theta - centre).T)
-    near = np.argsort(np.sum(z**2, axis=0), kind="stable")[:ADDED]
-    mixed = weight[near] + 1.0 / len(theta)
-    return _covariance(theta[near], mixed / mixed.sum(), centre) + LEAST_VARIANCE * whole
 
 
 # --- Importance sampling by randomised quasi-Monte Carlo about the mode, doubled until interval ends are accurate.

@@ -11,16 +11,7 @@ from numpy.typing import NDArray
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
-from tactile_bayes.mapping.cells import (
-    VALUE_STEP,
-    CellSums,
-    FramePoses,
-    Projection,
-    Projector,
-    Readout,
-    add_frames,
-    chunk_frames,
-)
+from tactile_bayes.mapping import cells
 from tactile_bayes.mapping.map import FEW_READINGS, MapRecipe, TactileMap
 from tactile_bayes.mapping.profile import GrowingProfile
 from tactile_bayes.mapping.select import SelectedFrames, chunks, gate
@@ -35,7 +26,7 @@ class Source(Record, eq=False):
     """Used frames of one scan, which can be read chunk by chunk any number of times."""
 
     selection: SelectedFrames  #: The scan with its used frames.
-    projection: Projection  #: The used frames only, in their order.
+    projection: cells.Projection  #: The used frames only, in their order.
 
     @property
     def frames(self) -> IndexArray:
@@ -138,12 +129,12 @@ class _System:
 
     def _total(self, gains: FloatArray | None) -> FloatArray:
         """Sum over each cell's readings of their pressure over their frame's gain; without gains, their number."""
-        cells = self._shape[0] * self._shape[1]
-        total = np.zeros(cells)
+        size = self._shape[0] * self._shape[1]
+        total = np.zeros(size)
         for frames, flat, pressure, valid in self._parts():
             counted = np.ones_like(pressure) if valid is None else valid
             weight = counted if gains is None else pressure / gains[frames, None]
-            total += np.bincount(flat.ravel(), weight.ravel(), cells)
+            total += np.bincount(flat.ravel(), weight.ravel(), size)
         return total
 
     def _parts(self) -> Iterator[tuple[slice, *_Part]]:
@@ -222,7 +213,7 @@ def flat_field(selection: SelectedFrames) -> tuple[FloatArray, int]:
 class Accumulated(Record, eq=False):
     """Sums over all frames, and how the gains were solved."""
 
-    sums: CellSums  #: The cells.
+    sums: cells.CellSums  #: The cells.
     levels: list[FloatArray]  #: Divisors of the frames, one array per scan.
     scale: float = 1.0  #: Divisor of the sums' values (1 but for ``gain``, whose level is set afterwards).
     passes: int = 1  #: Passes over the scan.
@@ -249,15 +240,15 @@ def accumulate(sources: list[Source], *, cell_mm: float, normalise: str, progres
 
 def add_all(
     sources: list[Source], levels: list[FloatArray], *, cell_mm: float, progress: Progress = untold
-) -> CellSums:
+) -> cells.CellSums:
     """One pass over all used frames, each divided by its level."""
-    sums = CellSums(cell_mm)
+    sums = cells.CellSums(cell_mm)
     done, total = 0, sum(len(source.projection) for source in sources)
     for source, level in zip(sources, levels, strict=True):
-        for part, counts in source.parts(chunk_frames(source.selection.readout.size)):
+        for part, counts in source.parts(cells.chunk_frames(source.selection.readout.size)):
             pressure, valid = source.selection.readout.pressure_kpa(counts)
             projection = source.projection.part(part)
-            add_frames(sums, source.selection.readout, pressure, valid, projection=projection, level=level[part])
+            cells.add_frames(sums, source.selection.readout, pressure, valid, projection=projection, level=level[part])
             done += len(counts)
             progress(done, total)
     return sums
@@ -284,9 +275,9 @@ class MapAccumulator:
     ) -> None:
         self.plane_from_base = plane_from_base
         taxels = np.ones(head.shape, dtype=bool)
-        self._head, self._readout, self._window_kpa = head, Readout.of(calibration, taxels), pressure_window_kpa
-        self._projector = Projector(head, plane_from_base=plane_from_base, taxels=taxels, cell_mm=cell_mm)
-        self._sums, self._profile = CellSums(cell_mm), GrowingProfile(taxels)
+        self._head, self._readout, self._window_kpa = head, cells.Readout.of(calibration, taxels), pressure_window_kpa
+        self._projector = cells.Projector(head, plane_from_base=plane_from_base, taxels=taxels, cell_mm=cell_mm)
+        self._sums, self._profile = cells.CellSums(cell_mm), GrowingProfile(taxels)
         dropped = ("dropped_no_pose", "dropped_elements", "dropped_low", "dropped_high")
         self._counted = Counter(dict.fromkeys(("frames_total", "frames_used", *dropped, "saturated_readings"), 0))
 
@@ -296,13 +287,13 @@ class MapAccumulator:
         more = {"clipped_values": self._sums.clipped, "negative_readings": self._sums.negative}
         return {name: float(value) for name, value in {**self._counted, **more}.items()}
 
-    def add(self, counts: CountArray, poses: FramePoses) -> BoolArray:
+    def add(self, counts: CountArray, poses: cells.FramePoses) -> BoolArray:
         """Add (n, rows, columns) frames with the n poses at their times; returns the (n,) that were used."""
-        parts = chunks(len(counts), chunk_frames(self._readout.size))
+        parts = chunks(len(counts), cells.chunk_frames(self._readout.size))
         used = [self._add(self._readout.counts(counts[part]), poses.part(part)) for part in parts]
         return np.concatenate([np.zeros(0, dtype=bool), *used])
 
-    def _add(self, counts: CountArray, poses: FramePoses) -> BoolArray:
+    def _add(self, counts: CountArray, poses: cells.FramePoses) -> BoolArray:
         pressure, valid = self._readout.pressure_kpa(counts)
         level, share = self._readout.levels(pressure, valid)
         low, high, used = gate(poses.known, level, share, pressure_window_kpa=self._window_kpa)
@@ -318,7 +309,7 @@ class MapAccumulator:
         self._counted["saturated_readings"] += round(float((1 - share).sum()) * self._readout.size)
         self._profile.add(pressure, level, share)
         valid, projection = None if valid is None else valid[frames], self._projector.at(poses)
-        add_frames(self._sums, self._readout, pressure, valid, projection=projection, level=level)
+        cells.add_frames(self._sums, self._readout, pressure, valid, projection=projection, level=level)
         return used
 
     def snapshot(self) -> TactileMap:
@@ -361,7 +352,9 @@ LONGEST_MM = 100.0
 _LENGTHS = 400
 
 
-def shared_frame_figures(sources: Sequence[Source], levels: Sequence[FloatArray], sums: CellSums) -> dict[str, float]:
+def shared_frame_figures(
+    sources: Sequence[Source], levels: Sequence[FloatArray], sums: cells.CellSums
+) -> dict[str, float]:
     """Figures of the error correlation within a frame, from at most `RUNS` x `RUN_FRAMES` of the frames that made
     `sums`.
 
@@ -386,7 +379,7 @@ def shared_frame_figures(sources: Sequence[Source], levels: Sequence[FloatArray]
     if len(runs) < LEAST_RUNS or readings < LEAST_READINGS:
         return {}
     variance = sum(float(np.einsum("fk,fk->", run.whole, run.others)) for run in runs) / readings
-    if not variance > VALUE_STEP**2:
+    if not variance > cells.VALUE_STEP**2:
         return {}
     share, length_mm = _decay(*_correlations(sources, runs, variance))
     figures = {
@@ -416,15 +409,15 @@ class _Run(Record, eq=False):
 
     source: Source  #: Which of the sources.
     cell: NDArray[np.int64]
-    cells: int
-    """`cell`, `cells`: Where each reading lies in the block of cells that the run covers, and how many those are."""
+    size: int
+    """`cell`, `size`: Where each reading lies in the block of cells that the run covers, and how many those are."""
     whole: FloatArray
     others: FloatArray
     """`whole`, `others`: Errors about the map, and about the map without this run."""
     known: BoolArray  #: Valid readings in cells that enough readings of other frames fell into.
 
     @classmethod
-    def of(cls, source: Source, level: FloatArray, sums: CellSums, run: slice) -> _Run:
+    def of(cls, source: Source, level: FloatArray, sums: cells.CellSums, run: slice) -> _Run:
         """The errors of the frames `run` of a source."""
         counts = source.selection.scan.frames.counts[source.frames[run]]
         pressure, valid = source.selection.readout.pressure_kpa(source.selection.readout.counts(counts))
@@ -433,7 +426,7 @@ class _Run(Record, eq=False):
         projection = source.projection.part(run)
         first, shape = projection.block()
         cell, window = projection.flat(first, shape), sums.window(first, shape)
-        count, total = sums.count[window].ravel(), sums.total[window].ravel() * VALUE_STEP
+        count, total = sums.count[window].ravel(), sums.total[window].ravel() * cells.VALUE_STEP
         rest = count - np.bincount(cell[fine], minlength=len(count))
         rest_total = total - np.bincount(cell[fine], value[fine], len(count))
         enough = rest >= FEW_READINGS
@@ -487,9 +480,9 @@ def _inflation(runs: Sequence[_Run], square: float) -> float:
     more = 0.0
     for run in runs:
         frames = len(run.whole)
-        place = (run.cell + np.arange(frames)[:, None] * run.cells).ravel()
+        place = (run.cell + np.arange(frames)[:, None] * run.size).ravel()
         sums = [
-            np.bincount(place, error.ravel(), frames * run.cells).reshape(frames, -1)
+            np.bincount(place, error.ravel(), frames * run.size).reshape(frames, -1)
             for error in (run.whole, run.others)
         ]
         between = sums[0] @ sums[1].T

@@ -22,16 +22,9 @@ import numpy as np
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.geometry import FloatArray, apply, inverse, principal_axes
+from tactile_bayes.mapping import convention
 from tactile_bayes.mapping.cells import FramePoses, poses_at
-from tactile_bayes.mapping.convention import (
-    CONVENTIONS,
-    CoarseFrames,
-    block_means,
-    corrected_quaternions,
-    every_stretch,
-    import_again,
-    thinning,
-)
+from tactile_bayes.mapping.convention import CoarseFrames
 from tactile_bayes.mapping.latency import COMPARED, Cells, map_fit
 from tactile_bayes.mapping.plausibility import SURE_ODDS, scan_doubts
 from tactile_bayes.mapping.select import SelectedFrames, TaxelFault, scan_findings, select_frames
@@ -42,7 +35,7 @@ _ORDERS: Final = ("rows-reversed", "columns-reversed", "half-turn", "quarter-tur
 _ARRAY: Final = ((), *((name,) for name in _ORDERS))
 _FRAMES: Final = ((), ("transposed",))
 _LEVER: Final = ((), ("lever-inverse",), ("lever-none",))
-_ROTATIONS: Final = tuple(CONVENTIONS.values())
+_ROTATIONS: Final = tuple(convention.CONVENTIONS.values())
 
 Corrections = tuple[str, ...]
 Trial = tuple[Corrections, float]  #: Corrections, and by how many ms poses are later.
@@ -112,7 +105,7 @@ def _corrected(scan: Scan, name: str) -> Scan:
     if name in levers:
         return replace(scan, head=HeadGeometry(head.surface_mm, head.pitch_mm, levers[name]))
     if name in _ROTATIONS[-1]:
-        wxyz = corrected_quaternions(poses.quaternion_wxyz, [name])
+        wxyz = convention.corrected_quaternions(poses.quaternion_wxyz, [name])
         return replace(scan, poses=TrackerPoses(poses.time_s, poses.position_mm, wxyz))
     calibration = scan.element_calibration
     gain, offset = (_rearranged(one, name) for one in (calibration.gain_kpa_per_count, calibration.offset_kpa))
@@ -268,7 +261,7 @@ class ArrangementCheck(Record, eq=False):
             return Finding(
                 "wrong_arrangement",
                 "the sensor array or the tracker seems not to be mounted as stated; size and place may be wrong",
-                import_again(self.best.corrections),
+                convention.import_again(self.best.corrections),
                 "have it checked how the array and the tracker are mounted",
             )
         return None
@@ -451,8 +444,13 @@ class _Overlap(Record, eq=False, dict=True):
         used, all_s = np.flatnonzero(stated.used), stated.scan.frames.time_s
         if not len(used):
             return None
-        every = thinning([all_s[used]], most=_ROUGH_FRAMES if rough else MOST_FRAMES)
-        found = cls(selection, latency_ms, CoarseFrames.of(selection, used[every_stretch(all_s[used], every)]), rough)
+        every = convention.thinning([all_s[used]], most=_ROUGH_FRAMES if rough else MOST_FRAMES)
+        found = cls(
+            selection,
+            latency_ms,
+            CoarseFrames.of(selection, used[convention.every_stretch(all_s[used], every)]),
+            rough,
+        )
         return found if found.stretches >= _LEAST_BLOCKS else None
 
     @property
@@ -491,7 +489,7 @@ class _Overlap(Record, eq=False, dict=True):
         None where the first step takes off little.
         """
         array, (_, cells, levelled, error) = self.array, self.still
-        time_s = block_means(self.selection.scan.frames.time_s[array.frames, None], array.first)
+        time_s = convention.block_means(self.selection.scan.frames.time_s[array.frames, None], array.first)
         slope = cells.gradient(levelled)
         waves = {rate: np.hstack([np.cos(turn := 2 * np.pi * rate * time_s), np.sin(turn)]) for rate in _SWAYS_HZ}
         gains = {rate: _moves(wave, slope, error)[0] for rate, wave in waves.items()}
@@ -581,7 +579,7 @@ class _Overlap(Record, eq=False, dict=True):
             scan, first = corrected(self.selection.scan, rotations), self.array.first
             time_s = scan.frames.time_s[self.array.frames]
             poses = poses_at(scan.poses, time_s, latency_ms=self.latency_ms, max_gap_ms=np.inf)
-            means = block_means(poses.rotation.reshape(-1, 9), first).reshape(-1, 3, 3)
+            means = convention.block_means(poses.rotation.reshape(-1, 9), first).reshape(-1, 3, 3)
             known = np.logical_and.reduceat(poses.known, first)
-            self.paths[rotations] = FramePoses(block_means(poses.position_mm, first), means, known)
+            self.paths[rotations] = FramePoses(convention.block_means(poses.position_mm, first), means, known)
         return self.paths[rotations]

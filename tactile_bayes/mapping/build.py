@@ -11,6 +11,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, check_number
 from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.geometry import BoolArray, FloatArray, Plane, apply, inverse, patient_from_plane
+from tactile_bayes.mapping import select
 from tactile_bayes.mapping.accumulate import (
     GAIN_TOLERANCE,
     Accumulated,
@@ -29,15 +30,7 @@ from tactile_bayes.mapping.latency import register_strokes as find_shifts
 from tactile_bayes.mapping.map import FEW_READINGS, MapRecipe, TactileMap, broken_assumptions, handling_findings, smooth
 from tactile_bayes.mapping.plausibility import exam_figures, exam_findings, map_findings, with_cause
 from tactile_bayes.mapping.profile import evenness_figures, head_profile_figures, motion, pose_noise_figures
-from tactile_bayes.mapping.select import (
-    SelectedFrames,
-    every_nth,
-    frame_figures,
-    refuse_without_frames,
-    scan_findings,
-    select_frames,
-    timing_figures,
-)
+from tactile_bayes.mapping.select import SelectedFrames
 from tactile_bayes.options import MapOptions
 from tactile_bayes.progress import Progress, untold
 from tactile_bayes.scans import HeadShape, Scan
@@ -174,13 +167,13 @@ def build_map(
     how = MapOptions(**options)
     check_number("max_pose_gap_ms", max_pose_gap_ms, 0, open_ends=True)
     given = [scans] if isinstance(scans, Scan) else list(scans)
-    parts = [every_nth(scan, how.every) for scan in given]
+    parts = [select.every_nth(scan, how.every) for scan in given]
     _check_same_examination(parts)
     figures: dict[str, float] = {} if how.every == 1 else {"frames_every": float(how.every)}
     late_ms = 0.0 if isinstance(how.latency_ms, str) else float(how.latency_ms)
     selections = _selected(parts, how, late_ms, max_pose_gap_ms)
     figures |= exam_figures(selections)
-    of_scans = _numbered([scan_findings(scan) for scan in given])
+    of_scans = _numbered([select.scan_findings(scan) for scan in given])
     try:
         return _built(of_scans, selections, how, figures, late_ms=late_ms, gap_ms=max_pose_gap_ms, progress=progress)
     except BadDataError as error:
@@ -201,7 +194,12 @@ def _built(
     findings = of_scans + _of_arrangement(selections, late_ms, figures, refuse=not how.as_stated)
     figures |= head_profile_figures(selections)
     if how.flat_field:
-        selections = _selected(_flattened(selections, figures), how, late_ms, gap_ms)
+        used = [part for part in selections if part.used.any()]
+        flats = [find_flat_field(part) for part in used]
+        figures["flat_field_frames"] = float(sum(frames for _, frames in flats))
+        figures["flat_field_sd"] = float(np.mean([response.std() for response, _ in flats]))
+        even = [divided(part.scan, response) for (response, _), part in zip(flats, used, strict=True)]
+        selections = _selected(even, how, late_ms, gap_ms)
     if how.latency_ms == "auto":
         found = estimate_latency(selections, plane=_plane(selections), cell_mm=how.cell_mm, max_pose_gap_ms=gap_ms)
         figures |= {"latency_sd_ms": found.sd_ms, "latency_bound_ms": found.bound_ms}
@@ -255,19 +253,11 @@ def _selected(scans: list[Scan], how: MapOptions, late_ms: float, gap_ms: float)
     """Select the used frames of every scan; an error if none is left in any of them."""
     window = how.pressure_window_kpa
     selections = [
-        select_frames(scan, pressure_window_kpa=window, latency_ms=late_ms, max_pose_gap_ms=gap_ms) for scan in scans
+        select.select_frames(scan, pressure_window_kpa=window, latency_ms=late_ms, max_pose_gap_ms=gap_ms)
+        for scan in scans
     ]
-    refuse_without_frames(selections, pressure_window_kpa=window)
+    select.refuse_without_frames(selections, pressure_window_kpa=window)
     return selections
-
-
-def _flattened(selections: list[SelectedFrames], figures: dict[str, float]) -> list[Scan]:
-    """The scans with a used frame, the head's own response divided out of them."""
-    used = [part for part in selections if part.used.any()]
-    flats = [find_flat_field(part) for part in used]
-    figures["flat_field_frames"] = float(sum(frames for _, frames in flats))
-    figures["flat_field_sd"] = float(np.mean([response.std() for response, _ in flats]))
-    return [divided(part.scan, response) for (response, _), part in zip(flats, used, strict=True)]
 
 
 def _plane(selections: list[SelectedFrames]) -> Plane:
@@ -306,8 +296,8 @@ def _as_map(
     patient, nipple, spread = _landmarks(scans, plane)
     parts = [(f"scan {number} " if len(scans) > 1 else "", part) for number, part in enumerate(selections, start=1)]
     quality = {
-        **frame_figures(selections),
-        **timing_figures(scans),
+        **select.frame_figures(selections),
+        **select.timing_figures(scans),
         **plane_figures(selections, plane),
         **pose_noise_figures(selections, plane, cell_mm=recipe.cell_mm),
         **cell_figures(sums),

@@ -10,18 +10,10 @@ import numpy as np
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, Plane
+from tactile_bayes.mapping import convention
 from tactile_bayes.mapping.accumulate import Source
 from tactile_bayes.mapping.cells import Projector, poses_at
-from tactile_bayes.mapping.convention import (
-    LEAST_REACH_MM,
-    POOL_S,
-    CoarseFrames,
-    every_stretch,
-    numbered_on,
-    stroke_starts,
-    strokes_along,
-    thinning,
-)
+from tactile_bayes.mapping.convention import CoarseFrames
 from tactile_bayes.mapping.map import smooth
 from tactile_bayes.mapping.profile import pose_noise_figures
 from tactile_bayes.mapping.select import SelectedFrames
@@ -176,7 +168,9 @@ def _fitted(
 
 
 def _by_part(
-    parts: Sequence[CoarseFrames], method: Callable[[CoarseFrames, FloatArray], FloatArray], values: FloatArray
+    parts: Sequence[CoarseFrames],
+    method: Callable[[CoarseFrames, FloatArray], FloatArray],
+    values: FloatArray,
 ) -> FloatArray:
     """(n,) values with a method of each scan applied to its own."""
     if len(parts) == 1:
@@ -314,7 +308,7 @@ def _strokes(parts: Sequence[_Part], latency_ms: float) -> tuple[IndexArray, Flo
         head = part.places_mm(latency_ms).mean(axis=1)
         axis = np.linalg.svd(part.moves_mm(latency_ms).mean(axis=1), full_matrices=False)[2][0]
         along = head @ (axis if axis[int(np.argmax(np.abs(axis)))] > 0 else -axis)
-        starts = stroke_starts(along)
+        starts = convention.stroke_starts(along)
         lengths = np.diff(starts)
         labels.append(np.repeat(np.arange(len(lengths)), lengths) + sum(len(one) for one in ways))
         ways.append(np.sign([along[b - 1] - along[a] for a, b in pairwise(starts)]))
@@ -327,7 +321,7 @@ def _with_error(latency_ms: float, fit: ShiftFit, parts: Sequence[_Part], noise:
     moves, frame = [part.moves_mm(latency_ms) for part in parts], fit.frame_numbers()
     label, ways = _strokes(parts, latency_ms)
     stroke, count = label[frame], len(ways)
-    block = numbered_on([part.coarse.block for part in parts])[frame]
+    block = convention.numbered_on([part.coarse.block for part in parts])[frame]
     design = fit.design(moves)
     information = float(design @ design)
     halves = [fit.of_some(block % 2 == half).design(moves) for half in (0, 1)]
@@ -388,7 +382,7 @@ def find_strokes(sources: Sequence[Source]) -> list[StrokeShift]:
     return [
         StrokeShift(start, stop, number, way)
         for number, source in enumerate(sources)
-        for start, stop, way in strokes_along(source.projection.shift[:, 0] * source.projection.cell_mm)
+        for start, stop, way in convention.strokes_along(source.projection.shift[:, 0] * source.projection.cell_mm)
     ]
 
 
@@ -415,9 +409,9 @@ def register_strokes(sources: Sequence[Source]) -> tuple[list[Source], list[Stro
     strokes = find_strokes(sources)
     if len(strokes) < 2:
         raise BadDataError(
-            f"the scan has {len(strokes)} stroke over {LEAST_REACH_MM:g} mm", way_out="scan back and forth"
+            f"the scan has {len(strokes)} stroke over {convention.LEAST_REACH_MM:g} mm", way_out="scan back and forth"
         )
-    numbers = [len(one.frames) * 5e-3 / POOL_S * one.selection.readout.size / 4 for one in sources]
+    numbers = [len(one.frames) * 5e-3 / convention.POOL_S * one.selection.readout.size / 4 for one in sources]
     every = [max(1, int(np.ceil(len(strokes) * readings / _MOST_NUMBERS))) for readings in numbers]
     parts, shifts = _in_strokes(sources, strokes, every), np.zeros(len(strokes))
     for _ in range(_STROKE_ROUNDS):
@@ -490,7 +484,7 @@ def _in_strokes(sources: Sequence[Source], strokes: Sequence[StrokeShift], every
     for number, source in enumerate(sources):
         if not len(source.frames):
             continue
-        kept = every_stretch(source.selection.scan.frames.time_s[source.frames], every[number])
+        kept = convention.every_stretch(source.selection.scan.frames.time_s[source.frames], every[number])
         coarse = CoarseFrames.of(source.selection, source.frames[kept])
         mine = [n for n, one in enumerate(strokes) if one.scan == number]
         stroke = np.searchsorted([strokes[n].start for n in mine], kept[coarse.first], side="right") - 1 + mine[0]
@@ -509,7 +503,7 @@ class _Round(Record, eq=False):
     def of(cls, parts: Sequence[_Strokes], shifts_mm: FloatArray) -> _Round:
         fit = ShiftFit.of([part.coarse for part in parts], [part.shifted_mm(shifts_mm) for part in parts])
         frame = fit.frame_numbers()
-        block = numbered_on([part.coarse.block for part in parts])
+        block = convention.numbered_on([part.coarse.block for part in parts])
         even = (block % 2 == 0)[frame]
         halves = [fit.of_some(keep) for keep in (even, ~even)]
         columns, told = [], []
@@ -583,7 +577,9 @@ def stroke_lag_figures(sources: Sequence[Source]) -> dict[str, float]:
     linear step from no shift, so a figure above 1 mm is rough. The standard error holds errors that frames share over
     0.2 s.
     """
-    every = thinning((source.selection.scan.frames.time_s[source.frames] for source in sources), most=LAG_FRAMES)
+    every = convention.thinning(
+        (source.selection.scan.frames.time_s[source.frames] for source in sources), most=LAG_FRAMES
+    )
     strokes = find_strokes(sources)
     parts, ways = _in_strokes(sources, strokes, [every] * len(sources)), np.array([one.direction for one in strokes])
     if len({way for part in parts for way in ways[part.stroke].tolist()}) < 2:
@@ -595,6 +591,6 @@ def stroke_lag_figures(sources: Sequence[Source]) -> dict[str, float]:
         return {}
     # a lump that is ahead of its place is seen at places that are behind theirs
     lag = -float(design @ fit.data) / whole
-    block = numbered_on([part.coarse.block for part in parts])[fit.frame_numbers()]
+    block = convention.numbered_on([part.coarse.block for part in parts])[fit.frame_numbers()]
     scores = np.bincount(block, design * (fit.data + lag * design))
     return {"stroke_lag_mm": lag, "stroke_lag_sd_mm": float(np.sqrt(np.sum(scores**2))) / whole}

@@ -63,32 +63,22 @@ def exam_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
     """Figures of the readings, poses and landmarks of scans, by which `exam_findings` judges them."""
     figures: dict[str, float] = {"plateau_readings": 0.0, "wrapped_readings": 0.0}
     for part in selections:
-        _refuse_places(part)
-        still = _still(part)
+        places, counts, still = part.poses.position_mm[part.used], part.scan.frames.counts, _still(part)
+        spread = float(np.ptp(places, axis=0).max()) if len(places) else 0.0
+        if spread > IMPOSSIBLE_MM:  # no map of them can be held
+            way_out = "positions are in mm; leave out poses that stand for a tool out of sight"
+            raise BadDataError(f"the places of the head spread over {spread:,.0f} mm", way_out=way_out)
         readings, count = _plateau(part, np.flatnonzero(part.used & ~still))
         figures["plateau_readings"] += readings
         if readings:
             figures["plateau_count"] = float(count)
-        figures["wrapped_readings"] += _wrapped(part)
+        # readings just below 65,536 where none lies below them, down to half of it
+        wrapped = float((counts >= 65536 - WRAPPED).sum())
+        if wrapped and not ((counts >= 32768) & (counts < 65536 - WRAPPED)).any():
+            figures["wrapped_readings"] += wrapped
         for name, value in (*_stillness(part, still), *_flicker(part), *_geometry(part)):
             figures[name] = max(value, figures.get(name, 0.0))
     return figures
-
-
-def _refuse_places(part: SelectedFrames) -> None:
-    """Raise `BadDataError` for places so far apart that no map of them can be held."""
-    places = part.poses.position_mm[part.used]
-    spread = float(np.ptp(places, axis=0).max()) if len(places) else 0.0
-    if spread > IMPOSSIBLE_MM:
-        way_out = "positions are in mm; leave out poses that stand for a tool out of sight"
-        raise BadDataError(f"the places of the head spread over {spread:,.0f} mm", way_out=way_out)
-
-
-def _wrapped(part: SelectedFrames) -> int:
-    """Number of readings just below 65,536 where none lies below them, down to half of it."""
-    counts = part.scan.frames.counts
-    number = int((counts >= 65536 - WRAPPED).sum())
-    return 0 if number and ((counts >= 32768) & (counts < 65536 - WRAPPED)).any() else number
 
 
 def _plateau(part: SelectedFrames, frames: IndexArray) -> tuple[int, int]:

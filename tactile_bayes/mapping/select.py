@@ -395,8 +395,11 @@ def select_frames(
     A frame is used when the tracker knew where it was, nine taxels in ten are valid, and the mean over the valid ones
     lies in the window, its ends included.
     """
-    faults = find_faults(scan)
-    _refuse_dead(scan, faults)
+    faults, taxels = find_faults(scan), scan.head.shape[0] * scan.head.shape[1]
+    if len(faults) >= taxels > 0:
+        kinds = ", ".join(sorted({fault.fault for fault in faults}))
+        way_out = _counts_asked([scan]) or "check the array's cable and its calibration"
+        raise BadDataError(f"none of the {taxels} taxels works ({kinds})", way_out=way_out)
     fresh = cells.distinct_poses(scan.poses)
     poses = cells.poses_at(fresh, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=max_pose_gap_ms)
     readout = cells.Readout.of(scan.element_calibration, good_taxels(scan.head.shape, faults))
@@ -414,17 +417,6 @@ def gate(
     candidate = known & (valid_share >= VALID_SHARE)
     low, high = candidate & (level_kpa < pressure_window_kpa[0]), candidate & (level_kpa > pressure_window_kpa[1])
     return low, high, candidate ^ (low | high)
-
-
-def _refuse_dead(scan: Scan, faults: tuple[TaxelFault, ...]) -> None:
-    taxels = scan.head.shape[0] * scan.head.shape[1]
-    if len(faults) < taxels or not taxels:
-        return
-    kinds = {fault.fault for fault in faults}
-    raise BadDataError(
-        f"none of the {taxels} taxels works ({', '.join(sorted(kinds))})",
-        way_out=_counts_asked([scan]) or "check the array's cable and its calibration",
-    )
 
 
 def refuse_without_frames(selections: list[SelectedFrames], *, pressure_window_kpa: tuple[float, float]) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -13,13 +15,11 @@ from tactile_bayes.inference.ensemble import convergence
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plausibility import map_findings
 from tactile_bayes.posterior import verdict, white
-from tactile_bayes.posterior.bump import levelled, window_cells
+from tactile_bayes.posterior.bump import Detection, levelled, window_cells
 from tactile_bayes.posterior.correlated import Correlated
-from tactile_bayes.posterior.detection import Detection
 from tactile_bayes.posterior.draw import (
     DETECTED,
     ROTATION_ODDS,
-    Diagnostics,
     ModalBump,
     SamplerSettings,
     check_options,
@@ -325,8 +325,7 @@ def _measured(work: Work, seen: Assessment, candidates: tuple[Candidate, ...]) -
         advice = "learn a calibration whose table holds such lumps"
         fault = Abstention("extrapolated", reason, advice, terms.UNLIKE_ON_PAPER)
     if fault is not None:
-        told = diagnostics if fault.code == "extrapolated" else None
-        return _none(fault, candidates, detection, bump, told)
+        return _none(fault, candidates, detection, bump, diagnostics if fault.code == "extrapolated" else {})
     drawn = {"sigma_x_mm": posterior.sigma_x_mm, "sigma_y_mm": posterior.sigma_y_mm}
     drawn |= {} if size is None else {"max_size_mm": size.max_size_mm}
     return Estimate(
@@ -352,7 +351,7 @@ def _none(
     candidates: tuple[Candidate, ...] = (),
     detection: Detection | None = None,
     bump: ModalBump | None = None,
-    diagnostics: Diagnostics | None = None,
+    diagnostics: Mapping[str, Any] = MappingProxyType({}),
 ) -> Estimate:
     is_lump = why.code not in NO_LUMP
     return Estimate(
@@ -408,22 +407,20 @@ def _way_to(recipe: terms.Recipe, tactile_map: TactileMap) -> str:
     return "leave the fit's options to the calibration, or learn a calibration for these"
 
 
-def _diagnostics(made: MapDraws) -> Diagnostics:
-    """Figures and flags of the draws, for the report."""
-    return Diagnostics(
-        cells=len(made.fit.cells),
-        covered_share=made.fit.covered_share,
-        fat_mm=None if made.calibration is None else made.calibration.fat_mm,
-        method=made.draws.method,
-        sampler=made.draws.diagnostics,
-        noise=made.figures,
-        convergence={
-            name: convergence(getattr(source, name))
-            for source, names in ((made.size, SIZES), (made.posterior, BUMP[:3]))
-            if source is not None and made.draws.method == "ensemble"
-            for name in names
-        },
-    )
+def _diagnostics(made: MapDraws) -> dict[str, Any]:
+    figures = {
+        "cells": len(made.fit.cells),
+        "covered_share": made.fit.covered_share,
+        "fat_mm": None if made.calibration is None else made.calibration.fat_mm,
+        **made.draws.diagnostics,
+        **made.figures,
+        "method": made.draws.method,
+    }
+    if made.draws.method != "ensemble":
+        return figures
+    drawn = {name: getattr(made.posterior, name) for name in BUMP[:3]}
+    drawn = {name: getattr(made.size, name) for name in SIZES if made.size is not None} | drawn
+    return figures | {"convergence": {name: convergence(values) for name, values in drawn.items()}}
 
 
 def _findings(made: MapDraws, *, cell_mm: float) -> Iterator[Finding]:
@@ -439,7 +436,7 @@ def _findings(made: MapDraws, *, cell_mm: float) -> Iterator[Finding]:
         text = f"the map's cells of {cell_mm:g} mm are coarse for so small a lump"
         remedy, on_paper = "map again with a smaller --cell-mm", "have the scan mapped again with smaller cells"
         yield Finding("coarse_cells", text, remedy, on_paper)
-    offset = made.figures.level_offset
+    offset = made.figures.get("level_offset")
     if offset is not None and abs(offset) >= _NEAR_LEVEL:
         text = (
             f"the pressure round the lump is {100 * offset:+.1f} % off that of the rest of the map: something else "
@@ -451,10 +448,10 @@ def _findings(made: MapDraws, *, cell_mm: float) -> Iterator[Finding]:
 
 def _left_out(tactile_map: TactileMap, options: SamplerSettings, made: MapDraws) -> tuple[str, ...]:
     notes, noise, calibration = [], made.figures, made.calibration
-    if tactile_map.recipe.source == "scan" and noise.places_share is None:
+    if tactile_map.recipe.source == "scan" and noise.get("places_share") is None:
         notes.append("tracker position error and its blur")
-    odds = noise.rotation_odds
-    if odds is not None and not noise.rotated and not options.correlated:
+    odds = noise["rotation_odds"]
+    if odds is not None and not noise["rotated"] and not options.correlated:
         notes.append(f"rotation of the ellipse (odds {odds:.2g} to 1, used above {ROTATION_ODDS:g})")
     if options.background == "fixed":
         notes.append("a free background (fixed where normalising puts it, as printed in Eq 7)")

@@ -233,25 +233,28 @@ class Spanned(Record, eq=False):
         along, across = _basis(rows, high.min()), _basis(columns, wide.min())
         by_row, by_column = rows @ along.T, columns @ across.T
         size = np.square(by_row).T @ np.square(by_column)
-        i, j = _kept(size, (high * wide).min())
+        order = np.argsort(size, axis=None)  # what is dropped sums to `DROPPED` at most
+        kept = order[np.sqrt(np.cumsum(size.ravel()[order])) > DROPPED * (high * wide).min()]
+        i, j = np.unravel_index(kept, size.shape)
         if not 0 < len(i) <= MOST_PRODUCTS:
             return None
         (products,), _ = linear.projected([Profiles(along[i], across[j])])
-        gram = _gram(linear.window, along, across)[i[:, None], i, j[:, None], j]
-        return cls(by_row[:, i] * by_column[:, j], products, gram, linear)
+        by_pair = [(one[:, None] * one).reshape(len(one) ** 2, -1) for one in (along, across)]
+        each = (by_pair[0] @ linear.window.weight @ by_pair[1].T).reshape(*[len(along)] * 2, *[len(across)] * 2)
+        return cls(by_row[:, i] * by_column[:, j], products, each[i[:, None], i, j[:, None], j], linear)
 
     def solution(self, fields: list[FieldColumns]) -> LinearSolution:
         """Solutions for the bumps under all noise fields."""
-        return joined([self.linear.solve([self._inner(columns)], None, columns) for columns in fields])
-
-    def _inner(self, columns: FieldColumns) -> Inner:
-        """Inner products under the noise fields of one length."""
-        basis, c = Inner.of(self.products, columns), self.coefficients
-        m, (r, h, plain) = len(c), basis.plain.shape
-        shared = (basis.low[:, None, :] * columns.weight.T) @ basis.low.T
-        power = self.gram - shared.transpose(1, 0, 2)
-        square = np.stack([np.einsum("mr,mr->m", c @ one, c) for one in power], axis=1)
-        return Inner((c @ basis.plain.reshape(r, -1)).reshape(m, h, plain), square, np.empty((m, 0)))
+        solutions, c = [], self.coefficients
+        for columns in fields:
+            basis = Inner.of(self.products, columns)
+            m, (r, h, plain) = len(c), basis.plain.shape
+            shared = (basis.low[:, None, :] * columns.weight.T) @ basis.low.T
+            power = self.gram - shared.transpose(1, 0, 2)
+            square = np.stack([np.einsum("mr,mr->m", c @ one, c) for one in power], axis=1)
+            inner = Inner((c @ basis.plain.reshape(r, -1)).reshape(m, h, plain), square, np.empty((m, 0)))
+            solutions.append(self.linear.solve([inner], None, columns))
+        return joined(solutions, axis=1)
 
 
 def _basis(profiles: FloatArray, least: float) -> FloatArray:
@@ -259,19 +262,6 @@ def _basis(profiles: FloatArray, least: float) -> FloatArray:
     _, size, basis = np.linalg.svd(np.linalg.qr(profiles, mode="r"), full_matrices=False)
     left = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1])
     return np.asarray(basis[left > DROPPED * least])
-
-
-def _gram(window: Window, along: FloatArray, across: FloatArray) -> FloatArray:
-    """(ry, ry, rx, rx) weighted inner products of pairs of profile products."""
-    rows, columns = ((one[:, None] * one).reshape(len(one) ** 2, -1) for one in (along, across))
-    return np.asarray(rows @ window.weight @ columns.T).reshape(len(along), len(along), len(across), len(across))
-
-
-def _kept(size: FloatArray, least: float) -> tuple[IndexArray, IndexArray]:
-    """Rows and columns kept of (ry, rx) squared norms; the dropped ones sum to `DROPPED` at most."""
-    order = np.argsort(size, axis=None)
-    kept = order[np.sqrt(np.cumsum(size.ravel()[order])) > DROPPED * least]
-    return kept // size.shape[1], kept % size.shape[1]
 
 
 # --- The marginal posterior of a scene under all noise fields.
@@ -352,11 +342,8 @@ class CollapsedTarget:
     def conditional(self, theta: FloatArray) -> Solution:
         """Solutions at (m, p) vectors under each of h fields: log of prior times evidence (m, h), and amplitudes
         (m, h, v), their power (m, h, v, v), the level's fall with each (m, h, v) and the sum of squares (m, h)."""
-        parts = [
-            (one.evidence, one.amplitude, one.power, one.level_slope[..., 0], one.sum_of_squares)
-            for one in self._solutions(theta)
-        ]
-        return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
+        solution = joined(self._solutions(theta), axis=0)
+        return solution._replace(level_slope=solution.level_slope[..., 0])
 
     def draw_linear(
         self, theta: FloatArray, rng: np.random.Generator, *, solved: Solved | None = None
@@ -364,8 +351,7 @@ class CollapsedTarget:
         """Draw amplitudes (m, v), level (m,) and noise scale (m,) given the shape: exact, field first."""
         unique, back = distinct_rows(theta)
         evidence, centre, power, slope, squares = (solved or self.conditional)(unique)
-        c = len(self.linear.plain) - 1
-        at_zero = np.concatenate([np.einsum("hd,hd->h", one.inverse[:, 0], one.gram[:, :c, c]) for one in self.fields])
+        at_zero = np.concatenate([one.level()[:, 0] for one in self.fields])
         level_variance = np.concatenate([one.inverse[:, 0, 0] for one in self.fields])
         h = choose(evidence[back], rng)
         tau2 = squares[back, h] / rng.chisquare(self.dof, size=len(theta))

@@ -11,6 +11,7 @@ from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, NotConvergedError
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import (
     SMOOTHING_MM,
+    Detection,
     candidate_centres,
     cell_mean_gaussian,
     levelled,
@@ -18,10 +19,9 @@ from tactile_bayes.posterior.bump import (
     read_well,
     smoothed_excess,
 )
-from tactile_bayes.posterior.detection import Detection
+from tactile_bayes.posterior.correlated import LEAST_RISE
 from tactile_bayes.posterior.draw import MapPosterior, ModalBump, SamplerSettings
-from tactile_bayes.posterior.estimate import Assessment, best_chance, search
-from tactile_bayes.posterior.neighbours import LEAST_RISE
+from tactile_bayes.posterior.estimate import best_chance, search
 from tactile_bayes.posterior.result import Estimate, Mass, Rise
 from tactile_bayes.posterior.verdict import BEYOND_IT, LIKELY, MORE_LINES, MORE_LINES_ON_PAPER, weigh
 from tactile_bayes.posterior.white import AT_RIM, Candidate
@@ -99,20 +99,15 @@ def _rise_at(
     candidates, seen = search(rest, given)
     if seen is None:
         return _at_rim(rest, whole, candidates, given, estimate)
-    detection = seen.detection
+    detection, lump = seen.detection, estimate.measured
     proven = detection.probability >= LEAST_PROBABILITY
-    if not proven and not _may_be_lump(seen, rest, estimate):
+    if not proven and (lump is None or detection.probability < LEAST_BESIDE):
         return None, False
-    return _rise(seen.bump(), detection.probability, estimate.measured), proven
-
-
-def _may_be_lump(seen: Assessment, rest: TactileMap, estimate: Estimate) -> bool:
-    """True for a rise without the evidence of a lump that is likely one all the same, beside a measured lump."""
-    lump = estimate.measured
-    if lump is None or seen.detection.probability < LEAST_BESIDE:
-        return False
     bump = seen.bump()
-    return bump.amplitude >= LEAST_SHARE * lump.amplitude and weigh(rest, seen.detection, bump).chance >= LIKELY
+    likely = lump is not None and bump.amplitude >= LEAST_SHARE * lump.amplitude
+    if not proven and not (likely and weigh(rest, detection, bump).chance >= LIKELY):
+        return None, False
+    return _rise(bump, detection.probability, lump), proven
 
 
 def _rests(tactile_map: TactileMap, estimate: Estimate) -> Iterator[TactileMap]:

@@ -5,20 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from itertools import islice
 from math import lgamma, log, pi
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import Record
+from tactile_bayes.declarations import Record, field
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws, quantiles_of, weighted_quantiles_of
 from tactile_bayes.inference.ensemble import DrawGroup
 from tactile_bayes.inference.importance import smooth_weights
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.bump import FitCells, principal_widths
-from tactile_bayes.posterior.detection import Detection
-from tactile_bayes.posterior.draw import Diagnostics, MapPosterior, ModalBump
+from tactile_bayes.posterior.bump import Detection, FitCells, principal_widths
+from tactile_bayes.posterior.draw import MapPosterior, ModalBump
 from tactile_bayes.posterior.fit import FieldFit, SceneChoice
 from tactile_bayes.posterior.marginal import CollapsedTarget
 from tactile_bayes.posterior.verdict import SmallestLumps, Weighed
@@ -89,7 +88,10 @@ class Estimate(Record, eq=False):
     map_posterior: MapPosterior | None = None  #: Like the two above None without an estimate.
     size: SizePosterior | None = None  #: None also without a size calibration.
     candidates: tuple[Candidate, ...] = ()  #: Every place that was looked at.
-    diagnostics: Diagnostics | None = None  #: Figures and flags for the report; None where nothing was drawn.
+    diagnostics: Mapping[str, Any] = field(default_factory=dict)
+    """Figures of the fit, the noise and the method as the JSON has them: R-hat, effective draws and Monte-Carlo errors
+    of chains in ``convergence``; empty where nothing was drawn."""
+    sized_by: str = ""  #: Name of the calibration that gave the size, in words.
     left_out: tuple[str, ...] = ()  #: Sources of error that the estimate does not contain, in words.
     code: str = ""
     advice: str = ""

@@ -14,8 +14,7 @@ from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import TactileMap, orientation_of
 from tactile_bayes.mapping.plausibility import against_no_lump
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.bump import covered_share, map_ends, on_map, trusted, value_scale, window_cells
-from tactile_bayes.posterior.detection import Detection
+from tactile_bayes.posterior.bump import Detection, covered_share, map_ends, on_map, trusted, value_scale, window_cells
 from tactile_bayes.posterior.draw import DETECTED, ModalBump
 from tactile_bayes.posterior.marginal import CollapsedTarget, Scene
 from tactile_bayes.posterior.white import AT_RIM, LEAST_COVERED_SHARE, LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, Candidate

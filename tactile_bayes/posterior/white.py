@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property, partial
 from math import lgamma, log, pi
+from typing import Any
 
 import numpy as np
 
@@ -17,29 +18,26 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import (
     Bump,
+    Detection,
+    ErrorModel,
     FitCells,
     block_size,
     candidate_centres,
-    covered_share,
-    drawn_widths,
-    typical_level,
-    value_scale,
-    window_cells,
-)
-from tactile_bayes.posterior.detection import (
-    Detection,
-    ErrorModel,
     count_weights,
+    covered_share,
     detection_from_odds,
+    drawn_widths,
     error_model,
     independent_errors,
     level_offset,
+    typical_level,
+    value_scale,
+    window_cells,
 )
 from tactile_bayes.posterior.draw import (
     ROTATION_ODDS,
     MapPosterior,
     ModalBump,
-    NoiseFigures,
     Sampled,
     SamplerSettings,
     draw_parameters,
@@ -499,7 +497,7 @@ class MapDraws(Record, eq=False):
     fit: BumpFit  #: The least-squares fit that the draws started from.
     draws: ParameterDraws  #: Draws of the model's own parameters.
     posterior: MapPosterior  #: The joint draws by name.
-    figures: NoiseFigures  #: Figures of the fit and the noise, for the report.
+    figures: Mapping[str, Any]  #: Of the noise, and the decisions made under it, as in `Estimate.diagnostics`.
     calibration: Calibration | None = None  #: The one that gave the size, at the map's depth.
     size: SizePosterior | None = None
     fault: Abstention | None = None  #: Why there is no size; None also without a calibration.
@@ -546,7 +544,12 @@ class White(Record, eq=False):
             noise_sd=fit.target.draw_noise_sd(excess, rng).reshape(theta.shape[:2]),
             labels=draws.replicates,
         )
-        figures = {"noise_inflation": fit.errors.inflation, "noise_dof": fit.errors.dof}
-        offset = level_offset(fit.fit.residual, weight=fit.weight)
-        noise = NoiseFigures("independent", fit.bump.rotated, odds, figures, level_offset=offset)
-        return MapDraws(self.detection, fit, draws, posterior, noise)
+        figures = {
+            "noise": "independent",
+            "noise_inflation": fit.errors.inflation,
+            "noise_dof": fit.errors.dof,
+            "level_offset": level_offset(fit.fit.residual, weight=fit.weight),
+            "rotation_odds": odds,
+            "rotated": fit.bump.rotated,
+        }
+        return MapDraws(self.detection, fit, draws, posterior, figures)

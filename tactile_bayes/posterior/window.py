@@ -14,9 +14,10 @@ the last factor is approximate: the prior is taken at the mean noise scale. Fiel
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
 from math import lgamma, log, pi
+from typing import NamedTuple
 
 import numpy as np
 
@@ -320,7 +321,7 @@ LEAST_POWER = 1e-9
 """Power of a template, over what the prior on its amplitude is worth: less tells nothing and would only overflow."""
 
 
-class LinearSolution(Record, eq=False):
+class LinearSolution(NamedTuple):
     """Conditional posterior of the linear parameters for m shapes and h fields: a multivariate t."""
 
     evidence: FloatArray  #: (m, h) array: Log of the fields' prior times their evidence.
@@ -489,7 +490,7 @@ class LinearModel:
     def under_each(self, templates: list[Templates], fields: list[FieldColumns]) -> LinearSolution:
         """Solutions for each structure's (m,) templates under all fields."""
         projected, cross = self.projected(templates)
-        return joined([self.under(projected, cross, columns) for columns in fields])
+        return joined((self.under(projected, cross, columns) for columns in fields), axis=1)
 
     def under(self, projected: list[Projected], cross: FloatArray | None, columns: FieldColumns) -> LinearSolution:
         """The same under one length, from inner products without a field."""
@@ -525,10 +526,9 @@ class LinearModel:
         return LinearSolution(evidence, amplitude, matrix, np.stack(to_level, axis=2), squares)
 
 
-def joined(solutions: list[LinearSolution]) -> LinearSolution:
-    """Concatenate the fields of several lengths."""
-    each = ([getattr(one, name) for one in solutions] for name in LinearSolution.__struct_fields__)
-    return LinearSolution(*(np.concatenate(parts, axis=1) for parts in each))
+def joined(solutions: Iterable[LinearSolution], *, axis: int) -> LinearSolution:
+    """Concatenate the fields of several lengths (1), or blocks of shapes (0)."""
+    return LinearSolution(*(np.concatenate(parts, axis=axis) for parts in zip(*solutions, strict=True)))
 
 
 def _one(

@@ -43,7 +43,7 @@ def estimate_quantities(estimate: Estimate, tactile_map: TactileMap, *, probabil
         on_plane = np.stack([posterior.x_mm, posterior.y_mm, np.zeros_like(posterior.x_mm)], axis=-1)
         in_patient = apply(tactile_map.patient_from_plane, on_plane)
         draws |= {"centre_patient_mm.x": in_patient[..., 0], "centre_patient_mm.y": in_patient[..., 1]}
-    if estimate.diagnostics is not None and estimate.diagnostics.noise.rotated:
+    if estimate.diagnostics.get("rotated"):
         draws["angle_deg"] = np.degrees(posterior.angle_rad)
     labels, worth = estimate.draws.labels, estimate.draws.effective_draws
     found = {
@@ -451,7 +451,7 @@ def estimate_report(
 
     about, size, moved = estimate.about_mm, estimate.size, estimate.sensitivity
     masses = _mass_reports(estimate, tactile_map, quantities, probability=probability, scans=provenance.scans)
-    diagnostics = {} if estimate.diagnostics is None else estimate.diagnostics.as_dict()
+    diagnostics = dict(estimate.diagnostics)
     if estimate.detection is not None:
         diagnostics["log_bayes_factor"] = estimate.detection.log_bayes_factor
     return EstimateReport(

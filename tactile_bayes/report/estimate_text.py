@@ -11,7 +11,6 @@ from tactile_bayes.files.reports import EstimateReport, MassReport, PooledReport
 from tactile_bayes.findings import capital, finding_lines, finding_summary, joined
 from tactile_bayes.inference.draws import ParameterDraws, Quantity
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.draw import Diagnostics
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.verdict import SHARE_WITH_LUMP, chance_text
 from tactile_bayes.presets import RESEARCH_USE
@@ -258,10 +257,8 @@ def size_table(report: EstimateReport | PooledReport, shown: Collection[str] = _
 
 
 def _findings(estimate: Estimate, report: EstimateReport) -> list[str]:
-    lines, figures, largest = [], report.diagnostics, report.max_size_mm
-    found, draws = estimate.diagnostics, estimate.draws
-    assert found is not None  # as with every estimate
-    assert draws is not None
+    lines, figures, largest, draws = [], report.diagnostics, report.max_size_mm, estimate.draws
+    assert draws is not None  # as with every estimate
     if report.detected_probability is not None:
         which = f"{number}. " if (number := estimate_document.numbered(report.masses)) else ""
         prior = f"where {100 * SHARE_WITH_LUMP:g} % of exams hold one"
@@ -271,18 +268,18 @@ def _findings(estimate: Estimate, report: EstimateReport) -> list[str]:
         if report.another_exam is not None:
             lines.append(two_intervals_text(figures.get("between_map_sd"), report.another_exam.between_map_sd))
         lines += width_lines(report.leading.variance_share or {})
-        if found.repeatability:
-            lines.append(site_interval_text(found.repeatability))
+        if "repeatability" in figures:
+            lines.append(site_interval_text(figures["repeatability"]))
         lines += estimate_document.supposed_lines(report.supposing, largest.median, places=size_decimals([largest]))
         if "oval_probability" in figures:
             lines.append(shape_text(figures))
-        lines += [f"{text}." for text in (found.size_calibration, *invalid_draws(report)) if text]
-    if share := tracker_share(found):
+        lines += [f"{text}." for text in (figures.get("size_calibration"), *invalid_draws(report)) if text]
+    if share := tracker_share(figures):
         lines.append(f"{share}.")
-    lines += [f"Passed over: {text}." for text in found.noise.passed_over]
+    lines += [f"Passed over: {text}." for text in figures.get("passed_over", ())]
     lines.append(method_line(draws, _quantities(report)))
     for name, label in (("max_size_mm", "largest size"), ("min_size_mm", "smallest size")):
-        if one := found.convergence.get(name):
+        if one := figures.get("convergence", {}).get(name):
             ess = min(one["ess_bulk"], one["ess_tail"])
             lines.append(
                 f"Chains of the {label}: R-hat {one['rhat']:.3f}, {ess:.0f} effective draws, "
@@ -297,9 +294,9 @@ def invalid_draws(report: EstimateReport) -> list[str]:
     return [f"{number} draws gave no size and were left out"] if number else []
 
 
-def tracker_share(found: Diagnostics) -> str:
+def tracker_share(diagnostics: Mapping[str, Any]) -> str:
     """Share of the width variance from tracker position error, in words; empty where negligible."""
-    share = found.noise.places_share or 0.0
+    share = diagnostics.get("places_share") or 0.0
     return f"{100 * share:.0f} % of the width variance is tracker position error" if share >= LEAST_SHARE else ""
 
 
@@ -399,17 +396,16 @@ def _masses(masses: Sequence[MassReport], *, room: int) -> list[str]:
 
 def _quality(estimate: Estimate, report: EstimateReport, shown: Sequence[Quantity]) -> list[str]:
     """Monte-Carlo error of the interval ends, convergence measure, tracker's share, draws without a size."""
-    found, draws = estimate.diagnostics, estimate.draws
-    assert found is not None  # as with every estimate
-    assert draws is not None
+    draws = estimate.draws
+    assert draws is not None  # as with every estimate
     worst = max(shown, key=lambda one: one.mc_error / one.sd if one.sd > 0 else 0.0)
     ends = f"interval ends to {worst.mc_error / worst.sd:.3f} SD" if worst.sd > 0 else "interval ends exact"
     parts = [
-        f"sizes by the {found.calibration}" if found.calibration else "",
+        f"sizes by the {estimate.sized_by}" if estimate.sized_by else "",
         f"method {draws.method}, {ends}",
-        found.repeatability,
+        report.diagnostics.get("repeatability", ""),
         convergence_text(draws),
-        tracker_share(found),
+        tracker_share(report.diagnostics),
         *invalid_draws(report),
     ]
     return [f"Quality: {'; '.join(filter(None, parts))}."]

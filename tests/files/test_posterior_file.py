@@ -44,7 +44,7 @@ def test_arviz_opens_all_groups_and_its_figures_and_summaries_work(chains: tuple
     assert set(data.groups()) == {*GROUPS, "log_likelihood"}
     assert data.posterior.attrs["research_use"] == RESEARCH_USE
     summary = arviz.summary(data, var_names=["max_size_mm", "sigma_x_mm"])
-    found = made.estimate.diagnostics.convergence["max_size_mm"]
+    found = made.estimate.diagnostics["convergence"]["max_size_mm"]
     assert summary.loc["max_size_mm", "r_hat"] == pytest.approx(found["rhat"], abs=0.005)
     assert summary.loc["max_size_mm", "ess_tail"] == pytest.approx(found["ess_tail"], abs=0.6)
     with warnings.catch_warnings():

@@ -16,7 +16,7 @@ from nist import DATASETS, Certified, read
 from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.ensemble import ensemble
 from tactile_bayes.inference.modes import laplace, mode_and_covariance, optimise
-from tactile_bayes.posterior.detection import ErrorModel
+from tactile_bayes.posterior.bump import ErrorModel
 from tactile_bayes.posterior.white import Target
 
 DOF = 242.0

@@ -15,7 +15,7 @@ from tactile_bayes.inference.draws import ParameterDraws, student_draws
 from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 from tactile_bayes.inference.modes import find_mode, finite_differences, laplace, mode_and_covariance, optimise, stencil
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.detection import ErrorModel
+from tactile_bayes.posterior.bump import ErrorModel
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.result import Estimate

@@ -229,7 +229,7 @@ def test_the_depth_tells_seats_apart_that_the_map_does_not() -> None:
             sizes[name].append(float(np.median(found.size.max_size_mm)))
             told = any("depth of the fat" in note for note in found.left_out)
             assert told == (name == "without")
-            assert (found.diagnostics.fat_mm is None) == told
+            assert (found.diagnostics["fat_mm"] is None) == told
     assert sizes["with"] == pytest.approx([15.0, 15.0], rel=0.12)
     assert sizes["without"][1] / sizes["without"][0] > 1.2
 

@@ -12,7 +12,7 @@ from tactile_bayes.errors import CODES, NO_LUMP, NotConvergedError, UsageError
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import draw as methods
 from tactile_bayes.posterior import estimate
-from tactile_bayes.posterior.detection import Detection
+from tactile_bayes.posterior.bump import Detection
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.result import Estimate

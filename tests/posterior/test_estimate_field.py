@@ -52,8 +52,8 @@ def test_the_bump_comes_back(method: str) -> None:
         draws = getattr(posterior, name)
         assert abs(np.median(draws) - truth) < 4.0 * draws.std(), name
         assert draws.std() < 0.2 * max(abs(truth), 3.0), name
-    assert found.diagnostics.noise.noise == "field"
-    assert found.diagnostics.method == method
+    assert found.diagnostics["noise"] == "field"
+    assert found.diagnostics["method"] == method
 
 
 def test_a_lifted_level_beside_the_lump_does_not_narrow_it() -> None:

@@ -7,7 +7,7 @@ import pytest
 from posterior_maps import bump_values, grid_map
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.posterior.detection import detection_from_odds
+from tactile_bayes.posterior.bump import detection_from_odds
 from tactile_bayes.posterior.draw import ModalBump, SamplerSettings
 from tactile_bayes.posterior.verdict import LIKELY, Weighed, weigh
 from tactile_bayes.posterior.white import Candidate, fit_bump

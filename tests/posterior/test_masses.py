@@ -25,7 +25,7 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.findings import Finding
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior import masses as masses_module
-from tactile_bayes.posterior.detection import Detection
+from tactile_bayes.posterior.bump import Detection
 from tactile_bayes.posterior.draw import ModalBump, SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.masses import by_evidence, with_masses

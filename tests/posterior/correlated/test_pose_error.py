@@ -201,7 +201,7 @@ def test_the_spread_is_that_of_the_whole_covariance() -> None:
 def test_the_report_says_what_they_make_of_the_widths_or_that_they_are_left_out() -> None:
     tactile_map = build_map(scan(0.6))
     found = estimated(tactile_map)
-    share = found.diagnostics.noise.places_share
+    share = found.diagnostics["places_share"]
     assert isinstance(share, float)
     posterior = found.map_posterior
     assert posterior is not None

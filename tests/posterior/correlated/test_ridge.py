@@ -7,12 +7,12 @@ import pytest
 from posterior_maps import grid_map
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.posterior import neighbours
+from tactile_bayes.posterior import correlated as neighbours
+from tactile_bayes.posterior.correlated import beside_ridge, ridge_instead
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.fit import fit_scene
 from tactile_bayes.posterior.marginal import Scene
-from tactile_bayes.posterior.neighbours import beside_ridge, ridge_instead
 from tactile_bayes.posterior.result import Estimate
 from tests.posterior.correlated.test_selection import AXIS, bump, choose, errors, rib
 

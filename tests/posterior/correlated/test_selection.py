@@ -10,11 +10,11 @@ from posterior_maps import bump_values, correlated_field, grid_map
 
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior import neighbours as beside
+from tactile_bayes.posterior import correlated as beside
 from tactile_bayes.posterior.bump import smoothed_excess, window_cells
+from tactile_bayes.posterior.correlated import Surroundings, add_beside, rising_ribs
 from tactile_bayes.posterior.fit import ASKING, SceneChoice, Structure, choose_shape
 from tactile_bayes.posterior.marginal import Scene
-from tactile_bayes.posterior.neighbours import Surroundings, add_beside, rising_ribs
 from tactile_bayes.posterior.window import Problem, Window, independent_variance
 
 RADIUS, HALF, SIZE = 20.0, 35.0, 71

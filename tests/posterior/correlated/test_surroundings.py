@@ -7,9 +7,9 @@ import pytest
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.posterior.bump import SMOOTHING_MM
+from tactile_bayes.posterior.correlated import CLEAR_IN_WIDTHS, LEAST_CELLS, PIECE_MM, Surroundings
 from tactile_bayes.posterior.draw import ModalBump
 from tactile_bayes.posterior.marginal import Extra
-from tactile_bayes.posterior.neighbours import CLEAR_IN_WIDTHS, LEAST_CELLS, PIECE_MM, Surroundings
 
 BUMP, MIDDLE = ModalBump(0.3, 1.0, -2.0, 4.0, 4.0), (0.5, 0.5)
 

@@ -9,8 +9,7 @@ import pytest
 from posterior_maps import bump_map
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.posterior.bump import BLOCK, LEAST_BLOCK, Bump, FitCells, block_size, window_cells
-from tactile_bayes.posterior.detection import ErrorModel
+from tactile_bayes.posterior.bump import BLOCK, LEAST_BLOCK, Bump, ErrorModel, FitCells, block_size, window_cells
 from tactile_bayes.posterior.white import Target
 
 

@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 from posterior_maps import bump_map, correlated_field, grid_map
 
-from tactile_bayes.posterior.bump import window_cells
-from tactile_bayes.posterior.detection import count_weights, fitted_tilt, level_offset, residual_autocorrelation
+from tactile_bayes.posterior.bump import (
+    count_weights,
+    fitted_tilt,
+    level_offset,
+    residual_autocorrelation,
+    window_cells,
+)
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import BumpFit, fit_bump
 
