@@ -193,9 +193,6 @@ class _Ensemble:
         # emcee takes neither an integer nor a Generator: it must be handed the state of a RandomState
         random_state = np.random.RandomState(int(rng.integers(2**32))).get_state()
         self._state = self._emcee_state((begin - self._centre) / self._scale, random_state=random_state)
-        self._chain = np.empty((0, self.walkers, p))
-        self._log_density = np.empty((0, self.walkers))
-        self._accepted = 0.0
 
     def _standardised(self, log_density: LogDensity) -> LogDensity:
         """Density of ``(theta - centre) / scale``: emcee tests the walkers' independence by their condition number."""
@@ -204,47 +201,43 @@ class _Ensemble:
     @property
     def steps(self) -> int:
         """Number of steps taken."""
-        return len(self._chain)
+        return int(self._sampler.backend.iteration)
 
     def advance(self, steps: int) -> None:
         """Take more steps."""
-        self._sampler.reset()
         self._state = self._sampler.run_mcmc(self._state, steps)
-        self._chain = np.concatenate([self._chain, self._sampler.get_chain()])
-        self._log_density = np.concatenate([self._log_density, self._sampler.get_log_prob()])
-        self._accepted += float(np.mean(self._sampler.backend.accepted))
 
     def chain(self) -> FloatArray:
         """(draw, p) last two thirds, walker after walker, so that neighbours in the array are neighbours in time."""
-        kept = self._centre + self._scale * self._chain[self.steps // 3 :]
+        kept = self._centre + self._scale * self._sampler.get_chain(discard=self.steps // 3)
         return np.asarray(np.swapaxes(kept, 0, 1).reshape(-1, kept.shape[-1]))
 
     def statistics(self) -> dict[str, FloatArray]:
         """(draw,) log densities and whether the walker moved, in the order of `chain`; NaN before a restored state."""
-        first = self.steps // 3
-        moved = np.any(self._chain[1:] != self._chain[:-1], axis=2)
-        accepted = np.concatenate([np.ones((1, self.walkers)), moved])
-        return {"lp": self._log_density[first:].T.ravel(), "accepted": accepted[first:].T.ravel()}
+        first, chain = self.steps // 3, self._sampler.get_chain()
+        accepted = np.concatenate([np.ones((1, self.walkers)), np.any(chain[1:] != chain[:-1], axis=2)])
+        return {"lp": self._sampler.get_log_prob()[first:].T.ravel(), "accepted": accepted[first:].T.ravel()}
 
     def acceptance(self) -> float:
         """Share of accepted proposals."""
-        return self._accepted / self.steps
+        return float(np.mean(self._sampler.backend.accepted)) / self.steps
 
     def kept(self) -> tuple[FloatArray, FloatArray, float, FloatArray, FloatArray]:
         """State: chain, last log densities, accepted proposals, generator's key and cursor."""
         _, key, position, has_normal, normal = self._state.random_state
         cursor = np.array([position, has_normal, normal], dtype=np.float64)
-        return self._chain, np.asarray(self._state.log_prob), self._accepted, key, cursor
+        accepted = float(np.mean(self._sampler.backend.accepted))
+        return self._sampler.get_chain(), np.asarray(self._state.log_prob), accepted, key, cursor
 
     def restore(self, state: ChainState, index: int) -> None:
         """Continue from a stored state."""
-        self._chain, self._accepted = state.chain[index], float(state.accepted[index])
-        self._log_density = np.full(self._chain.shape[:2], np.nan)
+        chain, backend = state.chain[index], self._sampler.backend
+        backend.chain, backend.log_prob, backend.iteration = chain, np.full(chain.shape[:2], np.nan), len(chain)
+        backend.accepted[:] = state.accepted[index]
         position, has_normal, normal = state.cursor[index]
         random_state = ("MT19937", state.twister[index], int(position), int(has_normal), float(normal))
-        self._state = self._emcee_state(
-            self._chain[-1].copy(), log_prob=state.log_density[index].copy(), random_state=random_state
-        )
+        log_density = state.log_density[index].copy()
+        self._state = self._emcee_state(chain[-1].copy(), log_prob=log_density, random_state=random_state)
 
 
 def _finite_start(

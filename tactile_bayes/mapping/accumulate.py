@@ -105,11 +105,9 @@ class _System:
     def __init__(self, sources: list[Source], progress: Progress) -> None:
         self._sources, self._progress = sources, progress
         blocks = [source.projection.block() for source in sources if len(source.projection)]
-        self._first = (min(first[0] for first, _ in blocks), min(first[1] for first, _ in blocks))
-        self._shape = (
-            max(first[0] + shape[0] for first, shape in blocks) - self._first[0],
-            max(first[1] + shape[1] for first, shape in blocks) - self._first[1],
-        )
+        top, left = np.min([first for first, _ in blocks], axis=0).tolist()
+        bottom, right = np.max([np.add(*one) for one in blocks], axis=0).tolist()
+        self._first, self._shape = (top, left), (bottom - top, right - left)
         self._readings = sum(len(source.projection) * len(source.selection.readout.taxels) for source in sources)
         self._kept: dict[tuple[int, int], _Part | NDArray[np.int32]] = {}
         self._count = self._total(None)
@@ -186,11 +184,10 @@ def flat_field(selection: SelectedFrames) -> tuple[FloatArray, int]:
     move. Frames that depart from it no more than the calmest ones are lump-free; their mean is the response. A lump
     under most frames would be taken for the head's own profile and be flattened away.
     """
-    scan, good = selection.scan, selection.good_taxels
+    good = selection.good_taxels
     frames = np.flatnonzero(selection.used)
     frames = frames[:: max(1, len(frames) // MOST_FRAMES)][:MOST_FRAMES]
-    readout = selection.readout
-    pressure, valid = readout.pressure_kpa(readout.counts(scan.frames.counts[frames]))
+    pressure, valid = selection.pressure_kpa(frames)
     ratio = pressure / selection.level_kpa[frames, None]
     profile = ratio if valid is None else np.where(valid, ratio, 1.0)
     departure = np.sqrt(np.square(profile - np.median(profile, axis=0)).mean(axis=1))
@@ -419,8 +416,7 @@ class _Run(Record, eq=False):
     @classmethod
     def of(cls, source: Source, level: FloatArray, sums: cells.CellSums, run: slice) -> _Run:
         """The errors of the frames `run` of a source."""
-        counts = source.selection.scan.frames.counts[source.frames[run]]
-        pressure, valid = source.selection.readout.pressure_kpa(source.selection.readout.counts(counts))
+        pressure, valid = source.selection.pressure_kpa(source.frames[run])
         value = pressure / level[run, None]
         fine = np.ones(value.shape, dtype=bool) if valid is None else valid
         projection = source.projection.part(run)

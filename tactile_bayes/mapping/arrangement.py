@@ -446,10 +446,7 @@ class _Overlap(Record, eq=False, dict=True):
             return None
         every = convention.thinning([all_s[used]], most=_ROUGH_FRAMES if rough else MOST_FRAMES)
         found = cls(
-            selection,
-            latency_ms,
-            CoarseFrames.of(selection, used[convention.every_stretch(all_s[used], every)]),
-            rough,
+            selection, latency_ms, CoarseFrames.of(selection, used[convention.every_stretch(all_s[used], every)]), rough
         )
         return found if found.stretches >= _LEAST_BLOCKS else None
 

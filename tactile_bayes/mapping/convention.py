@@ -67,7 +67,7 @@ class CoarseFrames(Record, eq=False, dict=True):
     def of(cls, selection: SelectedFrames, frames: IndexArray) -> CoarseFrames:
         """Average the given frames of a scan, in the order of time; the few saturated readings count as their frame's
         mean."""
-        scan, readout = selection.scan, selection.readout
+        scan = selection.scan
         weight, row, basis = _taxel_blocks(selection.good_taxels)
         first = np.flatnonzero(np.diff(stretches(scan.frames.time_s[frames]), prepend=-1))
         shared = np.floor(scan.frames.time_s[frames[first]] / SHARED_S)
@@ -75,10 +75,10 @@ class CoarseFrames(Record, eq=False, dict=True):
         pooled = np.empty((len(frames), weight.shape[1]))
         for part in chunks(len(frames), _CHUNK):
             chosen = frames[part]
-            pressure, valid = readout.pressure_kpa(readout.counts(scan.frames.counts[chosen]))
+            pressure, valid = selection.pressure_kpa(chosen)
             pressure /= selection.level_kpa[chosen, None]
             pooled[part] = (pressure if valid is None else np.where(valid, pressure, 1.0)) @ weight
-        return cls(block_means(pooled, first), frames, first, block, readout.taxels, weight, row, basis)
+        return cls(block_means(pooled, first), frames, first, block, selection.readout.taxels, weight, row, basis)
 
     @cached_property
     def varying(self) -> FloatArray:

@@ -168,9 +168,7 @@ def _fitted(
 
 
 def _by_part(
-    parts: Sequence[CoarseFrames],
-    method: Callable[[CoarseFrames, FloatArray], FloatArray],
-    values: FloatArray,
+    parts: Sequence[CoarseFrames], method: Callable[[CoarseFrames, FloatArray], FloatArray], values: FloatArray
 ) -> FloatArray:
     """(n,) values with a method of each scan applied to its own."""
     if len(parts) == 1:

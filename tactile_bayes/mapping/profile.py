@@ -116,8 +116,7 @@ def _read(part: SelectedFrames, frames: IndexArray) -> FloatArray:
     reader, rows = ProfileReader.of(part.good_taxels), np.empty((len(frames), _COLUMNS))
     for chosen in chunks(len(frames), _CHUNK):
         some = frames[chosen]
-        counts = part.readout.counts(part.scan.frames.counts[some])
-        rows[chosen] = reader.read(part.readout.pressure_kpa(counts)[0], part.level_kpa[some])
+        rows[chosen] = reader.read(part.pressure_kpa(some)[0], part.level_kpa[some])
     return rows
 
 

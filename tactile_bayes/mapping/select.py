@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
-from tactile_bayes.geometry import BoolArray, FloatArray
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 from tactile_bayes.mapping import cells
 from tactile_bayes.presets import KPA_PER_UNIT, PRESSURE_WINDOW_KPA
 from tactile_bayes.scans import PressureFrames, Scan, TrackerPoses
@@ -96,14 +96,10 @@ def _classify(scan: Scan) -> NDArray[np.str_]:
 def _element_levels(scan: Scan) -> tuple[FloatArray, ...]:
     """Each taxel's mean and flicker in kPa, and shares of frames: still, lost and saturated; in one pass."""
     counts, calibration = scan.frames.counts, scan.element_calibration
-    total = np.zeros(counts.shape[1:])
-    steps, still = np.zeros(counts.shape[1:]), np.zeros(counts.shape[1:])
-    saturated, lost = np.zeros(counts.shape[1:], dtype=np.int64), np.zeros(counts.shape[1:])
-    moving, highest = 0, counts.max(axis=0)
-    last = counts[:1].astype(np.float64)
-    for start in range(0, len(counts), _CHUNK):
-        chunk = counts[start : start + _CHUNK].astype(np.float64)
-        total += chunk.sum(axis=0)
+    steps, still, lost, saturated = np.zeros((4, *counts.shape[1:]))
+    moving, highest, last = 0, counts.max(axis=0), counts[:1].astype(np.float64)
+    for part in chunks(len(counts), _CHUNK):
+        chunk = counts[part].astype(np.float64)
         change = np.abs(np.diff(chunk, axis=0, prepend=last))
         steps += change.sum(axis=0)  # not squared: one spike is no flicker
         unchanged = change == 0
@@ -117,7 +113,7 @@ def _element_levels(scan: Scan) -> tuple[FloatArray, ...]:
         last = chunk[-1:]
     n = len(counts)
     return (
-        calibration.linear_kpa(total / n),
+        calibration.linear_kpa(counts.mean(axis=0)),
         calibration.gain_kpa_per_count * (steps / max(n - 1, 1)),
         (still - 1) / max(n - 1, 1),  # the first frame was compared with itself
         lost / max(moving, 1),
@@ -362,6 +358,10 @@ class SelectedFrames(Record, eq=False, dict=True):
     def readout(self) -> cells.Readout:
         """The good taxels, and the conversion of their counts."""
         return cells.Readout.of(self.scan.element_calibration, self.good_taxels)
+
+    def pressure_kpa(self, frames: slice | IndexArray) -> tuple[FloatArray, BoolArray | None]:
+        """(f, k) pressures of the good taxels in some frames, and which are valid, see `Readout.pressure_kpa`."""
+        return self.readout.pressure_kpa(self.readout.counts(self.scan.frames.counts[frames]))
 
     def projector(self, *, plane_from_base: FloatArray, cell_mm: float) -> cells.Projector:
         """The projector of the good taxels."""

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
+from scipy.special import expit
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
@@ -335,14 +336,19 @@ class Bump(Record):
     def unit_bump(self, theta: FloatArray, cells: FitCells) -> FloatArray:
         """(m, k) bump of unit amplitude, averaged over each cell, for (m, p) parameter vectors."""
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            if not self.rotated:
-                return straight_bump(theta[:, 1], theta[:, 2], p=theta[:, 3], q=theta[:, 4], cells=cells)
-            return cell_mean_gaussian(
-                cells.x_mm - theta[:, 1, None],
-                cells.y_mm - theta[:, 2, None],
-                covariance_mm2=covariance_from_log_widths(*self.shape_parameters(theta)),
-                cell_mm=cells.cell_mm,
-            )
+            _, x_mm, y_mm, p, q = theta[:, :5].T
+            if self.rotated:
+                covariance = covariance_from_log_widths(*self.shape_parameters(theta))
+                away = cells.x_mm - x_mm[:, None], cells.y_mm - y_mm[:, None]
+                return cell_mean_gaussian(*away, covariance_mm2=covariance, cell_mm=cells.cell_mm)
+            # along the grid's axes: a product of what rows and columns have, with a fourth cumulant that is their sum
+            x_axis, y_axis, place = _lattice(cells)
+            x, x_fourth = profile(x_axis - x_mm[:, None], sigma_mm=np.exp(p + q), cell_mm=cells.cell_mm)
+            y, y_fourth = profile(y_axis - y_mm[:, None], sigma_mm=np.exp(p - q), cell_mm=cells.cell_mm)
+            bump = (1.0 - y_fourth)[:, :, None] - x_fourth[:, None, :]
+            bump *= x[:, None, :]
+            bump *= y[:, :, None]
+            return np.asarray(bump.reshape(len(bump), -1).take(place, axis=1))
 
     def predict(self, theta: FloatArray, cells: FitCells) -> FloatArray:
         """(m, k) map values of (m, p) parameter vectors: Eq 7 averaged over the cells."""
@@ -357,26 +363,16 @@ class Bump(Record):
     def log_prior(self, theta: FloatArray, prior: BumpPrior) -> FloatArray:
         """(m,) log prior density, flat in the background; the centre's prior belongs to the window."""
         p, q, r = self.shape_parameters(theta)
-        z = [
-            (theta[..., 0] / self.scale / prior.amplitude_sd, prior.amplitude_sd * self.scale),
-            ((p - np.log(prior.width_median_mm)) / prior.log_width_sd, prior.log_width_sd),
-            (q / prior.log_ratio_sd, prior.log_ratio_sd),
-        ]
-        if self.rotated:
-            z.append((r / prior.log_ratio_sd, prior.log_ratio_sd))
-        return np.asarray(sum(-0.5 * value**2 - np.log(sd * np.sqrt(2 * np.pi)) for value, sd in z))
+        total = log_normal_density(theta[..., 0], 0.0, prior.amplitude_sd * self.scale)
+        total = total + log_normal_density(p, np.log(prior.width_median_mm), prior.log_width_sd)
+        for ratio in (q, r) if self.rotated else (q,):
+            total = total + log_normal_density(ratio, 0.0, prior.log_ratio_sd)
+        return np.asarray(total)
 
 
-def straight_bump(x_mm: FloatArray, y_mm: FloatArray, *, p: FloatArray, q: FloatArray, cells: FitCells) -> FloatArray:
-    """(m, k) cell means of Gaussians along the grid's axes: an exponential that is a product of what rows and columns
-    have, and a fourth cumulant that is their sum."""
-    x_axis, y_axis, place = _lattice(cells)
-    x, x_fourth = _profile(x_axis, centre_mm=x_mm, sigma_mm=np.exp(p + q), cell_mm=cells.cell_mm)
-    y, y_fourth = _profile(y_axis, centre_mm=y_mm, sigma_mm=np.exp(p - q), cell_mm=cells.cell_mm)
-    bump = (1.0 - y_fourth)[:, :, None] - x_fourth[:, None, :]
-    bump *= x[:, None, :]
-    bump *= y[:, :, None]
-    return np.asarray(bump.reshape(len(bump), -1).take(place, axis=1))
+def log_normal_density(value: FloatArray, mean: float, sd: float) -> FloatArray:
+    """(...) log density of a normal distribution."""
+    return np.asarray(-0.5 * ((value - mean) / sd) ** 2 - np.log(sd * np.sqrt(2.0 * np.pi)))
 
 
 @lru_cache(maxsize=2)
@@ -388,12 +384,10 @@ def _lattice(cells: FitCells) -> tuple[FloatArray, FloatArray, IndexArray]:
     return x_axis, y_axis, row * len(x_axis) + column
 
 
-def _profile(
-    axis_mm: FloatArray, *, centre_mm: FloatArray, sigma_mm: FloatArray, cell_mm: float
-) -> tuple[FloatArray, FloatArray]:
+def profile(distance_mm: FloatArray, *, sigma_mm: FloatArray, cell_mm: float) -> tuple[FloatArray, FloatArray]:
     """(m, n) cell means of Gaussians along an axis to second order, and their fourth-order correction."""
     wide = (sigma_mm**2 + cell_mm**2 / 12.0)[:, None]
-    square = (axis_mm - centre_mm[:, None]) ** 2 / wide
+    square = distance_mm**2 / wide
     gaussian = sigma_mm[:, None] / np.sqrt(wide) * np.exp(-0.5 * square)
     return gaussian, cell_mm**4 / 2880.0 * (square * (square - 6.0) + 3.0) / wide**2
 
@@ -523,12 +517,11 @@ def _correlate_columns(cells: FitCells, columns: FloatArray, correlation: FloatA
 class Detection(Record):
     """Odds of a bump against smooth errors alone; see `verdict` for whether it is a lump."""
 
-    probability: float  #: Probability of a bump, at even odds and if there were only bumps and smooth errors.
     log_bayes_factor: float  #: Natural log of the evidence ratio.
     ridge: str = ""
     """The ridge, in words, that a lump's evidence was held against; empty where it was held against noise alone."""
 
-
-def detection_from_odds(log_bayes_factor: float, *, ridge: str = "") -> Detection:
-    """Convert a Bayes factor to a probability at even prior odds."""
-    return Detection(float(1.0 / (1.0 + np.exp(-np.clip(log_bayes_factor, -700, 700)))), log_bayes_factor, ridge)
+    @property
+    def probability(self) -> float:
+        """Probability of a bump, at even odds and if there were only bumps and smooth errors."""
+        return float(expit(self.log_bayes_factor))

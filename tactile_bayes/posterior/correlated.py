@@ -16,19 +16,12 @@ from tactile_bayes.posterior.bump import (
     SMOOTHING_MM,
     Detection,
     covariance_from_log_widths,
-    detection_from_odds,
     drawn_widths,
     overlap,
     smoothed_excess,
     trusted,
 )
-from tactile_bayes.posterior.draw import (
-    DETECTED,
-    MapPosterior,
-    ModalBump,
-    SamplerSettings,
-    draw_parameters,
-)
+from tactile_bayes.posterior.draw import DETECTED, MapPosterior, ModalBump, SamplerSettings, draw_parameters
 from tactile_bayes.posterior.fit import (
     ASKING,
     LEAST_ODDS,
@@ -439,7 +432,7 @@ class Correlated(Record, eq=False):
         try:
             scene, detection = fit_and_test(tactile_map, fit, options)
         except NotConvergedError:
-            return cls(tactile_map, fit, Detection(0.0, -np.inf))
+            return cls(tactile_map, fit, Detection(-np.inf))
         fault = rim_fault(tactile_map, scene.plain.modal(), radius_mm=options.fit_radius_mm)
         if not fault and detection.probability >= DETECTED:
             scene, detection = with_neighbours(scene, detection, tactile_map, asked=options.scene_asked)
@@ -511,7 +504,7 @@ def field_detection(plain: FieldFit, tactile_map: TactileMap, log_evidence: floa
 
     The window's evidence has the centre anywhere in the window; the search over the rest of the map is paid for.
     """
-    return detection_from_odds(log_evidence - plain.target.null_log_evidence() - _searched(plain, tactile_map))
+    return Detection(log_evidence - plain.target.null_log_evidence() - _searched(plain, tactile_map))
 
 
 def _searched(plain: FieldFit, tactile_map: TactileMap) -> float:
@@ -536,9 +529,9 @@ def with_neighbours(
     ridge = ridge_instead(choice, ridges)
     if ridge is not None and ridge.log_evidence >= choice.plain.target.null_log_evidence():
         against = ridge.log_evidence + _searched(choice.plain, tactile_map)
-        detection = detection_from_odds(choice.fit.log_evidence - against, ridge=ridge_text(ridge))
+        detection = Detection(choice.fit.log_evidence - against, ridge=ridge_text(ridge))
         if detection.probability < DETECTED and (both := beside_ridge(choice, ridge)) is not None:
-            detection = detection_from_odds(both.log_evidence - against, ridge=detection.ridge)
+            detection = Detection(both.log_evidence - against, ridge=detection.ridge)
     return ask_departure(choice), detection
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from types import MappingProxyType
 from typing import Any
 
@@ -17,13 +18,7 @@ from tactile_bayes.mapping.plausibility import map_findings
 from tactile_bayes.posterior import verdict, white
 from tactile_bayes.posterior.bump import Detection, levelled, window_cells
 from tactile_bayes.posterior.correlated import Correlated
-from tactile_bayes.posterior.draw import (
-    DETECTED,
-    ROTATION_ODDS,
-    ModalBump,
-    SamplerSettings,
-    check_options,
-)
+from tactile_bayes.posterior.draw import DETECTED, ROTATION_ODDS, ModalBump, SamplerSettings, check_options
 from tactile_bayes.posterior.result import Estimate, prior_sensitivity
 from tactile_bayes.posterior.white import BumpFit, Candidate, MapDraws, White
 from tactile_bayes.presets import CELL_PER_SIGMA, INTERVAL
@@ -132,7 +127,7 @@ def best_chance(
         if detection is None:
             bump, detection = _weighed(tactile_map, candidate, options)
         if bump is not None and detection is not None:
-            weighed.append(verdict.weigh(tactile_map, detection, bump, fault=candidate.fault, candidate=candidate))
+            weighed.append(verdict.weigh(tactile_map, detection, bump, candidate))
     return max(weighed, key=lambda one: (one.probability, one.detection.log_bayes_factor), default=None)
 
 
@@ -353,19 +348,11 @@ def _none(
     bump: ModalBump | None = None,
     diagnostics: Mapping[str, Any] = MappingProxyType({}),
 ) -> Estimate:
-    is_lump = why.code not in NO_LUMP
-    return Estimate(
-        "no_estimate",
-        why.reason,
-        detection=detection,
-        bump=bump if is_lump else None,
-        candidates=candidates,
-        diagnostics=diagnostics,
-        code=why.code,
-        advice=why.advice,
-        on_paper=why.on_paper,
-        about_mm=why.about_mm if bump is None or is_lump else (bump.x_mm, bump.y_mm),
-    )
+    told = asdict(why)
+    if why.code in NO_LUMP and bump is not None:
+        told["about_mm"], bump = (bump.x_mm, bump.y_mm), None
+    found = {"detection": detection, "bump": bump, "candidates": candidates, "diagnostics": diagnostics}
+    return Estimate("no_estimate", **told, **found)
 
 
 def calibration_for(tactile_map: TactileMap, calibration: Calibration) -> Calibration:

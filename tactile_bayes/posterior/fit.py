@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property, partial
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, as_dict, field, replace
+from tactile_bayes.declarations import Record, as_dict, replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import ParameterDraws, Solved, student_draws
@@ -252,8 +252,14 @@ class SceneChoice(Record, eq=False):
 
     fit: FieldFit  #: Its mode.
     plain: FieldFit  #: The fit without a second structure, by which a lump is detected.
-    supported: str  #: The simplest shape that the map supports: ``"round"``, ``"ellipse"`` or ``"rotated"``.
-    structures: tuple[Structure, ...] = field(default_factory=tuple)  #: Every question asked.
+    structures: tuple[Structure, ...] = ()  #: Every question asked.
+
+    @property
+    def supported(self) -> str:
+        """The simplest shape that the map supports: ``"round"``, ``"ellipse"`` or ``"rotated"``."""
+        if self.fit.scene.shape != "ellipse":
+            return self.fit.scene.shape
+        return "ellipse" if any(one.name == "ellipse" and one.supported for one in self.structures) else "round"
 
 
 def choose_shape(problem: Problem, start: FloatArray, *, scene: SceneAsked = "auto") -> SceneChoice:
@@ -269,7 +275,7 @@ def choose_shape(problem: Problem, start: FloatArray, *, scene: SceneAsked = "au
     if scene in ASKING:
         chosen, turned = _rotation_question(problem, chosen, start)
         questions.append(turned)
-    return SceneChoice(chosen, chosen, _supported_shape(chosen, questions), (*questions, _tilt_question(chosen)))
+    return SceneChoice(chosen, chosen, (*questions, _tilt_question(chosen)))
 
 
 def retested(choice: SceneChoice, fit: FieldFit) -> SceneChoice:
@@ -279,8 +285,7 @@ def retested(choice: SceneChoice, fit: FieldFit) -> SceneChoice:
     if fit.scene.shape == "ellipse":
         answers["ellipse"] = _ellipse_question(fit)
     answers["tilt"] = _tilt_question(fit)
-    structures = tuple(answers.values())
-    return replace(choice, fit=fit, supported=_supported_shape(fit, structures), structures=structures)
+    return replace(choice, fit=fit, structures=tuple(answers.values()))
 
 
 def fit_or_none(problem: Problem, scene: Scene, start: FloatArray) -> FieldFit | None:
@@ -301,12 +306,6 @@ def newton_step_to(fit: FieldFit, scene: Scene) -> Mixture | None:
     there, here = zip(*((i, names.index(name)) for i, name in enumerate(wanted) if name in names), strict=True)
     scale[np.ix_(there, there)] = fit.covariance[np.ix_(here, here)]
     return newton_mixture(target, start, scale)
-
-
-def _supported_shape(chosen: FieldFit, questions: Sequence[Structure]) -> str:
-    if chosen.scene.shape != "ellipse":
-        return chosen.scene.shape
-    return "ellipse" if any(one.name == "ellipse" and one.supported for one in questions) else "round"
 
 
 def _ellipse_question(fit: FieldFit) -> Structure:

@@ -11,6 +11,7 @@ import numpy as np
 from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 from tactile_bayes.inference.draws import Solution, Solved, distinct_rows
+from tactile_bayes.posterior.bump import log_normal_density
 from tactile_bayes.posterior.window import (
     FieldColumns,
     Inner,
@@ -196,11 +197,6 @@ def ridge_place(offset: FloatArray, radius_mm: float) -> tuple[BoolArray, float]
     """(m,) whether ridges may lie this far from the window's middle, and the volume of angles and offsets."""
     reach = REACH_IN_RADII * radius_mm
     return np.abs(offset) <= reach, float(np.pi * 2.0 * reach)
-
-
-def log_normal_density(value: FloatArray, mean: float, sd: float) -> FloatArray:
-    """(...) log density of a normal distribution."""
-    return np.asarray(-0.5 * ((value - mean) / sd) ** 2 - np.log(sd * np.sqrt(2.0 * np.pi)))
 
 
 # --- Low-rank basis shared by many bumps, for fast inner products.
@@ -444,7 +440,8 @@ class CollapsedTarget:
                     yield spanned.solution(fields)
                     continue
             for j in range(0, len(points), BLOCK):
-                yield self.linear.under_each(self.scene.templates(points[j : j + BLOCK], self.window), fields)
+                products = self.linear.projected(self.scene.templates(points[j : j + BLOCK], self.window))
+                yield joined((self.linear.under(*products, columns) for columns in fields), axis=1)
 
 
 def choose(evidence: FloatArray, rng: np.random.Generator) -> IndexArray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+from scipy.special import logit
 
 from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, NotConvergedError
@@ -185,11 +186,7 @@ def _second_lump(estimate: Estimate) -> ModalBump | None:
 
 
 def _at_rim(
-    rest: TactileMap,
-    whole: TactileMap,
-    candidates: tuple[Candidate, ...],
-    options: SamplerSettings,
-    estimate: Estimate,
+    rest: TactileMap, whole: TactileMap, candidates: tuple[Candidate, ...], options: SamplerSettings, estimate: Estimate
 ) -> tuple[Rise | None, bool]:
     """A rise that is a lump by the evidence and that the map covers too poorly to measure; None where there is none."""
     if not candidates or candidates[0].fit is None or not candidates[0].fault.startswith(AT_RIM):
@@ -367,5 +364,5 @@ def _calibrated(tactile_map: TactileMap, mass: Mass) -> float:
     """Probability that a mass is a lump, by its own estimate, or by the odds and the bump of its rise."""
     if mass.estimate.probability is not None:
         return mass.estimate.probability
-    odds = Detection(mass.probability, float(np.log(mass.probability) - np.log1p(-min(mass.probability, 1.0 - 1e-16))))
+    odds = Detection(float(logit(min(mass.probability, 1.0 - 1e-16))))
     return weigh(tactile_map, odds, mass.bump).chance

@@ -68,18 +68,14 @@ class Weighed(Record, eq=False):
 
 
 def weigh(
-    tactile_map: TactileMap,
-    detection: Detection,
-    bump: ModalBump,
-    *,
-    fault: str = "",
-    candidate: Candidate | None = None,
+    tactile_map: TactileMap, detection: Detection, bump: ModalBump, candidate: Candidate | None = None
 ) -> Weighed:
-    """A rise with the bump that the odds are of; `fault` and `candidate` as the search met it."""
+    """A rise with the bump that the odds are of; `candidate` as the search met it."""
     centre_mm, (narrow, wide) = (bump.x_mm, bump.y_mm), sorted((bump.sigma_x_mm, bump.sigma_y_mm))
     evidence = log1p(float(np.clip(detection.log_bayes_factor, 0.0, MOST_EVIDENCE)))
     too_wide = max(log(max(wide, 1e-3) / WIDE_MM), 0.0)
     open_share = 1.0 - covered_share(tactile_map, centre_mm, radius_mm=1.5 * wide)
+    fault = "" if candidate is None else candidate.fault
     faulty = float(bool(fault) and not fault.startswith(NO_EVIDENCE))
     features = (evidence, min(log(wide / max(narrow, 1e-3)), 2.0), min(too_wide, 2.0), open_share, faulty)
     return Weighed(detection, centre_mm, features, candidate)

@@ -25,11 +25,11 @@ from tactile_bayes.posterior.bump import (
     candidate_centres,
     count_weights,
     covered_share,
-    detection_from_odds,
     drawn_widths,
     error_model,
     independent_errors,
     level_offset,
+    log_normal_density,
     typical_level,
     value_scale,
     window_cells,
@@ -405,11 +405,11 @@ def detect(tactile_map: TactileMap, fit: BumpFit) -> Detection:
     """
     blocks = _blocks(tactile_map, fit)
     if len(blocks.value) < 8 or fit.theta[0] <= 0:
-        return Detection(0.0, -np.inf)
+        return Detection(-np.inf)
     sigma_x, sigma_y, _ = fit.widths()
     width = float(np.sqrt(sigma_x * sigma_y))
     null, lump = _log_evidences(blocks, width, amplitude_sd=fit.prior.amplitude_sd * fit.bump.scale)
-    return detection_from_odds(lump - null + _log_occam_factor(tactile_map, fit))
+    return Detection(lump - null + _log_occam_factor(tactile_map, fit))
 
 
 def _blocks(tactile_map: TactileMap, fit: BumpFit) -> _Blocks:
@@ -478,12 +478,8 @@ def _log_occam_factor(tactile_map: TactileMap, fit: BumpFit) -> float:
         return -np.inf
     area = float(tactile_map.covered.sum()) * tactile_map.recipe.cell_mm**2
     p, q, _ = fit.bump.shape_parameters(fit.theta)
-    density = (
-        -0.5 * ((p - log(prior.width_median_mm)) / prior.log_width_sd) ** 2
-        - 0.5 * (q / prior.log_ratio_sd) ** 2
-        - log(2 * pi * prior.log_width_sd * prior.log_ratio_sd)
-        - log(area)
-    )
+    density = log_normal_density(p, log(prior.width_median_mm), prior.log_width_sd) - log(area)
+    density = density + log_normal_density(q, 0.0, prior.log_ratio_sd)
     return float(min(2 * log(2 * pi) + 0.5 * log_det + density, 0.0))
 
 

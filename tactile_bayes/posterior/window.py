@@ -24,7 +24,7 @@ import numpy as np
 from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.bump import FitCells, cell_mean_gaussian, covariance_from_log_widths
+from tactile_bayes.posterior.bump import FitCells, cell_mean_gaussian, covariance_from_log_widths, profile
 from tactile_bayes.posterior.white import WIDEST_IN_RADII
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES
 
@@ -270,11 +270,8 @@ def cell_mean_profile(
     and added there: a difference of the order of the terms that both leave out.
     """
     blurred = np.hypot(sigma_mm, blur_mm)
-    wide = (blurred**2 + cell_mm**2 / 12.0)[:, None]
-    square = distance_mm**2 / wide
-    gaussian = blurred[:, None] / np.sqrt(wide) * np.exp(-0.5 * square)
-    fourth = (square * (square - 6.0) + 3.0) / wide**2
-    return (sigma_mm / blurred)[:, None] * (gaussian * (1.0 - cell_mm**4 / 2880.0 * fourth))
+    gaussian, fourth = profile(distance_mm, sigma_mm=blurred, cell_mm=cell_mm)
+    return (sigma_mm / blurred)[:, None] * (gaussian * (1.0 - fourth))
 
 
 def independent_variance(cells: FitCells) -> FloatArray:
@@ -487,13 +484,8 @@ class LinearModel:
         cross = self.window.product(*templates) if len(templates) == 2 else None
         return [self.window.project(one, self.weighted) for one in templates], cross
 
-    def under_each(self, templates: list[Templates], fields: list[FieldColumns]) -> LinearSolution:
-        """Solutions for each structure's (m,) templates under all fields."""
-        projected, cross = self.projected(templates)
-        return joined((self.under(projected, cross, columns) for columns in fields), axis=1)
-
     def under(self, projected: list[Projected], cross: FloatArray | None, columns: FieldColumns) -> LinearSolution:
-        """The same under one length, from inner products without a field."""
+        """Solutions for each structure's (m,) templates under one length, from inner products without a field."""
         inner = [Inner.of(one, columns) for one in projected]
         return self.solve(inner, None if cross is None else inner[0].product(inner[1], cross, columns), columns)
 

@@ -87,7 +87,7 @@ def test_a_bump_that_cannot_be_measured_has_its_code(
     fit, found = fit_bump(tactile_map, (bump.get("x", 1.3), bump.get("y", -0.8)), options=SamplerSettings())
     assert fault in found
     candidate = Candidate((0.0, 0.0), fit, found)
-    lump = Weighed(Detection(1.0, 50.0), (0.0, 0.0), (4.0, 0.0, 0.0, 0.0, 0.0), candidate)
+    lump = Weighed(Detection(50.0), (0.0, 0.0), (4.0, 0.0, 0.0, 0.0, 0.0), candidate)
     answer = no_bump(tactile_map, [candidate], lump, where="here")
     assert answer.code == code
     assert advice in answer.advice
@@ -100,7 +100,7 @@ def test_a_wide_rise_at_the_rim_asks_for_strokes_and_not_for_a_larger_window() -
     tactile_map = grid_map(bump_values(half_mm=45.0, x=0.0, y=0.0, sigma_x=4.0, sigma_y=4.0))
     fit, _ = fit_bump(tactile_map, (0.0, 0.0), options=SamplerSettings())
     candidate = Candidate((0.0, 0.0), fit, f"{AT_RIM} (with a sigma of 13.3 mm its flank to +y is 9 mm short)")
-    lump = Weighed(Detection(1.0, 50.0), (0.0, 0.0), (4.0, 0.0, 0.0, 0.0, 0.0), candidate)
+    lump = Weighed(Detection(50.0), (0.0, 0.0), (4.0, 0.0, 0.0, 0.0, 0.0), candidate)
     answer = no_bump(tactile_map, [candidate], lump, where="here")
     assert answer.code == "window"
     assert answer.advice == answer.on_paper == "extend the strokes beyond it"

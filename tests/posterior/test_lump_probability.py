@@ -7,7 +7,7 @@ import pytest
 from posterior_maps import bump_values, grid_map
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.posterior.bump import detection_from_odds
+from tactile_bayes.posterior.bump import Detection
 from tactile_bayes.posterior.draw import ModalBump, SamplerSettings
 from tactile_bayes.posterior.verdict import LIKELY, Weighed, weigh
 from tactile_bayes.posterior.white import Candidate, fit_bump
@@ -17,9 +17,10 @@ CLEAR = {"log_bayes_factor": 60.0, "centre_mm": (0.0, 0.0), "widths_mm": (5.0, 4
 
 def weighed(**changes: object) -> Weighed:
     given = {**CLEAR, **changes}
-    detection = detection_from_odds(given.pop("log_bayes_factor"))  # type: ignore[arg-type]
+    detection = Detection(given.pop("log_bayes_factor"))  # type: ignore[arg-type]
     bump = ModalBump(0.2, *given["centre_mm"], *given["widths_mm"])  # type: ignore[misc]
-    return weigh(grid_map(bump_values(x=0.0, y=0.0)), detection, bump, fault=given["fault"])  # type: ignore[arg-type]
+    met = Candidate((0.0, 0.0), None, given["fault"])  # type: ignore[arg-type]
+    return weigh(grid_map(bump_values(x=0.0, y=0.0)), detection, bump, met)
 
 
 def test_a_clear_round_rise_is_a_lump() -> None:
@@ -48,7 +49,7 @@ def test_a_rise_has_the_width_of_the_bump_that_has_the_evidence() -> None:
     told = []
     for one in (narrow, wide):
         assert one.bump is not None
-        told.append(weigh(tactile_map, detection_from_odds(35.0), one.bump, fault=one.fault).probability)
+        told.append(weigh(tactile_map, Detection(35.0), one.bump, one).probability)
     assert told[0] > LIKELY > 0.3 > told[1]
 
 

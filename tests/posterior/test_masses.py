@@ -97,7 +97,7 @@ def ranked(*masses: tuple[float, float | None, float, bool]) -> list[int]:
         estimate = Estimate(
             "no_estimate" if size is None else "estimate",
             "",
-            detection=Detection(1.0, evidence),
+            detection=Detection(evidence),
             size=draws,
             bump=ModalBump(amplitude, 0.0, 0.0, 5.0, 5.0),
             findings=() if held else outside,
