@@ -128,12 +128,9 @@ def _rearranged(array: Any, name: str) -> Any:
 class Arrangement(Record, eq=False):
     """One arrangement, and how well frames predict each other in it."""
 
-    corrections: Corrections
-    """What was corrected; empty for the scan as it is stated."""
-    spread: float
-    """Root mean square of these errors, of the frames' mean pressure."""
-    explained: float
-    """Share of the variance over the skin that is predicted."""
+    corrections: Corrections  #: What was corrected; empty for the scan as it is stated.
+    spread: float  #: Root mean square of these errors, of the frames' mean pressure.
+    explained: float  #: Share of the variance over the skin that is predicted.
     lasting: float
     """Correlation of a taxel's errors from one frame to the next: noise has little, contradictions last."""
     agreement: float
@@ -185,12 +182,9 @@ class ArrangementCheck(Record, eq=False):
 
     stated: Arrangement
     best: Arrangement
-    log_odds: float
-    """For `best` against `stated`; 0 where they are the same."""
-    excluded: Mapping[str, float]
-    """Log odds for what is stated against each correction alone."""
-    contradicting: bool = False
-    """True where frames contradict each other whatever is corrected."""
+    log_odds: float  #: For `best` against `stated`; 0 where they are the same.
+    excluded: Mapping[str, float]  #: Log odds for what is stated against each correction alone.
+    contradicting: bool = False  #: True where frames contradict each other whatever is corrected.
     asked_ms: float = 0.0  #: Latency that the poses were stated to have.
     doubts: tuple[Finding, ...] = ()
     """What was noted of the scan, and what in it is unlike an exam, where it was looked for."""
@@ -216,62 +210,59 @@ class ArrangementCheck(Record, eq=False):
         return not self.excluded
 
     @property
-    def words(self) -> str:
-        """What the frames agree with, in one sentence."""
+    def _told(self) -> tuple[str, Finding | None]:
+        """What the frames agree with, in one sentence, and what speaks against the scan as it is stated, with what to
+        check, or to state to `map`, or to correct."""
+        best, stated = (f"{100 * one.spread:.1f} %" for one in (self.best, self.stated))
         if self.too_short:
-            return TOO_SHORT
+            return TOO_SHORT, None
+        if self.says_nothing and not self.contradicting:
+            return NOTHING_SHOWN, None
         if self.contradicting:
-            return (
-                f"frames contradict each other by {_percent(self.best)} where they overlap, in every arrangement tried"
-            )
-        if self.best is not self.stated:
-            return (
-                f"{self.best.in_words} (odds {odds_words(self.log_odds)}): overlapping frames agree to "
-                f"{_percent(self.best)} if so, to {_percent(self.stated)} as stated"
-            )
-        if self.says_nothing:
-            return NOTHING_SHOWN
-        return f"array, lever arm and quaternions are as stated: overlapping frames agree to {_percent(self.stated)}"
-
-    @property
-    def _against(self) -> Finding | None:
-        """What speaks against the scan as it is stated, with what to check, or to state to `map`, or to correct."""
-        if self.contradicting:
-            return Finding(
+            words = f"frames contradict each other by {best} where they overlap, in every arrangement tried"
+            return words, Finding(
                 "frames_contradict",
                 "strokes over one place do not agree on what they felt there; size and place may be wrong",
                 "check the lever arm, both clocks, and that the breast lay still",
                 "make sure that the breast lies still, and have the tracker's mounting and its clock checked",
             )
+        if self.best is self.stated:
+            return f"array, lever arm and quaternions are as stated: overlapping frames agree to {stated}", None
+        odds = f"(odds {odds_words(self.log_odds)}): overlapping frames agree to {best} if so, to {stated} as stated"
+        words = f"{self.best.in_words} {odds}"
         if self.best.late_ms:
-            return Finding(
+            return words, Finding(
                 "late_poses",
                 "the tracker's times do not fit those of the sensor array; size and place may be wrong",
                 f"map it with --latency-ms {self.asked_ms + self.best.late_ms:.0f}",
                 "have the scan mapped again with the tracker's delay",
             )
         if self.best.sway_mm:
-            return Finding(
+            return words, Finding(
                 "frames_contradict",
                 "the body moved to and fro during the scan, as breathing moves it; size and place may be wrong",
                 "record with a reference tool on the body (--reference), or have the breath held",
                 "have the scan taken again with the breath held",
             )
-        if self.best is not self.stated:
-            return Finding(
-                "wrong_arrangement",
-                "the sensor array or the tracker seems not to be mounted as stated; size and place may be wrong",
-                convention.import_again(self.best.corrections),
-                "have it checked how the array and the tracker are mounted",
-            )
-        return None
+        return words, Finding(
+            "wrong_arrangement",
+            "the sensor array or the tracker seems not to be mounted as stated; size and place may be wrong",
+            convention.import_again(self.best.corrections),
+            "have it checked how the array and the tracker are mounted",
+        )
+
+    @property
+    def words(self) -> str:
+        """What the frames agree with, in one sentence."""
+        return self._told[0]
 
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Findings against a map made of the scan as it is stated."""
-        if (found := self._against) is None:
+        words, found = self._told
+        if found is None:
             return (NOT_CHECKED,) if self.says_nothing else ()
-        return (replace(found, remedy=f"{self.words}; {found.remedy}"),)
+        return (replace(found, remedy=f"{words}; {found.remedy}"),)
 
     def findings_of(self, scan: Scan) -> tuple[Finding, ...]:
         """The same; that nothing is shown is no finding where the scan's head was checked by another scan."""
@@ -280,7 +271,7 @@ class ArrangementCheck(Record, eq=False):
     @property
     def remedy(self) -> str:
         """What to check or, where another arrangement is better, to state to `map` or to correct by `import`."""
-        return (self._against or NOT_CHECKED).remedy if self.findings else ""
+        return (self._told[1] or NOT_CHECKED).remedy if self.findings else ""
 
     def lines(self) -> list[str]:
         """The answer in full: what the frames agree with, what they exclude, what they leave open, and what to do."""
@@ -292,10 +283,6 @@ class ArrangementCheck(Record, eq=False):
                 lines.append(f"excluded (odds {words}): {', '.join(name for name in odds if odds[name] == words)}")
             lines += [f"not excluded: {CORRECTIONS[name]}" for name in self.not_shown]
         return lines
-
-
-def _percent(one: Arrangement) -> str:
-    return f"{100 * one.spread:.1f} %"
 
 
 def odds_words(log_odds: float) -> str:

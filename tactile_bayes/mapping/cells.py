@@ -125,7 +125,6 @@ _SPREAD_STEP = 2.0**-24
 _AXIS_STEP = 2.0**-30
 _STEPS = np.repeat([_POSITION_STEP, _SPREAD_STEP, _AXIS_STEP], [3, 9, 6])[:, None]
 _FARTHEST_STEPS = 2.0**52
-_FRAMES_AT_ONCE = 4096
 # Mean directions shorter than this (of 1) are no direction: the head was turned by over 90 degrees (SD).
 _LEAST_RESULTANT = 0.3
 
@@ -172,15 +171,8 @@ def head_moments(head: HeadGeometry, poses: FramePoses) -> HeadMoments:
     Every taxel counts, working or not: where the head was does not depend on what it read. A head so far from the
     tracker's base that steps would have gaps is a `BadDataError`.
     """
-    known = poses.part(poses.known)
-    parts = (known.part(slice(i, i + _FRAMES_AT_ONCE)) for i in range(0, len(known.known), _FRAMES_AT_ONCE))
-    return sum((_moments(head, part) for part in parts), HeadMoments())
-
-
-def _moments(head: HeadGeometry, poses: FramePoses) -> HeadMoments:
-    """Of at most `_FRAMES_AT_ONCE` frames."""
-    steps = np.rint(np.array(_values(head, poses)) * (1.0 / _STEPS))
-    farthest = float(np.abs(steps[:3]).max())
+    steps = np.rint(np.array(_values(head, poses.part(poses.known))) * (1.0 / _STEPS))
+    farthest = float(np.abs(steps[:3]).max(initial=0.0))
     if not farthest <= _FARTHEST_STEPS:
         raise BadDataError(
             f"the head was {farthest * _POSITION_STEP:.3g} mm from the tracker's base",
@@ -189,7 +181,7 @@ def _moments(head: HeadGeometry, poses: FramePoses) -> HeadMoments:
     whole = steps.astype(np.int64)
     centre = whole[:3].astype(object)  # its squares may be above 2^63
     sums = (*centre.sum(axis=1), *(centre @ centre.T).ravel(), *whole[3:].sum(axis=1).tolist())
-    return HeadMoments((len(poses.known), *sums))
+    return HeadMoments((steps.shape[1], *sums))
 
 
 def _values(head: HeadGeometry, poses: FramePoses) -> list[FloatArray]:

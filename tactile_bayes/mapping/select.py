@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
@@ -65,14 +64,6 @@ def find_faults(scan: Scan) -> tuple[TaxelFault, ...]:
     """
     if not len(scan.frames):
         return ()
-    faults = _classify(scan)
-    return tuple(
-        TaxelFault(int(row), int(column), str(faults[row, column])) for row, column in np.argwhere(faults != "")
-    )
-
-
-def _classify(scan: Scan) -> NDArray[np.str_]:
-    """(rows, columns) fault of each taxel, "" for a good one."""
     mean, flicker, still, lost, saturated = _element_levels(scan)
     lowest, highest = scan.frames.counts.min(axis=0), scan.frames.counts.max(axis=0)
     usual = float(np.median(mean))
@@ -90,11 +81,12 @@ def _classify(scan: Scan) -> NDArray[np.str_]:
     faults[(constant & moving) | (sticks & (len(scan.frames) >= MIN_FRAMES))] = "stuck"
     faults[saturated > SATURATED_SHARE] = "saturated"
     faults[(scan.element_calibration.gain_kpa_per_count == 0) | empty | weak] = "dead"
-    return faults
+    found = np.argwhere(faults != "").tolist()
+    return tuple(TaxelFault(row, column, str(faults[row, column])) for row, column in found)
 
 
 def _element_levels(scan: Scan) -> tuple[FloatArray, ...]:
-    """Each taxel's mean and flicker in kPa, and shares of frames: still, lost and saturated; in one pass."""
+    """Each taxel's mean and flicker in kPa, and shares of frames: still, lost and saturated."""
     counts, calibration = scan.frames.counts, scan.element_calibration
     steps, still, lost, saturated = np.zeros((4, *counts.shape[1:]))
     moving, highest, last = 0, counts.max(axis=0), counts[:1].astype(np.float64)

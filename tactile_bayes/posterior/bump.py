@@ -120,8 +120,7 @@ class FitCells(Record, eq=False):
     row: IndexArray
     column: IndexArray  #: (k,) int arrays: Where the cells lie in the map's grid.
     cell_mm: float  #: Side of a cell.
-    pose_noise: PoseNoise | None = None
-    """Tracker position error of the frames; None where the map does not give it."""
+    pose_noise: PoseNoise | None = None  #: Tracker position error of the frames; None where the map does not give it.
 
     def __len__(self) -> int:
         return len(self.value)
