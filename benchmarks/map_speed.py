@@ -122,7 +122,7 @@ def same_work(source: Frames, job: Job) -> CellSums:
     for part in chunks(len(job.counts), chunk_frames(readout.size)):
         pressure, valid = readout.pressure_kpa(job.counts[part])
         level, _ = readout.levels(pressure, valid)
-        add_frames(sums, readout, pressure, valid, projection=projection.part(part), level=level)
+        add_frames(sums, pressure, valid, projection=projection.part(part), level=level)
     return sums
 
 

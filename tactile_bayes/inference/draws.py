@@ -211,16 +211,6 @@ class Solved:
         return tuple(np.concatenate(parts)[row] for parts in zip(*self._solutions, strict=True))
 
 
-def distinct_rows(rows: FloatArray) -> tuple[FloatArray, IndexArray]:
-    """Distinct rows in order, and the index of each row among them: ``np.unique``, quicker where no two rows agree in
-    their first coordinate."""
-    _, first, back = np.unique(rows[:, 0], return_index=True, return_inverse=True)
-    if np.array_equal(rows[first[back]], rows):
-        return rows[first], back
-    distinct, back = np.unique(rows, axis=0, return_inverse=True)
-    return distinct, back.reshape(-1)
-
-
 # --- Posterior draws of one quantity, with its median and intervals.
 
 

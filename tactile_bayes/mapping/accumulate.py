@@ -245,7 +245,7 @@ def add_all(
         for part, counts in source.parts(cells.chunk_frames(source.selection.readout.size)):
             pressure, valid = source.selection.readout.pressure_kpa(counts)
             projection = source.projection.part(part)
-            cells.add_frames(sums, source.selection.readout, pressure, valid, projection=projection, level=level[part])
+            cells.add_frames(sums, pressure, valid, projection=projection, level=level[part])
             done += len(counts)
             progress(done, total)
     return sums
@@ -306,7 +306,7 @@ class MapAccumulator:
         self._counted["saturated_readings"] += round(float((1 - share).sum()) * self._readout.size)
         self._profile.add(pressure, level, share)
         valid, projection = None if valid is None else valid[frames], self._projector.at(poses)
-        cells.add_frames(self._sums, self._readout, pressure, valid, projection=projection, level=level)
+        cells.add_frames(self._sums, pressure, valid, projection=projection, level=level)
         return used
 
     def snapshot(self) -> TactileMap:

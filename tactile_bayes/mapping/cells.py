@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 from operator import add
 
 import numpy as np
@@ -236,25 +235,17 @@ class CellSums:
     """Readings below 0, which noise about nothing gives. They are added as they are: cut off at 0, they would lift the
     mean."""
 
-    def add_steps(
-        self,
-        first: tuple[int, int],
-        shape: tuple[int, int],
-        flat: IntArray,
-        steps: FloatArray,
-        *,
-        bounded: bool = False,
-    ) -> None:
+    def add_steps(self, first: tuple[int, int], shape: tuple[int, int], flat: IntArray, steps: FloatArray) -> None:
         """Add at most `READINGS_PER_CALL` values in whole steps to cells of the block `first`, `shape`; overwrites
         `steps`.
 
         `flat` is the cell of each in the block, row by row. Values beyond `LIMIT_STEPS` either way are clipped and
-        counted, unless `bounded` says that all lie in 0 to `LIMIT_STEPS`.
+        counted.
         """
         self._make_room(first, shape)
-        if not bounded and (lowest := float(steps.min())) < 0:
+        if (lowest := float(steps.min())) < 0:
             self.negative += int((steps < 0).sum())
-        if not bounded and max(float(steps.max()), -lowest) > LIMIT_STEPS:
+        if max(float(steps.max()), -lowest) > LIMIT_STEPS:
             self.clipped += int((np.abs(steps) > LIMIT_STEPS).sum())
             np.clip(steps, -LIMIT_STEPS, LIMIT_STEPS, out=steps)
         cells, weights, index = shape[0] * shape[1], steps.ravel(), flat.ravel()
@@ -451,7 +442,7 @@ class Projector(Record, eq=False):
 PRESSURE_STEP_KPA = 2.0**-34
 
 
-class Readout(Record, eq=False, dict=True):
+class Readout(Record, eq=False):
     """The taxels used, and the conversion of their counts to pressures."""
 
     taxels: IndexArray  #: (k,) int array: Flat indices of the used taxels, rising.
@@ -460,15 +451,6 @@ class Readout(Record, eq=False, dict=True):
     offset_kpa: FloatArray
     """`gain_kpa`, `offset_kpa` (k,) arrays: On the grid of `PRESSURE_STEP_KPA`."""
     full_count: int  #: Readings at or above it carry no pressure.
-
-    @cached_property
-    def plain_count(self) -> int:
-        """Up to it no taxel is saturated; -1 where that holds for no count."""
-        used = self.gain_kpa > 0
-        room = (PRESSURE_RANGE_KPA[1] - self.offset_kpa[used]) / self.gain_kpa[used]
-        plain = min(float(room.min(initial=np.inf)) - 1, self.full_count - 1, 65535)
-        sound = bool((self.offset_kpa < PRESSURE_RANGE_KPA[1]).all())
-        return int(max(plain, -1)) if sound else -1
 
     @classmethod
     def of(cls, calibration: ElementCalibration, good: BoolArray) -> Readout:
@@ -491,8 +473,6 @@ class Readout(Record, eq=False, dict=True):
         """
         pressure = np.multiply(counts, self.gain_kpa, dtype=np.float64)
         pressure += self.offset_kpa
-        if not counts.size or int(counts.max()) <= self.plain_count:
-            return pressure, None
         valid = (counts < self.full_count) & (pressure < PRESSURE_RANGE_KPA[1])
         return pressure, None if valid.all() else valid
 
@@ -519,13 +499,7 @@ def chunk_frames(taxels: int) -> int:
 
 
 def add_frames(
-    sums: CellSums,
-    readout: Readout,
-    pressure_kpa: FloatArray,
-    valid: BoolArray | None,
-    *,
-    projection: Projection,
-    level: FloatArray,
+    sums: CellSums, pressure_kpa: FloatArray, valid: BoolArray | None, *, projection: Projection, level: FloatArray
 ) -> None:
     """Add the valid ones of (f, k) pressures, each over its frame's `level`, to the cells where `projection` puts them.
 
@@ -538,9 +512,7 @@ def add_frames(
     np.rint(steps, out=steps)
     first, shape = projection.block()
     flat = projection.flat(first, shape)
-    # valid readings lie below the range of the sensor: where none can be negative or clipped, none is looked at
-    bounded = readout.offset_kpa.min() >= 0 and PRESSURE_RANGE_KPA[1] / VALUE_STEP < LIMIT_STEPS * float(level.min())
     if valid is None:
-        sums.add_steps(first, shape, flat, steps, bounded=bounded)
+        sums.add_steps(first, shape, flat, steps)
     elif valid.any():
-        sums.add_steps(first, shape, flat[valid], steps[valid], bounded=bounded)
+        sums.add_steps(first, shape, flat[valid], steps[valid])

@@ -105,10 +105,7 @@ def profile_figures(rows: FloatArray) -> dict[str, float]:
 
 def _lump_free(rows: FloatArray) -> BoolArray:
     """(f,) which of at least two frames feel no lump, by the residuals of their smooth profiles."""
-    below, share = divmod(0.1 * (len(rows) - 1), 1.0)
-    parted = np.partition(rows[:, -1], int(below) + 1)
-    low, high = parted[: int(below) + 1].max(), parted[int(below) + 1]
-    return np.asarray(rows[:, -1] <= SMOOTH_FACTOR * float(low + share * (high - low)))  # of the tenth's quantile
+    return np.asarray(rows[:, -1] <= SMOOTH_FACTOR * np.quantile(rows[:, -1], 0.1))
 
 
 def _read(part: SelectedFrames, frames: IndexArray) -> FloatArray:

@@ -351,8 +351,8 @@ def _none(
     told = asdict(why)
     if why.code in NO_LUMP and bump is not None:
         told["about_mm"], bump = (bump.x_mm, bump.y_mm), None
-    found = {"detection": detection, "bump": bump, "candidates": candidates, "diagnostics": diagnostics}
-    return Estimate("no_estimate", **told, **found)
+    told |= {"detection": detection, "bump": bump, "candidates": candidates, "diagnostics": diagnostics}
+    return Estimate("no_estimate", **told)
 
 
 def calibration_for(tactile_map: TactileMap, calibration: Calibration) -> Calibration:

@@ -39,9 +39,7 @@ def summed(source: Source, level: np.ndarray, cell_mm: float, *, size: int) -> C
     sums = CellSums(cell_mm)
     for part, counts in source.parts(size):
         pressure, valid = source.selection.readout.pressure_kpa(counts)
-        add_frames(
-            sums, source.selection.readout, pressure, valid, projection=source.projection.part(part), level=level[part]
-        )
+        add_frames(sums, pressure, valid, projection=source.projection.part(part), level=level[part])
     return sums.trimmed()
 
 

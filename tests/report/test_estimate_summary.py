@@ -203,9 +203,7 @@ def test_a_pool_names_the_map_whose_strokes_see_the_lump_apart(folder: Path) -> 
 def test_a_calibration_is_named_whole_whatever_its_name_holds() -> None:
     """A file "size (2).json" was called "size": the name was cut at the first bracket."""
     full, report = crowded()
-    assert full.diagnostics is not None
-    words = {"calibration": "calibration size (2).json", "size_calibration": "Sizes by the calibration size (2).json"}
-    named = replace(full, diagnostics=replace(full.diagnostics, **words))
+    named = replace(full, sized_by="calibration size (2).json")
     assert "Quality: sizes by the calibration size (2).json; method" in estimate_summary(named, report)
     assert "sizes by" not in estimate_summary(full, report)  # the control: no calibration
 
