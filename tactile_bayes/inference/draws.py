@@ -421,18 +421,12 @@ def _mixture_quantiles(mean: FloatArray, sd: FloatArray) -> FloatArray:
     total = float(np.sqrt(np.mean(sd**2) + spread))
     if not total > 0:
         return mean
-    mean, sd = _merged(mean, np.maximum(sd, LEAST_SD * total), by=mean if spread > np.mean(sd**2) else sd)
+    by, merged = mean if spread > np.mean(sd**2) else sd, n // MERGED * MERGED
+    sd = np.maximum(sd, LEAST_SD * total)
+    if merged >= LEAST_MERGED:  # the few left over are spread over the order, so that no end of it is lost
+        order = np.argsort(by)[np.linspace(0, n - 1, merged).round().astype(np.intp)].reshape(-1, MERGED)
+        sd = np.sqrt(np.mean(sd[order] ** 2, axis=1) + np.var(mean[order], axis=1))
+        mean = mean[order].mean(axis=1)
     at = float(mean.mean()) + total * _NODES
     score = ndtri(np.clip(normal_cdf((at[:, None] - mean) / sd).mean(axis=1), 1e-12, 1.0 - 1e-12))
     return np.interp(ndtri((np.arange(n) + 0.5) / n), score, at)
-
-
-def _merged(mean: FloatArray, sd: FloatArray, *, by: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Merge each `MERGED` neighbours, in the order of `by`, into one normal of their mean and variance."""
-    n = len(mean) // MERGED * MERGED
-    if n < LEAST_MERGED:
-        return mean, sd
-    # the few left over are spread over the order, so that no end of it is lost
-    order = np.argsort(by)[np.linspace(0, len(mean) - 1, n).round().astype(np.intp)].reshape(-1, MERGED)
-    middle = mean[order].mean(axis=1)
-    return middle, np.sqrt(np.mean(sd[order] ** 2, axis=1) + np.var(mean[order], axis=1))

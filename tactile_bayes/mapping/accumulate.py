@@ -54,9 +54,8 @@ def sources_of(selections: Sequence[SelectedFrames], *, plane_from_base: FloatAr
 
 MAX_GAIN_PASSES = 50
 GAIN_TOLERANCE = 1e-4
-# Cells of this many readings are kept between passes (4 bytes each), and of fewer all of them (17 bytes); what is not
-# kept is found anew in every pass.
-KEPT_READINGS, ALL_KEPT = 2**26, 2**22
+# So many readings are kept between passes, at 17 bytes each; of more all is found anew in every pass.
+KEPT_READINGS = 2**24
 _CHUNK = 128
 
 
@@ -109,7 +108,7 @@ class _System:
         bottom, right = np.max([np.add(*one) for one in blocks], axis=0).tolist()
         self._first, self._shape = (top, left), (bottom - top, right - left)
         self._readings = sum(len(source.projection) * len(source.selection.readout.taxels) for source in sources)
-        self._kept: dict[tuple[int, int], _Part | NDArray[np.int32]] = {}
+        self._kept: dict[tuple[int, int], _Part] = {}
         self._count = self._total(None)
 
     def improved(self, gains: FloatArray) -> FloatArray:
@@ -145,16 +144,15 @@ class _System:
                 self._progress(start, total)
 
     def _part(self, number: int, part: slice, counts: CountArray) -> _Part:
-        kept, source = self._kept.get((number, part.start)), self._sources[number]
-        if isinstance(kept, tuple):
-            return kept
+        if (number, part.start) in self._kept:
+            return self._kept[number, part.start]
+        source = self._sources[number]
         pressure, valid = source.selection.readout.pressure_kpa(counts)
         if valid is not None:
             pressure *= valid
-        flat = source.projection.part(part).flat(self._first, self._shape) if kept is None else kept
-        found = flat, pressure, valid
-        if kept is None and self._readings <= KEPT_READINGS:
-            self._kept[number, part.start] = found if self._readings <= ALL_KEPT else flat.astype(np.int32)
+        found = source.projection.part(part).flat(self._first, self._shape), pressure, valid
+        if self._readings <= KEPT_READINGS:
+            self._kept[number, part.start] = found
         return found
 
 

@@ -417,23 +417,17 @@ def register_strokes(sources: Sequence[Source]) -> tuple[list[Source], list[Stro
         shifts = np.clip(shifts + round_.step(shifts), -2 * EXPECTED_MM, 2 * EXPECTED_MM)
     known, errors = round_.errors()
     if known.sum() < 2:
-        raise BadDataError(
-            _few_known(known, round_), way_out="scan back and forth over a lump, or leave out the option"
-        )
+        best = float(round_.own_errors().min())
+        told = f"the best is known to +-{best:.1f} mm" if np.isfinite(best) else "no slope stands out of the noise"
+        fixed = f"crossed a lump or an edge that fixes a shift to {KNOWN_SD_MM:g} mm"
+        what = f"{int(known.sum())} of {len(known)} strokes {fixed} ({told})"
+        raise BadDataError(what, way_out="scan back and forth over a lump, or leave out the option")
     shifts = np.where(known, shifts - shifts[known].mean(), 0.0)
     shifted = [
         replace(one, shift_mm=float(shift), sd_mm=float(error), known=bool(sure))
         for one, shift, error, sure in zip(strokes, shifts, errors, known, strict=True)
     ]
     return [_moved(source, [one for one in shifted if one.scan == n]) for n, source in enumerate(sources)], shifted
-
-
-def _few_known(known: BoolArray, last: _Round) -> str:
-    """The scan's deficiency, in one line."""
-    best = float(last.own_errors().min())
-    told = f"the best is known to +-{best:.1f} mm" if np.isfinite(best) else "no slope stands out of the noise"
-    fixed = f"crossed a lump or an edge that fixes a shift to {KNOWN_SD_MM:g} mm"
-    return f"{int(known.sum())} of {len(known)} strokes {fixed} ({told})"
 
 
 def mobility(strokes: Sequence[StrokeShift]) -> tuple[float, float]:

@@ -223,7 +223,12 @@ def evenness_figures(selections: Sequence[SelectedFrames], plane: Plane) -> dict
     motions = [motion(part, plane) for part in parts]
     profiles = [_profiles(part, *motion) for part, motion in zip(parts, motions, strict=True)]
     rows, designs, groups = (np.concatenate(some) for some in zip(*profiles, strict=True))
-    return _curvature(motions) | _profile_changes(rows, designs, groups)
+    place = np.concatenate([place_mm[:, :2] - place_mm[:, :2].mean(axis=0) for place_mm, _ in motions])
+    normal = np.concatenate([axes[:, :2, 2] - axes[:, :2, 2].mean(axis=0) for _, axes in motions])
+    figures, moved = {}, float(np.sum(place**2))
+    if moved > len(place) * _LEAST_SPREAD_MM**2:  # over the directions in which the head moved, weighted by how far
+        figures["skin_curvature_per_m"] = -1000.0 * float(np.sum(place * normal)) / moved
+    return figures | _profile_changes(rows, designs, groups)
 
 
 def motion(part: SelectedFrames, plane: Plane) -> tuple[FloatArray, FloatArray]:
@@ -245,16 +250,6 @@ def _profiles(
     design = np.hstack([np.ones_like(way), place_mm[among, :2] / SPAN_MM, way, level, axes[among, 2, :2]])
     stretch = np.floor(part.scan.frames.time_s[chosen] / _STRETCH_S).astype(np.int64) % _GROUPS
     return _read(part, chosen), design, stretch
-
-
-def _curvature(motions: Sequence[tuple[FloatArray, FloatArray]]) -> dict[str, float]:
-    """Mean over the directions in which the head moved, weighted by how far."""
-    place = np.concatenate([place_mm[:, :2] - place_mm[:, :2].mean(axis=0) for place_mm, _ in motions])
-    normal = np.concatenate([axes[:, :2, 2] - axes[:, :2, 2].mean(axis=0) for _, axes in motions])
-    moved = float(np.sum(place**2))
-    if not moved > len(place) * _LEAST_SPREAD_MM**2:
-        return {}
-    return {"skin_curvature_per_m": -1000.0 * float(np.sum(place * normal)) / moved}
 
 
 def _profile_changes(rows: FloatArray, design: FloatArray, group: NDArray[np.int64]) -> dict[str, float]:

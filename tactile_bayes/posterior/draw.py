@@ -194,7 +194,11 @@ def draw_parameters(
         figures = draws.diagnostics
         shape = figures.get("pareto_k", 0.0)
         if shape == -np.inf or shape <= TRUSTED_SHAPE:
-            return _with_end_error(draws, fitted.width_sd_mm), tuple(passed_over)
+            if fitted.width_sd_mm is not None:  # of the Gaussians without their bias
+                error = figures.get("end_error_sd", END_ERROR / float(np.sqrt(draws.effective_draws)))
+                errors = {"end_error_sd": error, "end_error_mm": error * fitted.width_sd_mm}
+                draws = replace(draws, diagnostics={**figures, **errors})
+            return draws, tuple(passed_over)
         passed_over.append(f"{method}: Pareto shape {shape:.2f} (trusted up to {TRUSTED_SHAPE:g})")
     raise NotConvergedError("; ".join(passed_over), diagnostics=dict(figures))
 
@@ -214,15 +218,6 @@ def accuracy_in_sd(options: SamplerSettings, width_sd_mm: float | None) -> float
     if options.accuracy_mm is None or width_sd_mm is None:
         return options.accuracy_sd
     return min(max(options.accuracy_mm / width_sd_mm, 1e-3), options.accuracy_sd or 0.5)
-
-
-def _with_end_error(draws: ParameterDraws, width_sd_mm: float | None) -> ParameterDraws:
-    """Add the Monte-Carlo error of interval ends in SDs and mm (of the Gaussians: their bias is not included)."""
-    if width_sd_mm is None:
-        return draws
-    figures = dict(draws.diagnostics)
-    figures.setdefault("end_error_sd", END_ERROR / float(np.sqrt(draws.effective_draws)))
-    return replace(draws, diagnostics=figures | {"end_error_mm": figures["end_error_sd"] * width_sd_mm})
 
 
 def importance_draws(density: Sampled, *, rng: np.random.Generator, accuracy_sd: float | None = None) -> ParameterDraws:

@@ -50,8 +50,12 @@ def search(tactile_map: TactileMap, options: SamplerSettings) -> tuple[tuple[Can
     first where none is; None where none can be a lump."""
     tried: list[Candidate] = []
     first: tuple[Candidate, Assessment] | None = None
-    looks = 0
-    for candidate in _places(tactile_map, options):
+    looks, settings = 0, _search_options(tactile_map, options)
+    found_on = levelled(tactile_map) if options.correlated else tactile_map
+    for place in white.fitted_candidates(found_on, settings):
+        candidate = place
+        if found_on is not tactile_map and place.fit is not None:
+            candidate = replace(place, fit=_with_cells_of(tactile_map, place.fit, settings))
         tried.append(candidate)
         if candidate.fault or candidate.fit is None:
             continue
@@ -72,16 +76,6 @@ def search(tactile_map: TactileMap, options: SamplerSettings) -> tuple[tuple[Can
     if first is None:
         return tuple(tried), None
     return (*(one for one in tried if one.centre_mm != first[0].centre_mm), first[0]), first[1]
-
-
-def _places(tactile_map: TactileMap, options: SamplerSettings) -> Iterator[Candidate]:
-    """Candidate places, highest first, fitted on demand."""
-    settings = _search_options(tactile_map, options)
-    found_on = levelled(tactile_map) if options.correlated else tactile_map
-    for one in white.fitted_candidates(found_on, settings):
-        if found_on is not tactile_map and one.fit is not None:
-            one = replace(one, fit=_with_cells_of(tactile_map, one.fit, settings))
-        yield one
 
 
 def _with_cells_of(tactile_map: TactileMap, fit: BumpFit, settings: SamplerSettings) -> BumpFit:
@@ -120,28 +114,21 @@ def best_chance(
     Those that the search has weighed count. Where they are fewer than `MOST_LOOKS` the highest others are weighed too.
     """
     weighed: list[verdict.Weighed] = []
+    settings = _search_options(tactile_map, options)
     for candidate in sorted(candidates, key=lambda one: one.detection is None):
         if candidate.detection is None and len(weighed) >= MOST_LOOKS:
             break
-        bump, detection = candidate.bump, candidate.detection
+        fit, bump, detection = candidate.fit, candidate.bump, candidate.detection
         if detection is None:
-            bump, detection = _weighed(tactile_map, candidate, options)
-        if bump is not None and detection is not None:
+            if fit is None or candidate.fault.startswith(white.OUTGROWN):  # the bump close by
+                fit, _ = white.fit_close(levelled(tactile_map), candidate.centre_mm, options=settings)
+            if fit is None or min(fit.widths()[:2]) < white.LEAST_WIDTH_IN_CELLS * fit.cells.cell_mm:
+                continue  # a fit to a single cell says nothing of a lump
+            bump = fit.modal()
+            detection = assess(tactile_map, _with_cells_of(tactile_map, fit, settings), options).detection
+        if bump is not None:
             weighed.append(verdict.weigh(tactile_map, detection, bump, candidate))
     return max(weighed, key=lambda one: (one.probability, one.detection.log_bayes_factor), default=None)
-
-
-def _weighed(
-    tactile_map: TactileMap, candidate: Candidate, options: SamplerSettings
-) -> tuple[ModalBump | None, Detection | None]:
-    """Bump and odds of a lump at a faulty place, from close by where the first fit moved away or grew too large; None
-    for a fit to a single cell, which says nothing of a lump."""
-    fit, settings = candidate.fit, _search_options(tactile_map, options)
-    if fit is None or candidate.fault.startswith(white.OUTGROWN):
-        fit, _ = white.fit_close(levelled(tactile_map), candidate.centre_mm, options=settings)
-    if fit is None or min(fit.widths()[:2]) < white.LEAST_WIDTH_IN_CELLS * fit.cells.cell_mm:
-        return None, None
-    return fit.modal(), assess(tactile_map, _with_cells_of(tactile_map, fit, settings), options).detection
 
 
 def _search_options(tactile_map: TactileMap, fit: SamplerSettings) -> SamplerSettings:

@@ -181,31 +181,19 @@ def newton_mixture(
         if not np.isfinite(by_field[:, h]).all():
             return None
         gradient, hessian = finite_differences(by_field[:, h], step=0.3 * scale)
-        gaussian = _newton_gaussian(gradient, hessian, scale, limit=covariance)
-        if gaussian is None:
+        values, vectors = np.linalg.eigh(-hessian * np.outer(scale, scale))
+        one = (vectors / values) @ vectors.T * np.outer(scale, scale)
+        step = one @ gradient
+        if not values[0] > 0.05 or np.sqrt(step @ np.linalg.solve(covariance, step)) > 3.0:
             return None
-        step, one, gained = gaussian
         means.append(start + step)
         covariances.append(one)
+        gained = 0.5 * float(gradient @ step)
         masses.append(by_field[0, h] + gained + 0.5 * float(np.linalg.slogdet(2.0 * np.pi * one)[1]))
     if not masses:
         return None
     total, kept = float(np.logaddexp.reduce(masses)), float(np.log(share[share > least_share].sum()))
     return Mixture(np.exp(np.array(masses) - total), np.array(means), np.array(covariances), total - kept)
-
-
-def _newton_gaussian(
-    gradient: FloatArray, hessian: FloatArray, scale: FloatArray, *, limit: FloatArray
-) -> tuple[FloatArray, FloatArray, float] | None:
-    """Newton step to a field's mode, its covariance and the gain; None without a maximum nearby."""
-    values, vectors = np.linalg.eigh(-hessian * np.outer(scale, scale))
-    if not values[0] > 0.05:
-        return None
-    covariance = (vectors / values) @ vectors.T * np.outer(scale, scale)
-    step = covariance @ gradient
-    if np.sqrt(step @ np.linalg.solve(limit, step)) > 3.0:
-        return None
-    return step, covariance, 0.5 * float(gradient @ step)
 
 
 # --- Derivatives of a window's cells by all free parameters of a fitted scene.
