@@ -11,22 +11,10 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, check_number
 from tactile_bayes.findings import Finding, by_weight
 from tactile_bayes.geometry import BoolArray, FloatArray, Plane, apply, inverse, patient_from_plane
-from tactile_bayes.mapping import select
-from tactile_bayes.mapping.accumulate import (
-    GAIN_TOLERANCE,
-    Accumulated,
-    accumulate,
-    add_all,
-    divided,
-    shared_frame_figures,
-    sources_of,
-)
-from tactile_bayes.mapping.accumulate import flat_field as find_flat_field
+from tactile_bayes.mapping import accumulate, latency, select
 from tactile_bayes.mapping.arrangement import check_arrangement
 from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, CellSums, HeadMoments, head_moments
 from tactile_bayes.mapping.convention import check_convention, convention_findings, hint
-from tactile_bayes.mapping.latency import StrokeShift, estimate_latency, mobility, stroke_count, stroke_lag_figures
-from tactile_bayes.mapping.latency import register_strokes as find_shifts
 from tactile_bayes.mapping.map import FEW_READINGS, MapRecipe, TactileMap, broken_assumptions, handling_findings, smooth
 from tactile_bayes.mapping.plausibility import exam_figures, exam_findings, map_findings, with_cause
 from tactile_bayes.mapping.profile import evenness_figures, head_profile_figures, motion, pose_noise_figures
@@ -44,9 +32,9 @@ _WIDER = 1.5
 
 def find_mass(selections: Sequence[SelectedFrames], plane: Plane) -> FloatArray:
     """(2,) place of the highest point of the smoothed map on `plane`, mm."""
-    sources = sources_of(selections, plane_from_base=plane.plane_from_base, cell_mm=_CELL_MM)
+    sources = accumulate.sources_of(selections, plane_from_base=plane.plane_from_base, cell_mm=_CELL_MM)
     levels = [source.selection.level_kpa[source.selection.used] for source in sources]
-    sums = add_all(sources, levels, cell_mm=_CELL_MM).trimmed()
+    sums = accumulate.add_all(sources, levels, cell_mm=_CELL_MM).trimmed()
     count, total = smooth(sums.count), smooth(sums.total)
     mean = np.divide(total, count, out=np.full_like(total, -np.inf), where=count >= FEW_READINGS)
     row, column = np.unravel_index(int(mean.argmax()), mean.shape)
@@ -123,11 +111,11 @@ def cell_figures(sums: CellSums) -> dict[str, float]:
     }
 
 
-def stroke_figures(strokes: Sequence[StrokeShift]) -> dict[str, float]:
+def stroke_figures(strokes: Sequence[latency.StrokeShift]) -> dict[str, float]:
     """Shift of each stroke, and the mobility that they add up to."""
     if not strokes:
         return {}
-    moved, sd = mobility(strokes)
+    moved, sd = latency.mobility(strokes)
     figures = {
         "strokes": float(len(strokes)),
         "strokes_known": float(sum(one.known for one in strokes)),
@@ -195,13 +183,15 @@ def _built(
     figures |= head_profile_figures(selections)
     if how.flat_field:
         used = [part for part in selections if part.used.any()]
-        flats = [find_flat_field(part) for part in used]
+        flats = [accumulate.flat_field(part) for part in used]
         figures["flat_field_frames"] = float(sum(frames for _, frames in flats))
         figures["flat_field_sd"] = float(np.mean([response.std() for response, _ in flats]))
-        even = [divided(part.scan, response) for (response, _), part in zip(flats, used, strict=True)]
+        even = [accumulate.divided(part.scan, response) for (response, _), part in zip(flats, used, strict=True)]
         selections = _selected(even, how, late_ms, gap_ms)
     if how.latency_ms == "auto":
-        found = estimate_latency(selections, plane=_plane(selections), cell_mm=how.cell_mm, max_pose_gap_ms=gap_ms)
+        found = latency.estimate_latency(
+            selections, plane=_plane(selections), cell_mm=how.cell_mm, max_pose_gap_ms=gap_ms
+        )
         figures |= {"latency_sd_ms": found.sd_ms, "latency_bound_ms": found.bound_ms}
         late_ms, figures["latency_frames"] = found.latency_ms, float(found.frames)
         selections = _selected([part.scan for part in selections], how, late_ms, gap_ms)
@@ -211,14 +201,14 @@ def _built(
         radius = None if how.plane_radius_mm == "auto" else how.plane_radius_mm
         plane, near = local_plane(selections, plane, radius_mm=radius)
         figures.update(near)
-    sources = sources_of(selections, plane_from_base=plane.plane_from_base, cell_mm=how.cell_mm)
+    sources = accumulate.sources_of(selections, plane_from_base=plane.plane_from_base, cell_mm=how.cell_mm)
     if how.register_strokes:
-        sources, strokes = find_shifts(sources)
+        sources, strokes = latency.register_strokes(sources)
         figures.update(stroke_figures(strokes))
-    done = accumulate(sources, cell_mm=how.cell_mm, normalise=how.normalise, progress=progress)
-    figures.update(shared_frame_figures(sources, done.levels, done.sums))
-    figures |= evenness_figures(selections, plane) | stroke_lag_figures(sources)
-    figures["stroke_count"] = float(stroke_count(sources))
+    done = accumulate.accumulate(sources, cell_mm=how.cell_mm, normalise=how.normalise, progress=progress)
+    figures.update(accumulate.shared_frame_figures(sources, done.levels, done.sums))
+    figures |= evenness_figures(selections, plane) | latency.stroke_lag_figures(sources)
+    figures["stroke_count"] = float(latency.stroke_count(sources))
     low, high = map(float, how.pressure_window_kpa)
     recipe = MapRecipe(
         "scan", how.normalise, float(how.cell_mm), (low, high), late_ms, how.flat_field, how.register_strokes
@@ -284,7 +274,7 @@ def _check_same_examination(scans: list[Scan]) -> None:
 
 
 def _as_map(
-    done: Accumulated,
+    done: accumulate.Accumulated,
     selections: list[SelectedFrames],
     plane: Plane,
     recipe: MapRecipe,
@@ -305,7 +295,7 @@ def _as_map(
         **figures,
         "gain_passes": float(done.passes),
         "gain_last_change": done.last_change,
-        "gain_unsettled": float(not done.last_change <= GAIN_TOLERANCE),
+        "gain_unsettled": float(not done.last_change <= accumulate.GAIN_TOLERANCE),
     }
     tactile_map = TactileMap(
         mean=sums.mean() / done.scale,

@@ -479,12 +479,8 @@ class Readout(Record, eq=False):
     def levels(self, pressure: FloatArray, valid: BoolArray | None) -> tuple[FloatArray, FloatArray]:
         """Mean over the valid taxels (n,), NaN without any, and the share of the whole array that is valid (n,)."""
         # Sums of whole steps: any order of adding gives the same bits, so a matrix product may do it.
-        if valid is None and len(self.taxels):
-            share = np.full(len(pressure), len(self.taxels) / self.size)
-            return pressure @ np.ones(len(self.taxels)) / len(self.taxels), share
-        valid = np.ones(pressure.shape, dtype=bool) if valid is None else valid
-        number = valid.sum(axis=1)
-        total = np.where(valid, pressure, 0.0) @ np.ones(len(self.taxels))
+        number = np.full(len(pressure), len(self.taxels)) if valid is None else valid.sum(axis=1)
+        total = (pressure if valid is None else np.where(valid, pressure, 0.0)) @ np.ones(len(self.taxels))
         level = np.full(len(total), np.nan)
         np.divide(total, number, out=level, where=number > 0)
         return level, number / self.size

@@ -214,9 +214,9 @@ def estimate_latency(
     The scans may be selected with any latency, which hardly moves the plane. `BadDataError` names what a scan lacks
     that does not determine the latency.
 
-    Gauss-Newton steps on the regression of `tactile_bayes.mapping.latency`, with the head's velocity v as design: the
-    information on the latency is :math:`\sum (v \cdot \nabla m)^2 / s^2` over what the nuisances leave of it. In
-    strokes one way at one speed they leave nothing, since a map shifted by v tau looks the same.
+    Gauss-Newton steps on the regression of `ShiftFit`, with the head's velocity v as design: the information on the
+    latency is :math:`\sum (v \cdot \nabla m)^2 / s^2` over what the nuisances leave of it. In strokes one way at one
+    speed they leave nothing, since a map shifted by v tau looks the same.
 
     The standard error is the largest of three: leaving out a stroke at a time (jackknife), the regression's own with
     errors shared over 0.2 s, and the bound; widened as Student's t of that many strokes is. Noise has slopes too: the
@@ -399,10 +399,10 @@ def register_strokes(sources: Sequence[Source]) -> tuple[list[Source], list[Stro
     Shifts are about their mean, so the map stays where it is. `BadDataError` when there are fewer than two strokes, or
     fewer than two crossed a lump or an edge that fixes a shift.
 
-    The regression of `tactile_bayes.mapping.latency` with one unknown per stroke, a few rounds. Along y nothing is
-    shifted: each line lies at another y, so other columns of the head pass the lump, and their different readings look
-    like a shift of half a millimetre (record 0097). Standard errors are those of the regression, widened for errors
-    shared by neighbouring frames and for the part of the slopes that is noise; their floor is 0.06 mm.
+    The regression of `ShiftFit` with one unknown per stroke, a few rounds. Along y nothing is shifted: each line lies
+    at another y, so other columns of the head pass the lump, and their different readings look like a shift of half a
+    millimetre (record 0097). Standard errors are those of the regression, widened for errors shared by neighbouring
+    frames and for the part of the slopes that is noise; their floor is 0.06 mm.
     """
     strokes = find_strokes(sources)
     if len(strokes) < 2:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.special import expit
@@ -109,7 +109,7 @@ class PoseNoise(Record):
         return cls((figures[0], figures[1]), (figures[2], figures[3]), figures[4])
 
 
-class FitCells(Record, eq=False):
+class FitCells(Record, eq=False, dict=True):
     """The cells of one window, flattened."""
 
     x_mm: FloatArray
@@ -131,6 +131,14 @@ class FitCells(Record, eq=False):
         grid = np.zeros((*values.shape[:-1], int(row.max()) + 1, int(column.max()) + 1))
         grid[..., row, column] = values
         return grid
+
+    @cached_property
+    def lattice(self) -> tuple[FloatArray, FloatArray, IndexArray]:
+        """Coordinates of the smallest grid's columns and rows, and each cell's index in it."""
+        column, row = self.column - self.column.min(), self.row - self.row.min()
+        x_axis, y_axis = np.zeros(int(column.max()) + 1), np.zeros(int(row.max()) + 1)
+        x_axis[column], y_axis[row] = self.x_mm, self.y_mm
+        return x_axis, y_axis, row * len(x_axis) + column
 
     @property
     def reading_variance(self) -> float:
@@ -341,7 +349,7 @@ class Bump(Record):
                 away = cells.x_mm - x_mm[:, None], cells.y_mm - y_mm[:, None]
                 return cell_mean_gaussian(*away, covariance_mm2=covariance, cell_mm=cells.cell_mm)
             # along the grid's axes: a product of what rows and columns have, with a fourth cumulant that is their sum
-            x_axis, y_axis, place = _lattice(cells)
+            x_axis, y_axis, place = cells.lattice
             x, x_fourth = profile(x_axis - x_mm[:, None], sigma_mm=np.exp(p + q), cell_mm=cells.cell_mm)
             y, y_fourth = profile(y_axis - y_mm[:, None], sigma_mm=np.exp(p - q), cell_mm=cells.cell_mm)
             bump = (1.0 - y_fourth)[:, :, None] - x_fourth[:, None, :]
@@ -372,15 +380,6 @@ class Bump(Record):
 def log_normal_density(value: FloatArray, mean: float, sd: float) -> FloatArray:
     """(...) log density of a normal distribution."""
     return np.asarray(-0.5 * ((value - mean) / sd) ** 2 - np.log(sd * np.sqrt(2.0 * np.pi)))
-
-
-@lru_cache(maxsize=2)
-def _lattice(cells: FitCells) -> tuple[FloatArray, FloatArray, IndexArray]:
-    """Coordinates of the window's columns and rows, and each cell's index in their grid; cached."""
-    column, row = cells.column - cells.column.min(), cells.row - cells.row.min()
-    x_axis, y_axis = np.zeros(int(column.max()) + 1), np.zeros(int(row.max()) + 1)
-    x_axis[column], y_axis[row] = cells.x_mm, cells.y_mm
-    return x_axis, y_axis, row * len(x_axis) + column
 
 
 def profile(distance_mm: FloatArray, *, sigma_mm: FloatArray, cell_mm: float) -> tuple[FloatArray, FloatArray]:

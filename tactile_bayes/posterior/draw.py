@@ -195,8 +195,8 @@ def draw_parameters(
         shape = figures.get("pareto_k", 0.0)
         if shape == -np.inf or shape <= TRUSTED_SHAPE:
             if fitted.width_sd_mm is not None:  # of the Gaussians without their bias
-                error = figures.get("end_error_sd", END_ERROR / float(np.sqrt(draws.effective_draws)))
-                errors = {"end_error_sd": error, "end_error_mm": error * fitted.width_sd_mm}
+                error_sd = figures.get("end_error_sd", END_ERROR / float(np.sqrt(draws.effective_draws)))
+                errors = {"end_error_sd": error_sd, "end_error_mm": error_sd * fitted.width_sd_mm}
                 draws = replace(draws, diagnostics={**figures, **errors})
             return draws, tuple(passed_over)
         passed_over.append(f"{method}: Pareto shape {shape:.2f} (trusted up to {TRUSTED_SHAPE:g})")
