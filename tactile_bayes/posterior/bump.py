@@ -350,8 +350,8 @@ class Bump(Record):
                 return cell_mean_gaussian(*away, covariance_mm2=covariance, cell_mm=cells.cell_mm)
             # along the grid's axes: a product of what rows and columns have, with a fourth cumulant that is their sum
             x_axis, y_axis, place = cells.lattice
-            x, x_fourth = profile(x_axis - x_mm[:, None], sigma_mm=np.exp(p + q), cell_mm=cells.cell_mm)
-            y, y_fourth = profile(y_axis - y_mm[:, None], sigma_mm=np.exp(p - q), cell_mm=cells.cell_mm)
+            x, x_fourth = _profile(x_axis - x_mm[:, None], sigma_mm=np.exp(p + q), cell_mm=cells.cell_mm)
+            y, y_fourth = _profile(y_axis - y_mm[:, None], sigma_mm=np.exp(p - q), cell_mm=cells.cell_mm)
             bump = (1.0 - y_fourth)[:, :, None] - x_fourth[:, None, :]
             bump *= x[:, None, :]
             bump *= y[:, :, None]
@@ -382,7 +382,7 @@ def log_normal_density(value: FloatArray, mean: float, sd: float) -> FloatArray:
     return np.asarray(-0.5 * ((value - mean) / sd) ** 2 - np.log(sd * np.sqrt(2.0 * np.pi)))
 
 
-def profile(distance_mm: FloatArray, *, sigma_mm: FloatArray, cell_mm: float) -> tuple[FloatArray, FloatArray]:
+def _profile(distance_mm: FloatArray, *, sigma_mm: FloatArray, cell_mm: float) -> tuple[FloatArray, FloatArray]:
     """(m, n) cell means of Gaussians along an axis to second order, and their fourth-order correction."""
     wide = (sigma_mm**2 + cell_mm**2 / 12.0)[:, None]
     square = distance_mm**2 / wide

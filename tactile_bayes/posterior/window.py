@@ -24,7 +24,7 @@ import numpy as np
 from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.bump import FitCells, cell_mean_gaussian, covariance_from_log_widths, profile
+from tactile_bayes.posterior.bump import FitCells, cell_mean_gaussian, covariance_from_log_widths
 from tactile_bayes.posterior.white import WIDEST_IN_RADII
 from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES
 
@@ -270,8 +270,11 @@ def cell_mean_profile(
     and added there: a difference of the order of the terms that both leave out.
     """
     blurred = np.hypot(sigma_mm, blur_mm)
-    gaussian, fourth = profile(distance_mm, sigma_mm=blurred, cell_mm=cell_mm)
-    return (sigma_mm / blurred)[:, None] * (gaussian * (1.0 - fourth))
+    wide = (blurred**2 + cell_mm**2 / 12.0)[:, None]
+    square = distance_mm**2 / wide
+    gaussian = blurred[:, None] / np.sqrt(wide) * np.exp(-0.5 * square)
+    fourth = (square * (square - 6.0) + 3.0) / wide**2
+    return (sigma_mm / blurred)[:, None] * (gaussian * (1.0 - cell_mm**4 / 2880.0 * fourth))
 
 
 def independent_variance(cells: FitCells) -> FloatArray:
