@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tactile_bayes.declarations import Record
+from tactile_bayes.inference.modes import finite_differences, stencil
 from tactile_bayes.trial.figures import (
     Count,
     Ends,
@@ -27,7 +28,6 @@ from tactile_bayes.trial.readings import FloatArray, ModalitySizes, Reading
 # --- Variances of masses, readers and maps from unbalanced readings, by restricted maximum likelihood.
 
 Index = npt.NDArray[np.int64]
-_Criterion = Callable[[FloatArray], float]
 
 
 class Components(Record):
@@ -64,19 +64,25 @@ def components(y: FloatArray, mass: Index, reader: Index) -> Components:
 
     Masses and readers are numbered from 0 without gaps.
 
-    Patterson & Thompson (1971), Biometrika 58, 545. The criterion is profiled over the residual variance and searched
-    in the ratios of SDs to the residual SD, in which it is even, so that a variance of 0 is no edge (Bates et al.
-    2015, J. Stat. Softw. 67(1)). Masses are eliminated one by one, which leaves a system of the readers' size.
+    Patterson & Thompson (1971), Biometrika 58, 545. The criterion, -2 log restricted likelihood less a constant, is
+    profiled over the residual variance and searched in the ratios of SDs to the residual SD, in which it is even, so
+    that a variance of 0 is no edge (Bates et al. 2015, J. Stat. Softw. 67(1)).
     """
-    readers = int(reader.max()) + 1
-    problem = _Problem(y - y.mean(), mass, reader)
-    start = np.array([1.0, 0.3]) if readers > 1 else np.array([1.0])
-    found = [_descend(problem.criterion, start * factor) for factor in (1.0, 0.2, 5.0)]
-    theta = np.abs(min(found, key=problem.criterion))
-    residual = problem.residual_variance(theta)
+    readers, freedom = int(reader.max()) + 1, len(y) - 1
+    solved = _solver(y - y.mean(), mass, reader)
+
+    def criterion(ratios: FloatArray) -> float:
+        log_det, squares = solved(ratios)
+        return log_det + freedom * math.log(max(squares, 1e-300))
+
+    start = np.array([1.0, 0.3] if readers > 1 else [1.0])
+    found = [_descend(criterion, start * factor) for factor in (1.0, 0.2, 5.0)]
+    ratios = np.abs(min(found, key=criterion))
+    residual = max(0.0, solved(ratios)[1]) / freedom
+    variances = np.where(ratios < 1e-6, 0.0, ratios**2 * residual)  # 0 where the search ended at its lower limit
     return Components(
-        mass=_variance(theta[0], residual),
-        reader=_variance(theta[1], residual) if readers > 1 else None,
+        mass=float(variances[0]),
+        reader=float(variances[1]) if readers > 1 else None,
         map=residual,
         n=len(y),
         masses=int(mass.max()) + 1,
@@ -84,85 +90,50 @@ def components(y: FloatArray, mass: Index, reader: Index) -> Components:
     )
 
 
-def _variance(ratio: float, residual: float) -> float:
-    """Variance at a ratio of SDs; 0 where the search ended at its lower limit."""
-    return 0.0 if ratio < 1e-6 else float(ratio**2 * residual)
+def _solver(y: FloatArray, mass: Index, reader: Index) -> Callable[[FloatArray], tuple[float, float]]:
+    """At ratios of SDs: log determinant of the criterion and weighted residual sum of squares, both over variance 1.
 
+    Masses are eliminated one by one, which leaves a system of the readers' size.
+    """
+    terms = np.zeros((len(y), int(reader.max()) + 2))  # the fixed mean, then the readers
+    terms[:, 0] = terms[np.arange(len(y)), reader + 1] = 1.0
+    cross = np.zeros((int(mass.max()) + 1, terms.shape[1]))  # of each mass, the sum of its terms
+    np.add.at(cross, mass, terms)
+    count, total = cross[:, 0], np.bincount(mass, weights=y)
 
-class _Problem:
-    """Sums that the REML criterion needs: by mass, by reader and by pair of the two."""
-
-    def __init__(self, y: FloatArray, mass: Index, reader: Index) -> None:
-        masses, readers = int(mass.max()) + 1, int(reader.max()) + 1
-        self.n = len(y)
-        self.yy = float(y @ y)
-        self.count = np.bincount(mass, minlength=masses).astype(np.float64)
-        self.sum = np.bincount(mass, weights=y, minlength=masses)
-        # fixed mean first, then readers: counts and sums of y of each mass in each of these columns
-        self.cross = np.zeros((masses, readers + 1))
-        np.add.at(self.cross, (mass, reader + 1), 1.0)
-        self.cross[:, 0] = self.count
-        per_reader = np.bincount(reader, minlength=readers).astype(np.float64)
-        self.gram = np.diag(np.concatenate([[self.n], per_reader]))
-        self.gram[0, 1:] = self.gram[1:, 0] = per_reader
-        self.right = np.concatenate([[y.sum()], np.bincount(reader, weights=y, minlength=readers)])
-
-    def _solved(self, theta: FloatArray) -> tuple[float, float]:
-        """Log determinant of the REML criterion and the weighted residual sum of squares, both over variance 1."""
-        shrink = theta[0] ** 2 / (1 + theta[0] ** 2 * self.count)
-        gram = self.gram - (self.cross * shrink[:, None]).T @ self.cross
-        right = self.right - self.cross.T @ (shrink * self.sum)
-        squares = self.yy - float(shrink @ self.sum**2)
-        scale = np.ones(len(right))
-        scale[1:] = theta[1] if len(theta) > 1 else 0.0
-        system = gram * np.outer(scale, scale)
+    def solved(ratios: FloatArray) -> tuple[float, float]:
+        scale = np.full(terms.shape[1], ratios[1] if len(ratios) > 1 else 0.0)
+        scale[0] = 1.0
+        shrink = ratios[0] ** 2 / (1 + ratios[0] ** 2 * count)
+        right = scale * (terms.T @ y - cross.T @ (shrink * total))
+        system = (terms.T @ terms - (cross * shrink[:, None]).T @ cross) * np.outer(scale, scale)
         system[1:, 1:] += np.eye(len(scale) - 1)
-        beta = np.linalg.solve(system, scale * right)
-        _, log_det = np.linalg.slogdet(system)
-        return float(log_det + np.sum(np.log1p(theta[0] ** 2 * self.count))), squares - float(beta @ (scale * right))
+        squares = float(y @ y) - float(shrink @ total**2) - float(np.linalg.solve(system, right) @ right)
+        log_det = np.linalg.slogdet(system)[1] + np.sum(np.log1p(ratios[0] ** 2 * count))
+        return float(log_det), squares
 
-    def criterion(self, theta: FloatArray) -> float:
-        """-2 log restricted likelihood, less a constant."""
-        log_det, squares = self._solved(theta)
-        return log_det + (self.n - 1) * math.log(max(squares, 1e-300))
-
-    def residual_variance(self, theta: FloatArray) -> float:
-        return max(0.0, self._solved(theta)[1]) / (self.n - 1)
+    return solved
 
 
-def _descend(function: _Criterion, theta: FloatArray) -> FloatArray:
+def _descend(function: Callable[[FloatArray], float], theta: FloatArray) -> FloatArray:
     """A minimum by Newton's method with finite differences, kept downhill."""
-    value, k = function(theta), len(theta)
     for _ in range(60):
-        h = 1e-4 * np.maximum(np.abs(theta), 1e-2)
-        steps = np.diag(h)
-        ahead = np.array([function(theta + s) for s in steps])
-        behind = np.array([function(theta - s) for s in steps])
-        slope = (ahead - behind) / (2 * h)
-        bend = np.diag((ahead - 2 * value + behind) / h**2)
-        for i in range(k):
-            for j in range(i):
-                mixed = function(theta + steps[i] + steps[j]) - ahead[i] - ahead[j] + value
-                bend[i, j] = bend[j, i] = mixed / (h[i] * h[j])
-        values, vectors = np.linalg.eigh(bend)
-        step = -vectors @ ((vectors.T @ slope) / np.maximum(np.abs(values), 1e-6))
-        theta, moved, value = _downhill(function, theta, step, value)
-        if moved < 1e-9 * max(1.0, float(np.abs(theta).max())):
+        step = 1e-4 * np.maximum(np.abs(theta), 1e-2)
+        values = np.array([function(point) for point in stencil(theta, step=step)])
+        slope, bend = finite_differences(values, step=step)
+        curvature, axes = np.linalg.eigh(bend)
+        move = -axes @ ((axes.T @ slope) / np.maximum(np.abs(curvature), 1e-6))
+        move *= min(1.0, 3 * max(1.0, float(np.abs(theta).max())) / max(float(np.abs(move).max()), 1e-300))
+        for _ in range(40):
+            if function(theta + move) <= values[0]:
+                break
+            move /= 2
+        else:
+            return theta
+        theta = theta + move
+        if np.abs(move).max() < 1e-9 * max(1.0, float(np.abs(theta).max())):
             break
     return theta
-
-
-def _downhill(
-    function: _Criterion, theta: FloatArray, step: FloatArray, value: float
-) -> tuple[FloatArray, float, float]:
-    size = float(np.abs(step).max())
-    step = step * min(1.0, 3 * max(1.0, float(np.abs(theta).max())) / size) if size > 0 else step
-    for _ in range(40):
-        tried = function(theta + step)
-        if tried <= value:
-            return theta + step, float(np.abs(step).max()), tried
-        step = step / 2
-    return theta, 0.0, value
 
 
 # --- Spread of replicates of one mass.
