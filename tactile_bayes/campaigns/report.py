@@ -101,12 +101,11 @@ def exam_rows(campaign: Campaign, pooled: Mapping[str, PooledReport]) -> list[Ro
         if not row.failed:
             of_scan[row.exam.path].append(row)
     more = {path: unnamed([row.masses for row in some]) for path, some in of_scan.items()}
-    told = {
-        row.exam.name: (*row.findings, *together.get(row.exam.name, ()), *more[row.exam.path])
-        for some in of_scan.values()
-        for row in some
-    }
-    return [replace(row, findings=by_weight(told.get(row.exam.name, ()))) for row in rows]
+    for index, row in enumerate(rows):
+        if not row.failed:
+            told = (*row.findings, *together.get(row.exam.name, ()), *more[row.exam.path])
+            rows[index] = replace(row, findings=by_weight(told))
+    return rows
 
 
 def _of_pooled(pooled: Iterable[PooledReport]) -> dict[str, tuple[Finding, ...]]:
@@ -192,14 +191,13 @@ def trial_lines(
     `masses` have a size after excision: the others are left out. None takes all. Numbers run over the visits of a mass.
     """
     taken = [row for row in rows if masses is None or (row.exam.patient, row.exam.mass) in masses]
-    readings = [
-        _reading(row.exam, TACTILE, row.status, row.size, row.reason, row.synthetic, row.exam.reader) for row in taken
+    readings = [_reading(row, TACTILE, reader=row.exam.reader) for row in taken]
+    visits: dict[str, list[Row]] = defaultdict(list)
+    for row in taken if pooled else ():
+        visits[row.exam.of_mass].append(row)
+    readings += [
+        _reading(_together(campaign, some, pooled.get(name)), POOLED_MODALITY) for name, some in visits.items()
     ]
-    if pooled:
-        visits: dict[str, list[Row]] = defaultdict(list)
-        for row in taken:
-            visits[row.exam.of_mass].append(row)
-        readings += [_together(campaign, some, pooled.get(name)) for name, some in visits.items()]
     count: Counter[tuple[object, ...]] = Counter()
     for one in readings:
         key = (one["patient"], one["mass"], one["modality"])
@@ -208,38 +206,30 @@ def trial_lines(
     return readings
 
 
-def _together(campaign: Campaign, rows: Sequence[Row], report: PooledReport | None) -> dict[str, object]:
-    """The reading of a mass at a visit."""
+def _together(campaign: Campaign, rows: Sequence[Row], report: PooledReport | None) -> Row:
+    """A mass at a visit, by all of its exams."""
     exam = rows[-1].exam
     told = [row.synthetic for row in rows if row.synthetic is not None]  # a failed exam does not say
     synthetic = any(told) if told else None
-    if report is not None:
-        silent = all(row.status == "not_done" for row in rows)
-        status = "not_done" if silent and report.max_size_mm is None else _status(report)
-        return _reading(exam, POOLED_MODALITY, status, report.max_size_mm, report.reason, synthetic)
-    fault = campaign.faults.get(exam.of_mass)
-    reason = "every exam failed" if fault is None else f"{fault.step} failed: {fault.reason}"
-    return _reading(exam, POOLED_MODALITY, "not_done", None, reason, synthetic)
+    if report is None:
+        fault = campaign.faults.get(exam.of_mass)
+        reason = "every exam failed" if fault is None else f"{fault.step} failed: {fault.reason}"
+        return Row(exam, "not_done", reason, synthetic=synthetic)
+    silent = all(row.status == "not_done" for row in rows)
+    status = "not_done" if silent and report.max_size_mm is None else _status(report)
+    return Row(exam, status, report.reason, size=report.max_size_mm, synthetic=synthetic)
 
 
-def _reading(
-    exam: Exam,
-    modality: str,
-    status: str,
-    size: Quantity | None,
-    reason: str,
-    synthetic: bool | None,
-    reader: str | None = None,
-) -> dict[str, object]:
+def _reading(row: Row, modality: str, *, reader: str | None = None) -> dict[str, object]:
     return {
-        **_names(exam),
+        **_names(row.exam),
         "modality": modality,
-        "status": status,
-        **_figures(size, _SIZES),
+        "status": row.status,
+        **_figures(row.size, _SIZES),
         "reader": reader,
-        "date": exam.day,
-        "reason": (reason or None) if status != "detected" else None,
-        "synthetic": synthetic,
+        "date": row.exam.day,
+        "reason": (row.reason or None) if row.status != "detected" else None,
+        "synthetic": row.synthetic,
     }
 
 

@@ -138,7 +138,7 @@ class Campaign:
                 self._pool(sound)
             if grown:
                 growing = grown_masses(self._estimated(sound))
-                self._of_masses("compare", GROWTH, growing, self._compare_task, masses=len(grown_masses(sound)))
+                self._of_masses("compare", growing, self._compare_task, masses=len(grown_masses(sound)))
 
     def _steps(self, exams: int, masses: int, *, learns: bool = False, compared: int = 0) -> dict[str, int]:
         """Steps that so many exams and masses take, done or not.
@@ -254,9 +254,10 @@ class Campaign:
     def _folder_of(self, exam: Exam) -> Path:
         return self.folder / EXAMS / exam.name
 
-    def _task(self, step: str, name: str, key: object, make: Callable[[], steps.Made], kind: str = EXAMS) -> steps.Task:
+    def _task(self, step: str, name: str, key: object, make: Callable[[], steps.Made], kind: str = "") -> steps.Task:
         """A step of an exam or mass; `key` is all that its files depend on."""
-        return steps.Task(step, name, self.folder / kind / name, steps.digest_of(key), make)
+        folder = self.folder / (kind or _KINDS.get(step, EXAMS)) / name
+        return steps.Task(step, name, folder, steps.digest_of(key), make)
 
     def _map_task(self, exam: Exam) -> steps.Task:
         given: dict[str, Any] = {"expected": self._expected(exam), "normalise": self.settings.normalise}
@@ -399,22 +400,16 @@ class Campaign:
         groups: dict[str, list[Exam]] = defaultdict(list)
         for exam in self._estimated(sound):
             groups[exam.of_mass].append(exam)
-        self._of_masses("pool", MASSES, groups, self._pool_task, masses=len({exam.of_mass for exam in sound}))
+        self._of_masses("pool", groups, self._pool_task, masses=len({exam.of_mass for exam in sound}))
 
     def _of_masses(
-        self,
-        step: str,
-        kind: str,
-        found: Mapping[str, _Any],
-        task_of: Callable[[str, _Any], steps.Task],
-        *,
-        masses: int,
+        self, step: str, found: Mapping[str, _Any], task_of: Callable[[str, _Any], steps.Task], *, masses: int
     ) -> None:
         """Run a step for the masses that have what it needs, out of so many."""
         known = {} if self._sizes_unknown else found
         for names in _blocks(list(known), self._block):
             self._run(step, [task_of(name, known[name]) for name in names], of=len(names))
-            self._copy(kind, names, made_by=(step,))
+            self._copy(_KINDS[step], names, made_by=(step,))
         for one in (step, "copy") if self.settings.copy_to else (step,):
             self._run(one, [], of=masses - len(known))
 
@@ -429,7 +424,7 @@ class Campaign:
     def _pool_task(self, name: str, exams: Sequence[Exam]) -> steps.Task:
         settings, key = self._of_one_mass(exams)
         make = partial(steps.make_pool, self.folder / EXAMS, [exam.name for exam in exams], settings)
-        return self._task("pool", name, key, make, MASSES)
+        return self._task("pool", name, key, make)
 
     def _of_one_mass(self, exams: Sequence[Exam]) -> tuple[Settings, dict[str, Any]]:
         """Settings by which exams are sized together, and all that the result depends on."""
@@ -453,7 +448,7 @@ class Campaign:
         make = partial(
             steps.make_growth, self.folder / EXAMS, names, settings, days=days, course=course, figures=figures
         )
-        return self._task("compare", name, key, make, GROWTH)
+        return self._task("compare", name, key, make)
 
     def _file(self, step: str, name: str, file: str) -> str | None:
         return self.files(step, name).get(file)
@@ -463,6 +458,7 @@ class Campaign:
         return str(self.result("map", exam.name)["normalise"])
 
 
+_KINDS: Final = {"pool": MASSES, "compare": GROWTH}  #: The folder of a step's masses; other steps are of exams.
 _POOLED_FROM: Final = (("map", MAP), ("estimate", ESTIMATE), ("estimate", SHAPE))
 
 

@@ -344,7 +344,7 @@ def test_an_exam_that_cannot_show_a_lump_was_not_done(code: str, status: str) ->
     """Not held against the modality; the control is a map that could have shown a lump."""
     row = Row.of(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), estimate_report(reason_code=code))
     assert row.status == status
-    without_faults: Any = SimpleNamespace(found=SimpleNamespace(faults={}))
+    without_faults: Any = SimpleNamespace(faults={})
     together = {row.exam.of_mass: pooled_report(reason="no size", maps=())}
     assert [one["status"] for one in trial_lines(without_faults, [row], together, None)] == [status, status]
 
