@@ -84,8 +84,8 @@ def ranks(
         found = model.posteriors_of(Trial(readings, ex_vivo_mm), sample=sample, rng=rng)[0].get("tactile")
         if found is not None:
             yield (
-                float(np.mean(found.mape_percent < truth)),
-                float(np.mean(found.mape_detected_percent < of_found)),
+                float(np.mean(found.draws["mape_percent"] < truth)),
+                float(np.mean(found.draws["mape_detected_percent"] < of_found)),
                 found.summary.mape_percent.median,
             )
 

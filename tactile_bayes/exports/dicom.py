@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -245,31 +245,23 @@ POSTURES: Final = ("supine", "oblique", "sitting")  #: Of a person; a phantom ha
 _IMAGE_TYPE: Final = ["DERIVED", "PRIMARY", "VOLUME", "QUANTITY"]
 
 
-class Place(NamedTuple):
-    """A map's own coordinates in the patient."""
-
-    reference: str  #: Identifier of its frame of reference.
-    transform: FloatArray  #: (4, 4) from its plane to L, P, S in mm.
+def place_of(source: exam.MapFile) -> FloatArray | None:
+    """(4, 4) from the map's plane to L, P, S in mm; None without landmarks, or without a posture of a person."""
+    return exam.lps_from_plane(source.tactile_map) if source.facts.get("posture") in POSTURES else None
 
 
-def place_of(source: exam.MapFile) -> Place | None:
-    """The map's coordinates in the patient, known with landmarks, in a posture of a person; None where they are not.
-
-    They are the map's own: no other image shares them, not even another map of the exam, because the third axis follows
-    the normal of the scanned skin.
-    """
-    transform = exam.lps_from_plane(source.tactile_map)
-    if transform is None or source.facts.get("posture") not in POSTURES:
-        return None
-    return Place(exam.content_uid("frame of reference", source.digest), transform)
+def frame_of_reference(source: exam.MapFile) -> str:
+    """Identifier of the map's own coordinates: not even another map of the exam has them, for the third axis follows
+    the normal of the scanned skin."""
+    return exam.content_uid("frame of reference", source.digest)
 
 
-def parametric_map(source: exam.MapFile, place: Place, *, study: Study, number: int) -> Any:
+def parametric_map(source: exam.MapFile, transform: FloatArray, *, study: Study, number: int) -> Any:
     """The map's means as a Parametric Map of one frame that faces the viewer as the program's pictures do.
 
     Cells without data are NaN, which is also the padding value. `number`: of the instance in its series, from 1.
     """
-    values, directions, corner_mm = image_plane(source.tactile_map, place.transform)
+    values, directions, corner_mm = image_plane(source.tactile_map, transform)
     pydicom = exam.required("pydicom")
     dataset = pydicom.Dataset()
     add_study(dataset, study, source)
@@ -282,7 +274,7 @@ def parametric_map(source: exam.MapFile, place: Place, *, study: Study, number: 
     dataset.SeriesInstanceUID = study.uid("series of parametric maps")
     dataset.SeriesNumber, dataset.InstanceNumber = 1, number
     dataset.SeriesDescription = f"Tactile map. {RESEARCH_USE}"
-    dataset.FrameOfReferenceUID = place.reference
+    dataset.FrameOfReferenceUID = frame_of_reference(source)
     dataset.PositionReferenceIndicator = "XIPHOID"
     _add_content(dataset, source, values)
     dataset.SharedFunctionalGroupsSequence = [_shared_groups(source, values, directions)]
@@ -338,10 +330,7 @@ def _shared_groups(source: exam.MapFile, values: FloatArray, directions: FloatAr
     )
     side = laterality(source.facts)
     if side:
-        region = item(
-            CodeValue=exam.BREAST.value, CodingSchemeDesignator=exam.BREAST.scheme, CodeMeaning=exam.BREAST.meaning
-        )
-        groups.FrameAnatomySequence = [item(FrameLaterality=side, AnatomicRegionSequence=[region])]
+        groups.FrameAnatomySequence = [item(FrameLaterality=side, AnatomicRegionSequence=[coded(exam.BREAST)])]
     return groups
 
 
@@ -465,11 +454,11 @@ def _sites(estimate: exam.EstimateFile, maps: Sequence[exam.MapFile]) -> list[An
 
 def _region(finding: exam.SizedMass, maps: Sequence[exam.MapFile]) -> Any | None:
     """The lump's centre as a point in the map's frame of reference; of one map whose place is known."""
-    place = place_of(maps[0]) if len(maps) == 1 else None
-    if place is None or finding.centre_mm is None:
+    transform = place_of(maps[0]) if len(maps) == 1 else None
+    if transform is None or finding.centre_mm is None:
         return None
-    centre = exam.on_plane(place.transform, finding.centre_mm)
-    return exam.required("highdicom").sr.ImageRegion3D("POINT", np.array([centre]), place.reference)
+    centre = exam.on_plane(transform, finding.centre_mm)
+    return exam.required("highdicom").sr.ImageRegion3D("POINT", np.array([centre]), frame_of_reference(maps[0]))
 
 
 def _measurements(finding: exam.SizedMass, evidence: Sequence[Any]) -> Iterator[Any]:
@@ -533,9 +522,9 @@ def dicom_files(
     study = study_of(identity, maps)
     numbered = [(f"_{i}" if len(maps) > 1 else "", i, one) for i, one in enumerate(maps, start=1)]
     objects = {
-        f"{VALUES}{suffix}.dcm": parametric_map(one, place, study=study, number=number)
+        f"{VALUES}{suffix}.dcm": parametric_map(one, transform, study=study, number=number)
         for suffix, number, one in numbered
-        if (place := place_of(one)) is not None
+        if (transform := place_of(one)) is not None
     }
     for suffix, number, one in numbered:
         objects[f"picture{suffix}.dcm"] = secondary_capture(one, estimate, study=study, number=number)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.trial.figures import UndefinedError, ratio
+from tactile_bayes.trial.figures import Ends, UndefinedError, ratio
 from tactile_bayes.trial.readings import FloatArray
 
 # --- Ordered angles of the lines through all pairs of points: listed, or counted when there are many.
@@ -110,6 +110,31 @@ def _inversions(x: FloatArray, z: FloatArray, *, ties: bool) -> int:
     return number
 
 
+class Line(Record):
+    """y = intercept + slope x, fitted to n pairs."""
+
+    intercept: float
+    slope: float
+    n: int
+    intercept_se: float | None = None
+    slope_se: float | None = None
+    """`intercept_se`, `slope_se`: Analytic standard errors, as if the pairs were independent; None where there is no
+    formula."""
+    stated: tuple[Ends, Ends] | None = None
+    """Intervals of intercept and slope that the fit itself gives; infinite for few pairs."""
+
+    def intervals(self, *, confidence: float) -> tuple[Ends, Ends] | None:
+        """Analytic intervals of intercept and slope, by Student's t with n - 2 degrees of freedom, or those stated."""
+        if self.intercept_se is None or self.slope_se is None:
+            return self.stated
+        t = student(self.n - 2, confidence=confidence)
+        of_intercept, of_slope = t * self.intercept_se, t * self.slope_se
+        return (
+            (self.intercept - of_intercept, self.intercept + of_intercept),
+            (self.slope - of_slope, self.slope + of_slope),
+        )
+
+
 # --- Passing and Bablok's line: the shifted median of the slopes of all pairs of masses.
 #
 # Conventions, those that laboratories' programs share: the slope of a vertical pair is +90 degrees when Kendall's
@@ -117,16 +142,7 @@ def _inversions(x: FloatArray, z: FloatArray, *, ties: bool) -> int:
 # line) counts half in the shift; means of two middle slopes are taken between angles.
 
 
-class PassingBablok(Record):
-    """A Passing-Bablok line with its intervals; ends may be infinite for few masses."""
-
-    intercept: float
-    slope: float
-    intercept_interval: tuple[float, float]
-    slope_interval: tuple[float, float]
-
-
-def passing_bablok(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) -> PassingBablok:
+def passing_bablok(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) -> Line:
     """Fit y on x without assuming a distribution or knowing which method errs more.
 
     Undefined with fewer than two different points, when the middle slope is vertical, or when so many slopes are beyond
@@ -158,7 +174,7 @@ def passing_bablok(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) ->
         slopes = _at(angles, low), _at(angles, high)
         if all(abs(end) < 1e15 for end in slopes):
             intercepts = float(np.median(y - slopes[1] * x)), float(np.median(y - slopes[0] * x))
-    return PassingBablok(float(np.median(y - slope * x)), slope, intercepts, slopes)
+    return Line(float(np.median(y - slope * x)), slope, n, stated=(intercepts, slopes))
 
 
 def _at(angles: PairAngles, twice: int) -> float:
@@ -175,45 +191,18 @@ def _at(angles: PairAngles, twice: int) -> float:
 # lines.
 
 
-class Line(Record):
-    """y = intercept + slope x, fitted to n pairs."""
-
-    intercept: float
-    slope: float
-    n: int
-    intercept_se: float | None = None
-    slope_se: float | None = None
-    """`intercept_se`, `slope_se`: Analytic standard errors, as if the pairs were independent; None where there is no
-    formula."""
-
-    def intervals(self, *, confidence: float) -> tuple[tuple[float, float], tuple[float, float]] | None:
-        """Analytic intervals of intercept and slope, by Student's t with n - 2 degrees of freedom."""
-        if self.intercept_se is None or self.slope_se is None:
-            return None
-        t = student(self.n - 2, confidence=confidence)
-        of_intercept, of_slope = t * self.intercept_se, t * self.slope_se
-        return (
-            (self.intercept - of_intercept, self.intercept + of_intercept),
-            (self.slope - of_slope, self.slope + of_slope),
-        )
-
-
-def least_squares(x: FloatArray, y: FloatArray, *, weights: FloatArray | None = None) -> Line:
-    """Fit by least vertical squares, weighted when asked (1/x^2 for a constant relative error).
-
-    Undefined with fewer than two different x.
-    """
+def least_squares(x: FloatArray, y: FloatArray) -> Line:
+    """Fit by least vertical squares; undefined with fewer than two different x."""
     _need_two(x)
-    w = np.ones_like(x) if weights is None else weights
-    mean_x, mean_y, u, _, p = _moments(x, y, w)
+    mean_x, mean_y, u, _, p = _moments(x, y, np.ones_like(x))
     if u == 0:
         raise UndefinedError("all reference values are equal, so no line is determined")
     slope = p / u
     residuals = y - mean_y - slope * (x - mean_x)
     if len(x) < 3:
         return Line(mean_y - slope * mean_x, slope, len(x))
-    slope_se = math.sqrt(float(w @ residuals**2) / (len(x) - 2) / u)
-    intercept_se = slope_se * math.sqrt(float(w @ x**2 / w.sum()))
+    slope_se = math.sqrt(float(residuals @ residuals) / (len(x) - 2) / u)
+    intercept_se = slope_se * math.sqrt(float(np.mean(x**2)))
     return Line(mean_y - slope * mean_x, slope, len(x), intercept_se, slope_se)
 
 

@@ -319,7 +319,7 @@ MOST_REFITTED = 300
 _SMALLEST, _LARGEST = 1e-100, 1e100
 
 _T = TypeVar("_T")
-_Fit = Callable[[ModalitySizes], lines.Line | lines.PassingBablok]
+_Fit = Callable[[ModalitySizes], lines.Line]
 Unit = Literal["mm", "log_ratio"]
 Against = Literal["on_ex_vivo", "on_mean"]
 _Refitted = Ends | None | UnsetType
@@ -472,11 +472,11 @@ def _sd(sums: FloatArray) -> FloatArray:
     return np.sqrt(np.maximum(ratio(u + q - 2 * p, sums[..., 2] - 1), 0.0))
 
 
-def _fitted(fit: Callable[[FloatArray, FloatArray], lines.Line | lines.PassingBablok]) -> _Fit:
+def _fitted(fit: Callable[[FloatArray, FloatArray], lines.Line]) -> _Fit:
     """A line that several figures share, fitted once to the same masses."""
 
     @lru_cache(maxsize=1)
-    def fitted(sizes: ModalitySizes) -> lines.Line | lines.PassingBablok:
+    def fitted(sizes: ModalitySizes) -> lines.Line:
         _need_squares(sizes.ex_vivo_mm, sizes.size_mm)
         return fit(sizes.ex_vivo_mm, sizes.size_mm)
 
@@ -506,16 +506,16 @@ def _analytic(found: ModalitySizes, robust: _Fit, *, confidence: float, error_ra
         "ols": lambda: lines.least_squares(x, y),
         "deming": lambda: lines.deming(x, y, error_ratio=error_ratio),
         "weighted_deming": by_jackknife,
+        "passing_bablok": lambda: robust(found),
     }
     ends: dict[str, Ends | None] = {}
     for name, fit in fits.items():
         plain = _or_none(fit)
-        two = None if plain is None else plain.intervals(confidence=confidence)
-        ends[f"{name}_intercept_mm"], ends[f"{name}_slope"] = two or (None, None)
-    line = _or_none(lambda: robust(found))
-    if isinstance(line, lines.PassingBablok):
-        for name, both in (("intercept_mm", line.intercept_interval), ("slope", line.slope_interval)):
-            ends[f"passing_bablok_{name}"] = both if np.all(np.isfinite(both)) else None
+        if plain is None and name == "passing_bablok":
+            continue
+        two = (None if plain is None else plain.intervals(confidence=confidence)) or (None, None)
+        for part, both in zip(("intercept_mm", "slope"), two, strict=True):
+            ends[f"{name}_{part}"] = None if both is None or not np.all(np.isfinite(both)) else both
     agreement = _or_none(lambda: lines.concordance(x, y, confidence=confidence))
     ends["concordance"] = None if agreement is None else agreement.interval
     return ends

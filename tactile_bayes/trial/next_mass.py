@@ -88,13 +88,10 @@ class IntervalKind(Record):
 
 
 class Posterior(Record, eq=False):
-    """Posterior of one modality with its draws."""
+    """Posterior of one modality: (n,) draws of each of its figures."""
 
     summary: NextOfModality
-    mape_percent: FloatArray
-    mape_detected_percent: FloatArray
-    """`mape_percent`, `mape_detected_percent`: (n,) draws of the expected percent error of the next mass, misses
-    included, and of one that is found."""
+    draws: dict[str, FloatArray]
     diagnostics: dict[str, float]
 
 
@@ -144,7 +141,7 @@ def next_mass(trial: Trial, *, sample: Sampler = draw, rng: np.random.Generator)
     posteriors, left_out = posteriors_of(trial, sample=sample, rng=rng)
     compared = {}
     for one, other in combinations(posteriors, 2):  # P(A < B) for independent draws, over all pairs of them
-        a, b = posteriors[one].mape_percent, posteriors[other].mape_percent
+        a, b = (posteriors[name].draws["mape_percent"] for name in (one, other))
         below = float(np.mean(np.searchsorted(np.sort(a), b)) / len(a))
         compared[f"{one} errs less than {other}"] = rounded(below)
     return NextMass(
@@ -184,11 +181,10 @@ def _fit(sizes: ModalitySizes, caliper: Mapping[int, float], *, sample: Sampler,
     missed = len(sizes.size_mm) - len(found.size_mm)
     misses = rng.beta(missed + PRIOR_MISS, len(found.size_mm) + PRIOR_MISS, len(theta))
     of_found = expected_error_percent(model, theta)
-    error = (1 - misses) * of_found + 100 * misses
     sds = np.sqrt(np.array(variances(theta)))
     tails = [0.5, 0.5 - INTERVAL / 2, 0.5 + INTERVAL / 2]
     figures = {
-        "mape_percent": error,
+        "mape_percent": (1 - misses) * of_found + 100 * misses,
         "mape_detected_percent": of_found,
         "bias_percent": 100 * np.expm1(theta[:, 0]),
         "log_slope": theta[:, 1],
@@ -199,12 +195,8 @@ def _fit(sizes: ModalitySizes, caliper: Mapping[int, float], *, sample: Sampler,
         "miss_share": misses,
     }
     middles = {name: Middle(*map(rounded, np.quantile(values, tails).tolist())) for name, values in figures.items()}
-    return Posterior(
-        NextOfModality(masses=len(found.size_mm), patients=len(found.patients), **middles),
-        mape_percent=error,
-        mape_detected_percent=of_found,
-        diagnostics={name: rounded(float(value)) for name, value in drawn.diagnostics.items()},
-    )
+    summary = NextOfModality(masses=len(found.size_mm), patients=len(found.patients), **middles)
+    return Posterior(summary, figures, {name: rounded(float(value)) for name, value in drawn.diagnostics.items()})
 
 
 class LogModel:
