@@ -18,13 +18,12 @@ from tactile_bayes.options import Aim
 from tactile_bayes.report import trial as trial_words
 from tactile_bayes.report.figure_file import FORMATS, figure_file, finish, plain_matplotlib
 from tactile_bayes.report.pages import Growth, page
-from tactile_bayes.trial.calibration import BINS, Calibration, Prediction, prediction_of
 from tactile_bayes.trial.figures import Figures
 from tactile_bayes.trial.method_comparison import MethodComparison
 from tactile_bayes.trial.next_mass import NextOfModality
 from tactile_bayes.trial.planning import PlanReport
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes, Trial, mass_numbers
-from tactile_bayes.trial.summary import ModalityReport, TrialReport
+from tactile_bayes.trial.summary import BINS, Calibration, ModalityReport, Prediction, TrialReport, prediction_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,7 +7,6 @@ import pytest
 from scipy import stats
 
 from tactile_bayes.trial import accuracy
-from tactile_bayes.trial.calibration import coverage
 from tactile_bayes.trial.figures import (
     MIN_PATIENTS,
     Figure,
@@ -18,6 +17,7 @@ from tactile_bayes.trial.figures import (
     interval_from_values,
 )
 from tactile_bayes.trial.readings import Interval, ModalitySizes, Reading
+from tactile_bayes.trial.summary import coverage
 
 NOMINAL = 0.95
 

@@ -9,7 +9,8 @@ import pytest
 from scipy import integrate, stats
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.trial.calibration import (
+from tactile_bayes.trial.readings import Interval, Reading, Trial
+from tactile_bayes.trial.summary import (
     Calibration,
     Prediction,
     calibration,
@@ -18,7 +19,6 @@ from tactile_bayes.trial.calibration import (
     log_normal,
     prediction_of,
 )
-from tactile_bayes.trial.readings import Interval, Reading, Trial
 
 
 def stated_by(
