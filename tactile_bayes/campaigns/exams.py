@@ -307,21 +307,11 @@ OWN_AXES: Final = Finding(
 )
 
 
-class NamedPlace(Record):
-    """Where an exam of the breast has a mass, as the table says."""
-
-    mass: str
-    exam: str
-    """`mass`, `exam`: Their codes and names."""
-    path: Path  #: Of that exam's map.
-    centre_mm: tuple[float, float]  #: On that map.
-
-
 class Match(Record):
     """Which mass of a map is an exam's, by where other exams have the breast's masses."""
 
     mass: str  #: Code of the exam's mass, which one of the places is of.
-    places: tuple[NamedPlace, ...]
+    named: tuple[Exam, ...]  #: Exams that say where a mass lies on their map, one for each of the breast's masses.
     most_mm: float  #: Within this distance of its place a mass of the map is it.
 
 
@@ -358,7 +348,7 @@ def matched(path: Path, settings: Settings, match: Match) -> SizeEstimate:
     mass, most_mm = match.mass, match.most_mm
     outcome = estimate_file(path, settings)
     tactile_map, masses = outcome.tactile_map, outcome.estimate.masses
-    wanted = places_on(tactile_map, match.places)
+    wanted = places_on(tactile_map, path, match.named)
     near = [one for one in masses if nearest(wanted, (one.x_mm, one.y_mm), most_mm) == mass]
     if len(near) > 1:
         told = " and ".join(f"({one.x_mm:.1f}, {one.y_mm:.1f}) mm" for one in near)
@@ -390,11 +380,17 @@ def matched(path: Path, settings: Settings, match: Match) -> SizeEstimate:
     return replace(looked, estimate=none)
 
 
-def places_on(tactile_map: TactileMap, places: Sequence[NamedPlace]) -> dict[str, tuple[float, float]]:
+def map_of_exam(path: Path, exam: Exam) -> TactileMap:
+    """The map of another exam, whose folder is beside that of this map."""
+    return read_map(path.parent.with_name(exam.name) / path.name)
+
+
+def places_on(tactile_map: TactileMap, path: Path, named: Sequence[Exam]) -> dict[str, tuple[float, float]]:
     """Where masses lie on a map, by their code: x and y in patient axes are kept; as they are without landmarks."""
     found, here = {}, tactile_map.patient_from_plane
-    for one in places:
-        there = read_map(one.path).patient_from_plane
+    for one in named:
+        assert one.centre_mm is not None
+        there = map_of_exam(path, one).patient_from_plane
         found[one.mass] = one.centre_mm
         if there is not None and here is not None:
             x_y = (there @ np.array([*one.centre_mm, 0.0, 1.0]))[:2]

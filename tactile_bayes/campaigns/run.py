@@ -27,7 +27,7 @@ from tactile_bayes.api.repeatability import ExamFolder
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, BatchStore, Outcome, run_batch
 from tactile_bayes.campaigns import steps
-from tactile_bayes.campaigns.exams import Breasts, Match, NamedPlace, Visits, grown_masses, visit_dates
+from tactile_bayes.campaigns.exams import Breasts, Match, Visits, grown_masses, visit_dates
 from tactile_bayes.campaigns.inputs import READ, SITE, Alike, read_sources, unchanged
 from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import TactileBayesError
@@ -269,30 +269,26 @@ class Campaign:
         """Task of the estimate, or of its figures."""
         settings = self.settings.of(exam)
         key = {"map": self._file("map", exam.name, MAP), **self._settings_key(settings, self._normalise(exam))}
-        places, match = self._places(exam), None
-        if places:
-            match = Match(exam.mass, places, self.settings.match_mm)
-            told = [[one.mass, one.exam, self._file("map", one.exam, MAP), one.centre_mm] for one in places]
+        named, match = self._named(exam), None
+        if named:
+            match = Match(exam.mass, tuple(named), self.settings.match_mm)
+            told = [[one.mass, one.name, self._file("map", one.name, MAP), one.centre_mm] for one in named]
             key["match"] = {"mass": exam.mass, "most_mm": match.most_mm, "places": told}
         make = steps.make_estimate if step == "estimate" else steps.make_figures
         return self._task(step, exam.name, key, partial(make, self._folder_of(exam), settings, match))
 
     def _placed(self, mapped: Sequence[Exam]) -> list[Exam]:
         """The exams without those whose mass is named by a place on a map that could not be made."""
-        lost = [exam for exam in mapped if self._breasts.named(exam) and not self._places(exam)]
+        lost = [exam for exam in mapped if self._breasts.named(exam) and not self._named(exam)]
         for exam in lost:
             named = ", ".join(one.name for one in self._breasts.named(exam) if one.mass == exam.mass)
             reason = f"the place of its mass is on the map of {named}, which was not made"
             self.faults[exam.name] = Fault("estimate", reason)
         return [exam for exam in mapped if exam not in lost]
 
-    def _places(self, exam: Exam) -> tuple[NamedPlace, ...]:
-        """Places of the breast's masses that other exams name, where this one names none."""
-        return tuple(
-            NamedPlace(one.mass, one.name, self._folder_of(one) / MAP, one.centre_mm)
-            for one in self._breasts.named(exam, of=self.keys["map"])
-            if one.centre_mm is not None
-        )
+    def _named(self, exam: Exam) -> list[Exam]:
+        """Exams with a map that name the places of the breast's masses, where this one names none."""
+        return self._breasts.named(exam, of=self.keys["map"])
 
     def _settings_key(self, settings: Settings, normalise: str) -> dict[str, Any]:
         """All that an estimate depends on besides its map: settings, and the digests of the files that they name."""

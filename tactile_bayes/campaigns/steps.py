@@ -20,7 +20,7 @@ from tactile_bayes.api.pooled import pool_answers
 from tactile_bayes.api.repeatability import ExamFolder, learn_from_exams
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
-from tactile_bayes.campaigns.exams import ARRAYS, OWN_AXES, Match, matched
+from tactile_bayes.campaigns.exams import ARRAYS, OWN_AXES, Match, map_of_exam, matched
 from tactile_bayes.declarations import EXACT, Record, field, from_plain, replace, rounded, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files import manifest_csv as layout
@@ -272,7 +272,7 @@ def _estimated(folder: Path, settings: Settings, match: Match | None) -> SizeEst
     if match is None:
         return estimate_file(folder / layout.MAP, settings)
     found = matched(folder / layout.MAP, settings, match)
-    maps = (found.tactile_map, *(read_map(one.path) for one in match.places))
+    maps = (found.tactile_map, *(map_of_exam(folder / layout.MAP, one) for one in match.named))
     if all(one.patient_from_plane is not None for one in maps):
         return found
     findings = by_weight((*found.estimate.findings, OWN_AXES))
