@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, Literal, get_args
 
-from tactile_bayes.declarations import Record, as_dict, from_plain, replace
+from tactile_bayes.declarations import Record, from_plain, replace, settle
 from tactile_bayes.errors import BadDataError
 
 Severity = Literal["caution", "check"]
@@ -66,21 +66,18 @@ LEADS: Final[Mapping[Severity, str]] = {"caution": "CAUTION: ", "check": "To che
 class Finding(Record):
     """Something that speaks against a result."""
 
-    kind: str  #: A key of `KINDS`.
+    severity: Severity  #: How much it weighs, by its kind.
+    kind: str  #: Which finding it is.
     text: str  #: One sentence in a clinician's words, without capital and full stop, and without a name of an option.
-    remedy: str = ""
+    remedy: str
     """The laboratory's terms where `text` leaves them out, and what to do at the command line; may be empty."""
-    on_paper: str = ""  #: The same for a reader of the page, who has no command line.
-    about: str = ""  #: What it is about, where a result is of several: "map 2", "visit 1"; else empty.
+    on_paper: str  #: The same for a reader of the page, who has no command line.
+    about: str  #: What it is about, where a result is of several: "map 2", "visit 1"; else empty.
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise BadDataError(f"finding of unknown kind {self.kind!r}", way_out=f"one of {', '.join(KINDS)}")
-
-    @property
-    def severity(self) -> Severity:
-        """How much it weighs, by its kind."""
-        return KINDS[self.kind]
+        settle(self, severity=KINDS[self.kind])
 
     def at(self, about: str) -> Finding:
         """The same finding, about one of several maps or visits."""
@@ -92,30 +89,10 @@ class Finding(Record):
         subject = f"{self.about}: " if self.about else ""
         return f"{subject}{self.text}{f'; {remedy}' if remedy else ''}"
 
-    @property
-    def entry(self) -> FindingEntry:
-        """The finding as files have it."""
-        return FindingEntry(self.severity, self.kind, self.text, self.remedy, self.on_paper, self.about)
 
-    def as_dict(self) -> dict[str, str]:
-        """Plain data, as files have it."""
-        return as_dict(self.entry)
-
-
-class FindingEntry(Record):
-    """A finding in a file, where its severity stands first."""
-
-    severity: Severity
-    kind: str
-    text: str
-    remedy: str
-    on_paper: str
-    about: str
-
-    @property
-    def finding(self) -> Finding:
-        """The finding; a `BadDataError` where this version does not know its kind."""
-        return Finding(self.kind, self.text, self.remedy, self.on_paper, self.about)
+def finding(kind: str, text: str, remedy: str = "", on_paper: str = "", about: str = "") -> Finding:
+    """A `Finding` with the severity of its kind, a key of `KINDS`."""
+    return Finding(KINDS.get(kind, "check"), kind, text, remedy, on_paper, about)
 
 
 def by_weight(findings: Iterable[Finding]) -> tuple[Finding, ...]:
@@ -150,8 +127,8 @@ def joined(texts: Sequence[str], *, most: int, lead: str) -> list[str]:
 
 
 def findings_in(listed: object) -> tuple[Finding, ...]:
-    """Findings as `Finding.as_dict` wrote them into a file; anything else is a `BadDataError`."""
-    return tuple(one.finding for one in from_plain(tuple[FindingEntry, ...], listed, where="findings"))
+    """Findings as files have them; anything else is a `BadDataError`."""
+    return from_plain(tuple[Finding, ...], listed, where="findings")
 
 
 def capital(text: str) -> str:

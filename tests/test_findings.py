@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.findings import Finding, by_weight, verdict
+from tactile_bayes.findings import by_weight, finding, verdict
 
-CAUTION = Finding("late_poses", "poses came late", remedy="--latency-ms auto", on_paper="map the scan again")
-CHECK = Finding("few_strokes", "the scan has 2 strokes only")
+CAUTION = finding("late_poses", "poses came late", remedy="--latency-ms auto", on_paper="map the scan again")
+CHECK = finding("few_strokes", "the scan has 2 strokes only")
 
 
 def test_a_caution_makes_a_result_doubtful_and_a_check_does_not():
@@ -28,4 +28,4 @@ def test_paper_never_reads_an_option():
 
 def test_an_unknown_kind_is_refused_with_the_kinds():
     with pytest.raises(BadDataError, match="finding of unknown kind 'nothing'"):
-        Finding("nothing", "text")
+        finding("nothing", "text")

@@ -17,7 +17,7 @@ from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import CANNOT_SHOW, EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
-from tactile_bayes.findings import Finding, Verdict, by_weight, finding_lines, verdict
+from tactile_bayes.findings import Finding, Verdict, by_weight, finding, finding_lines, verdict
 from tactile_bayes.inference.draws import Draws
 from tactile_bayes.options import GROWN_BY, Comparing
 from tactile_bayes.presets import REGISTRATION_MM
@@ -270,7 +270,7 @@ def _compared(
         reason = f"no landmarks show where the mass of visit {' and '.join(unknown)} lies in the patient"
         return Compared("not_one_mass", reason, "touch both landmarks, or say --same-mass", away)
     doubts += [f"no landmarks show where the mass of visit {number} lies" for number in unknown]
-    taken = [Finding("taken_as_one", f"{text}; taken as one mass because you say so") for text in doubts]
+    taken = [finding("taken_as_one", f"{text}; taken as one mass because you say so") for text in doubts]
     return _sized(found, calibration, settings, apart=away, doubts=taken)
 
 
@@ -318,7 +318,7 @@ def _sized(
     depths = None if fat is None else fat.apart([one.profile for maps in shapes for one in maps])
     findings = [
         *doubts,
-        *(Finding("outside_calibration", f"{UNLIKE_LEARNED}: {text}") for text in outside),
+        *(finding("outside_calibration", f"{UNLIKE_LEARNED}: {text}") for text in outside),
         *([] if depths is None else [fat_apart(depths)]),
     ]
     for number, (maps, at) in enumerate(zip(shapes, fitted, strict=True), start=1):

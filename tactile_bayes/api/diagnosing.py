@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tactile_bayes.api.arguments import PathLike, Told, door, path_of, required_path
+from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import UsageError, check_choice
 from tactile_bayes.files.posterior_nc import PosteriorDraws, read_posterior
 from tactile_bayes.findings import finding_lines
@@ -44,7 +45,7 @@ class Diagnosis(Told, eq=False):
             "chains": self.chains,
             "quantities": self.quantities,
             "research_use": RESEARCH_USE,
-            "findings": [one.as_dict() for one in self.posterior.findings],
+            "findings": [as_dict(one) for one in self.posterior.findings],
         }
 
     @property

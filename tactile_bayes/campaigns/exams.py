@@ -25,7 +25,7 @@ from tactile_bayes.files.map_nc import read_map, read_map_and_scans
 from tactile_bayes.files.reading import check_address, fetched, files_below, is_address
 from tactile_bayes.files.reports import Place
 from tactile_bayes.files.scan_mcap import provenance_of, scan_records
-from tactile_bayes.findings import Finding
+from tactile_bayes.findings import Finding, finding
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import on_map
 from tactile_bayes.posterior.result import Estimate
@@ -302,7 +302,7 @@ def _number(rows: Sequence[dict[str, Any]], listed: Iterable[Mapping[str, str]])
 # patient axes, or in the maps' own axes where a scan has no landmarks.
 
 SAME_MM: Final = 6.0  #: Centres on one map nearer than this are of one mass: candidates of a search are so far apart.
-OWN_AXES: Final = Finding(
+OWN_AXES: Final = finding(
     "own_axes", "its mass was matched by place in the maps' own axes, because a scan has no landmarks"
 )
 
@@ -417,7 +417,7 @@ def unnamed(masses: Sequence[Sequence[MassPlace]]) -> list[Finding]:
         if all(np.hypot(at.x - one.x, at.y - one.y) > SAME_MM for one in [*centres, *found]):
             found.append(at)
     return [
-        Finding("unnamed_mass", f"a mass at ({at.x:.1f}, {at.y:.1f}) mm on the map is named by no row") for at in found
+        finding("unnamed_mass", f"a mass at ({at.x:.1f}, {at.y:.1f}) mm on the map is named by no row") for at in found
     ]
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 import numpy as np
 
-from tactile_bayes.errors import BadDataError, in_file
+from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import load_json, parse_record
 from tactile_bayes.files.netcdf import open_netcdf
 from tactile_bayes.files.reading import first_bytes, is_json
@@ -112,7 +113,6 @@ def _from_netcdf(path: Path) -> Interval:
 
 MOST_MM: Final = 500.0  #: Sizes above it are no lump's.
 _SIZES: Final = ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm")
-_WAY_OUT: Final = "give the JSON as `estimate --json` printed it"
 R = TypeVar("R", bound=EstimateReport | PooledReport)
 Holder = EstimateReport | PooledReport | MassReport | AnotherExam
 
@@ -120,64 +120,51 @@ Holder = EstimateReport | PooledReport | MassReport | AnotherExam
 def checked_report(document: object, kind: type[R], *, path: Path) -> R:
     """What ``estimate --json`` printed for one map, or for several: its fields, and its sizes against each other."""
     report = parse_record(document, kind, path=path)
-    with in_file(path):
-        _check_sizes(report)
-        if isinstance(report, EstimateReport):
-            _check_masses(report)
-        made = verdict(report.findings, answered=report.max_size_mm is not None)
-        if report.verdict != made:
-            what = f"verdict is {report.verdict!r}, and its findings make it {made!r}"
-            raise BadDataError(what, way_out=_WAY_OUT)
+    if (fault := next(_faults(report), None)) is not None:
+        what, rule = fault
+        raise BadDataError(what, way_out=f"{rule}give the JSON as `estimate --json` printed it", path=str(path))
     return report
 
 
-def _check_sizes(report: EstimateReport | PooledReport) -> None:
+def _faults(report: EstimateReport | PooledReport) -> Iterator[tuple[str, str]]:
+    """What cannot be so, each with the rule that it breaks where its own words do not say it."""
     if report.status != "estimate" and report.max_size_mm is not None:
-        raise BadDataError(f"status is {report.status!r}, and there is a max_size_mm", way_out=_WAY_OUT)
-    for where, holder in _holders(report):
-        for name in _SIZES:
-            if (size := getattr(holder, name, None)) is not None:
-                _check_size(f"{where}{name}", size)
-        largest, smallest = holder.max_size_mm, holder.min_size_mm
-        if (largest is None) != (smallest is None):
-            raise BadDataError(f"{where}max_size_mm and min_size_mm are not both there", way_out=_WAY_OUT)
-        if largest is not None and smallest is not None and smallest.median > largest.median:
-            what = f"{where}min_size_mm is {smallest.median:g} mm and max_size_mm {largest.median:g} mm"
-            raise BadDataError(what, way_out=_WAY_OUT)
-
-
-def _holders(report: EstimateReport | PooledReport) -> Iterator[tuple[str, Holder]]:
-    """Whatever holds sizes, with its place in the document."""
-    found: list[tuple[str, EstimateReport | PooledReport | MassReport]] = [("", report)]
-    if isinstance(report, EstimateReport):
-        found += [(f"masses[{i}].", mass) for i, mass in enumerate(report.masses)]
-    for where, one in found:
-        yield where, one
-        if one.another_exam is not None:
-            yield f"{where}another_exam.", one.another_exam
-
-
-def _check_size(where: str, size: Quantity) -> None:
-    low, median, high = size.low, size.median, size.high
-    if not 0 < low <= high <= MOST_MM:
-        what = f"{where} has low {low:g} and high {high:g}"
-        raise BadDataError(what, way_out=f"ends of an interval rise from above 0 to at most {MOST_MM:g} mm; {_WAY_OUT}")
-    if size.kind == "eti" and not low <= median <= high:
-        what = f"{where} has median {median:g} outside its interval of {low:g} to {high:g} mm"
-        raise BadDataError(what, way_out=_WAY_OUT)
-    if not 0 < median <= MOST_MM:
-        raise BadDataError(f"{where} has median {median:g}", way_out=_WAY_OUT)
-
-
-def _check_masses(report: EstimateReport) -> None:
-    """Each mass has its own number, one at most is the reported one, and that has the document's sizes."""
-    numbers = [one.number for one in report.masses]
+        yield f"status is {report.status!r}, and there is a max_size_mm", ""
+    masses = report.masses if isinstance(report, EstimateReport) else ()
+    holders: list[tuple[str, Holder]] = [("", report), *((f"masses[{i}].", mass) for i, mass in enumerate(masses))]
+    for where, holder in holders:
+        yield from _of_sizes(where, holder)
+        if (another := getattr(holder, "another_exam", None)) is not None:
+            yield from _of_sizes(f"{where}another_exam.", another)
+    numbers = [one.number for one in masses]
     if len(set(numbers)) < len(numbers):
-        raise BadDataError(f"masses are numbered {', '.join(map(str, numbers[:9]))}", way_out=_WAY_OUT)
-    reported = [(i, one) for i, one in enumerate(report.masses) if one.reported]
+        yield f"masses are numbered {', '.join(map(str, numbers[:9]))}", ""
+    reported = [i for i, one in enumerate(masses) if one.reported]
     if len(reported) > 1:
-        raise BadDataError(f"{len(reported)} masses are the reported one", way_out=_WAY_OUT)
-    for i, one in reported:
-        for name in ("max_size_mm", "min_size_mm"):
-            if getattr(one, name) != getattr(report, name):
-                raise BadDataError(f"masses[{i}].{name} is not the document's, of the same mass", way_out=_WAY_OUT)
+        yield f"{len(reported)} masses are the reported one", ""
+    for i, name in product(reported, ("max_size_mm", "min_size_mm")):
+        if getattr(masses[i], name) != getattr(report, name):
+            yield f"masses[{i}].{name} is not the document's, of the same mass", ""
+    made = verdict(report.findings, answered=report.max_size_mm is not None)
+    if report.verdict != made:
+        yield f"verdict is {report.verdict!r}, and its findings make it {made!r}", ""
+
+
+def _of_sizes(where: str, holder: Holder) -> Iterator[tuple[str, str]]:
+    """Faults of whatever holds sizes, by its place in the document."""
+    for name in _SIZES:
+        size: Quantity | None = getattr(holder, name, None)
+        if size is None:
+            continue
+        low, median, high, ends = size.low, size.median, size.high, "ends of an interval rise from above 0 to at most"
+        if not 0 < low <= high <= MOST_MM:
+            yield f"{where}{name} has low {low:g} and high {high:g}", f"{ends} {MOST_MM:g} mm; "
+        if size.kind == "eti" and not low <= median <= high:
+            yield f"{where}{name} has median {median:g} outside its interval of {low:g} to {high:g} mm", ""
+        if not 0 < median <= MOST_MM:
+            yield f"{where}{name} has median {median:g}", ""
+    largest, smallest = holder.max_size_mm, holder.min_size_mm
+    if (largest is None) != (smallest is None):
+        yield f"{where}max_size_mm and min_size_mm are not both there", ""
+    if largest is not None and smallest is not None and smallest.median > largest.median:
+        yield f"{where}min_size_mm is {smallest.median:g} mm and max_size_mm {largest.median:g} mm", ""

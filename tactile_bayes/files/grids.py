@@ -15,7 +15,7 @@ from tactile_bayes.files import text_lines
 from tactile_bayes.files.arrays_layout import GridOptions
 from tactile_bayes.files.images import read_image
 from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, AXES, Grid, read_named, turned_by_axes
-from tactile_bayes.findings import Finding
+from tactile_bayes.findings import finding
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap, block_sums
 from tactile_bayes.posterior.draw import SamplerSettings
@@ -426,7 +426,7 @@ def _divided(made: TactileMap, level: float | str) -> TactileMap:
         raise BadDataError(f"the level is {by:.4g}", way_out="subtract the offset of the readings first")
     unit = made.recipe.units
     text = f"values were divided by {by:.4g}{f' {unit}' if unit else ''}, the level beside the highest bump of the map"
-    found = Finding("level_fitted", f"{text}; what the hand's pressure changed between frames is still in them")
+    found = finding("level_fitted", f"{text}; what the hand's pressure changed between frames is still in them")
     divided = replace(
         made,
         mean=made.mean / by,

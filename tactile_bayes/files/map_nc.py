@@ -20,7 +20,7 @@ from tactile_bayes.files.documents import parse_json
 from tactile_bayes.files.netcdf import Contents, Group, Variable, grouped_netcdf_bytes, open_netcdf
 from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.files.reading import CELLS, check_limit
-from tactile_bayes.findings import FindingEntry
+from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.scans import HeadShape
@@ -62,7 +62,7 @@ class MapHeader(Record, kw_only=True):
     masked_taxels: tuple[str, ...]
     head: HeadShape | UnsetType = UNSET
     nipple_mm: tuple[float, float, float] | UnsetType = UNSET
-    findings: tuple[FindingEntry, ...]
+    findings: tuple[Finding, ...]
     provenance: dict[str, Any]
 
 
@@ -135,7 +135,7 @@ def read_map_and_header(path: Path) -> tuple[TactileMap, MapHeader]:
             quality={name: math.nan if value is None else value for name, value in header.quality.items()},
             head=None if isinstance(header.head, UnsetType) else header.head,
             nipple_mm=None if isinstance(header.nipple_mm, UnsetType) else np.array(header.nipple_mm),
-            findings=tuple(one.finding for one in header.findings),
+            findings=header.findings,
         )
         return tactile_map, header
 
@@ -151,7 +151,7 @@ def _attributes(tactile_map: TactileMap, provenance: Provenance) -> dict[str, st
         quality={name: float(v) if np.isfinite(v) else None for name, v in tactile_map.quality.items()},
         head=UNSET if tactile_map.head is None else tactile_map.head,
         nipple_mm=UNSET if tactile_map.nipple_mm is None else tuple(tactile_map.nipple_mm.tolist()),
-        findings=tuple(one.entry for one in tactile_map.findings),
+        findings=tactile_map.findings,
         provenance=provenance.as_dict(),
     )
     plain = to_plain(header, digits=EXACT)

@@ -20,7 +20,7 @@ from tactile_bayes.declarations import (
 )
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.documents import dump_json
-from tactile_bayes.findings import Finding, FindingEntry, Verdict
+from tactile_bayes.findings import Finding, Verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.clock import Position
 from tactile_bayes.options import Above0, Least0
@@ -36,9 +36,7 @@ ReasonCode = Literal[
     "", "empty", "undetected", "ridge", "cannot_show", "unresolved", "window", "prior", "extrapolated", "method"
 ]
 Shape = Literal["round", "ellipse", "rotated"]
-Entries = Annotated[
-    tuple[FindingEntry, ...], says("What speaks against the result, cautions first; see docs/formats.md")
-]
+Findings = Annotated[tuple[Finding, ...], says("What speaks against the result, cautions first; see docs/formats.md")]
 Judgement = Annotated[Verdict, says("no_answer: there is no size; doubtful: a caution stands")]
 
 
@@ -61,12 +59,6 @@ class Report(Sized, kw_only=True):
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}, {getattr(self, 'verdict', '')}>"
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """What speaks against the result, cautions first."""
-        entries: tuple[FindingEntry, ...] = getattr(self, "entries", ())
-        return tuple(one.finding for one in entries)
 
     @property
     def document(self) -> dict[str, Any]:
@@ -324,7 +316,7 @@ class EstimateReport(Report, kw_only=True):
     schema: Literal["tactile-bayes/estimate/1"]
     status: Literal["estimate", "no_estimate"]
     verdict: Judgement
-    entries: Entries = field(name="findings")
+    findings: Findings
     reason: str
     reason_code: ReasonCode = ""
     advice: str = ""
@@ -415,7 +407,7 @@ class PooledReport(Report, kw_only=True):
     status: Literal["estimate", "no_estimate", "maps_disagree"]
     """maps_disagree: each map has its size, and they are not of one size or not at one place"""
     verdict: Judgement
-    entries: Entries = field(name="findings")
+    findings: Findings
     reason: str
     max_size_mm: Quantity | None
     min_size_mm: Quantity | None

@@ -21,14 +21,14 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from tactile_bayes import __version__, scans
-from tactile_bayes.declarations import Record, from_plain
+from tactile_bayes.declarations import Record, as_dict, from_plain
 from tactile_bayes.errors import BadDataError, UsageError, in_file
 from tactile_bayes.files.atomic import atomic_path, refuse_existing
 from tactile_bayes.files.documents import check_session, parse_json
 from tactile_bayes.files.instrument import calibration_document, head_document
 from tactile_bayes.files.mcap_records import McapRecords, Messages, read_records
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.findings import Finding, findings_in
+from tactile_bayes.findings import Finding, finding, findings_in
 from tactile_bayes.geometry import FloatArray
 
 # --- Scan files: MCAP that Foxglove opens, readable after the recording program was killed.
@@ -82,7 +82,7 @@ class ScanWriter:
         told = {
             "provenance": provenance.as_dict(),
             "truth": truth,
-            "findings": [one.as_dict() for one in findings] or None,
+            "findings": [as_dict(one) for one in findings] or None,
         }
         units = {"length_unit": "mm", "time_unit": "ns", "pressure": "raw counts"}
         self._writer.add_metadata("tactile-bayes", {"schema": SCAN_SCHEMA, **units})
@@ -290,8 +290,8 @@ def file_findings(records: McapRecords) -> tuple[Finding, ...]:
     """Losses of a scan's file, notes of its recorder, and findings of the file that it is a copy of."""
     kept = parse_json(records.metadata.get("findings", {}).get("json", "[]"), name="findings")
     noted = records.metadata.get("recording", {}).get("cautions", "").splitlines()
-    lost = [Finding("data_lost", text) for text in records.lost]
-    return (*findings_in(kept), *lost, *(Finding("recorder_noted", text) for text in noted))
+    lost = [finding("data_lost", text) for text in records.lost]
+    return (*findings_in(kept), *lost, *(finding("recorder_noted", text) for text in noted))
 
 
 def provenance_of(records: McapRecords) -> dict[str, Any]:

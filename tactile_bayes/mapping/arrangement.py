@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 
 from tactile_bayes.declarations import Record, field, replace
-from tactile_bayes.findings import Finding, finding_lines
+from tactile_bayes.findings import Finding, finding, finding_lines
 from tactile_bayes.geometry import FloatArray, apply, inverse, principal_axes
 from tactile_bayes.mapping import convention
 from tactile_bayes.mapping.cells import FramePoses, poses_at
@@ -75,7 +75,7 @@ _LEAST_SWAY_HALFWAY: Final = 0.1
 _SWAY_NUMBERS: Final = 5  # that are fitted: a rate, and cosine and sine along two axes
 _LEAST_OTHERS: Final = 2  #: Readings of other times that predict one.
 NOTHING_SHOWN: Final = "too little stands out to show that array, lever arm and quaternions are as stated"
-NOT_CHECKED: Final = Finding(
+NOT_CHECKED: Final = finding(
     "arrangement_unknown",
     "how the sensor array and the tracker are mounted was never checked, and this scan does not show it",
     "scan a phantom with a lump once, run `tactile-bayes check PHANTOM.mcap -o HEAD.json`, and give --head-geometry "
@@ -220,7 +220,7 @@ class ArrangementCheck(Record, eq=False):
             return NOTHING_SHOWN, None
         if self.contradicting:
             words = f"frames contradict each other by {best} where they overlap, in every arrangement tried"
-            return words, Finding(
+            return words, finding(
                 "frames_contradict",
                 "strokes over one place do not agree on what they felt there; size and place may be wrong",
                 "check the lever arm, both clocks, and that the breast lay still",
@@ -231,20 +231,20 @@ class ArrangementCheck(Record, eq=False):
         odds = f"(odds {odds_words(self.log_odds)}): overlapping frames agree to {best} if so, to {stated} as stated"
         words = f"{self.best.in_words} {odds}"
         if self.best.late_ms:
-            return words, Finding(
+            return words, finding(
                 "late_poses",
                 "the tracker's times do not fit those of the sensor array; size and place may be wrong",
                 f"map it with --latency-ms {self.asked_ms + self.best.late_ms:.0f}",
                 "have the scan mapped again with the tracker's delay",
             )
         if self.best.sway_mm:
-            return words, Finding(
+            return words, finding(
                 "frames_contradict",
                 "the body moved to and fro during the scan, as breathing moves it; size and place may be wrong",
                 "record with a reference tool on the body (--reference), or have the breath held",
                 "have the scan taken again with the breath held",
             )
-        return words, Finding(
+        return words, finding(
             "wrong_arrangement",
             "the sensor array or the tracker seems not to be mounted as stated; size and place may be wrong",
             convention.import_again(self.best.corrections),

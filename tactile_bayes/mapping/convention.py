@@ -11,7 +11,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.findings import Finding
+from tactile_bayes.findings import Finding, finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, inverse, rotation_from_quaternion
 from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, Projection
 from tactile_bayes.mapping.select import SelectedFrames, chunks
@@ -250,11 +250,11 @@ def convention_findings(quality: Mapping[str, float], told: Iterable[Finding] = 
             f"against {quality['normal_agreement']:.3f} as they are told; check them; to change them, "
             f"{import_again(CONVENTIONS[other])}"
         )
-        return (Finding("wrong_rotations", text, remedy, "have the tracker's settings checked"),)
+        return (finding("wrong_rotations", text, remedy, "have the tracker's settings checked"),)
     if "normal_agreement" not in quality and "plane_rms_mm" in quality:
         text = "whether the tracker's rotations are read rightly does not show in this scan"
         remedy = "check that the quaternions are scalar first and from sensor to base"
-        return (Finding("rotations_unknown", text, remedy, "scan a phantom with a lump once and have it checked"),)
+        return (finding("rotations_unknown", text, remedy, "scan a phantom with a lump once and have it checked"),)
     return ()
 
 

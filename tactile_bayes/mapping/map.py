@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Meta, Record, field, settle
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.findings import Finding, capital
+from tactile_bayes.findings import Finding, capital, finding
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.scans import HeadShape
 
@@ -211,7 +211,7 @@ def broken_assumptions(quality: Mapping[str, float]) -> Iterator[Finding]:
         else:
             remedy, again = "--latency-ms auto", "with the tracker's delay estimated"
         kind = "lump_dragged" if lag > 0 else "late_poses"
-        yield Finding(kind, text, f"map again with {remedy}", f"have the scan mapped again {again}")
+        yield finding(kind, text, f"map again with {remedy}", f"have the scan mapped again {again}")
     if change := _beyond(quality, "profile_change", "profile_change_sd", MOST_PROFILE_CHANGE):
         far = change > BROKEN_PROFILE_CHANGE  # so far that sizes fail
         end = "the size may be off by more than its interval" if far else "the size is for even fat"
@@ -220,7 +220,7 @@ def broken_assumptions(quality: Mapping[str, float]) -> Iterator[Finding]:
             "pressure falls off from the head's middle): the fat is of uneven depth, "
             f"or a rib or another lump lies near; {end}"
         )
-        yield Finding("uneven_fat" if far else "slightly_uneven_fat", text)
+        yield finding("uneven_fat" if far else "slightly_uneven_fat", text)
     curvature = quality.get("skin_curvature_per_m", 0.0)
     if abs(curvature) > MOST_CURVATURE_PER_M:
         text = (
@@ -228,14 +228,14 @@ def broken_assumptions(quality: Mapping[str, float]) -> Iterator[Finding]:
             f"{1000 / abs(curvature):.0f} mm), and sizes are for flat skin (on radii of 75 and 150 mm simulated ones "
             "moved by 7 %)"
         )
-        yield Finding("curved_skin", text)
+        yield finding("curved_skin", text)
     strokes = quality.get("stroke_count", LEAST_STROKES)
     if strokes < LEAST_STROKES:
         text = (
             f"the scan has {strokes:.0f} stroke{'' if strokes == 1 else 's'} only, and sizes were learned from 4 to 7 "
             "(simulated ones from 3 came out 6 % large)"
         )
-        yield Finding("few_strokes", text)
+        yield finding("few_strokes", text)
 
 
 def handling_findings(quality: Mapping[str, float]) -> Iterator[Finding]:
@@ -243,26 +243,26 @@ def handling_findings(quality: Mapping[str, float]) -> Iterator[Finding]:
     if quality.get("saturated_readings"):
         number = f"{quality['saturated_readings']:.0f} readings"
         text = f"{number} were pressed beyond the array's range and left out: the map is too low there"
-        yield Finding("saturated_readings", text)
+        yield finding("saturated_readings", text)
     if quality.get("clipped_values"):
-        yield Finding("clipped_values", f"{quality['clipped_values']:.0f} values beyond the map's range were clipped")
+        yield finding("clipped_values", f"{quality['clipped_values']:.0f} values beyond the map's range were clipped")
     if quality.get("gain_unsettled"):
         text = "how hard each frame was pressed could not be evened out: too few strokes overlap"
         remedy = "the frames' gains had not settled: use --normalise mean, or scan with overlapping strokes"
-        yield Finding("unsettled_gains", text, remedy, "scan with overlapping strokes")
+        yield finding("unsettled_gains", text, remedy, "scan with overlapping strokes")
     if quality.get("coverage", 1.0) < LEAST_COVERAGE:
         text = f"only {100 * quality['coverage']:.0f} % of the map's rectangle is covered"
         add = "add strokes side by side"
-        yield Finding("low_coverage", text, f"{add}, or use larger cells", add)
+        yield finding("low_coverage", text, f"{add}, or use larger cells", add)
     if quality.get("tilt_deg", 0.0) > MOST_TILT_DEG:
         text = f"the head's face was tilted by {quality['tilt_deg']:.0f} degrees against its motion"
         check = "check the tracker's lever arm and quaternion order"
-        yield Finding("tilted_head", text, check, "hold it flat; if it was, have the tracker's mounting checked")
+        yield finding("tilted_head", text, check, "hold it flat; if it was, have the tracker's mounting checked")
     if quality.get("yaw_sd_deg", 0.0) > MOST_YAW_DEG:
         text = (
             f"the head was turned by {quality['yaw_sd_deg']:.0f} degrees (SD): the lump's length and breadth are mixed"
         )
-        yield Finding("turned_head", text)
+        yield finding("turned_head", text)
 
 
 def skewed(quality: Mapping[str, float]) -> str:

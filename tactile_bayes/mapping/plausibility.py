@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.findings import Finding
+from tactile_bayes.findings import Finding, finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, principal_axes
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
 from tactile_bayes.mapping.select import SelectedFrames, chunks, frame_figures, refuse_without_frames, timing_figures
@@ -209,7 +209,7 @@ def map_findings(tactile_map: TactileMap) -> tuple[Finding, ...]:
 def _finding(kind: str, text: str, remedy: str) -> Finding:
     """A finding whose remedy is the examiner's, or for those who look after the devices."""
     own = not remedy or remedy.startswith(("press ", "scan "))
-    return Finding(kind, text, remedy, remedy if own else "have the sensor, the tracker and the recording checked")
+    return finding(kind, text, remedy, remedy if own else "have the sensor, the tracker and the recording checked")
 
 
 def _unlike(quality: Mapping[str, float], head: HeadShape | None) -> Iterator[tuple[str, str]]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.findings import Finding
+from tactile_bayes.findings import Finding, finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 from tactile_bayes.mapping import cells
 from tactile_bayes.presets import KPA_PER_UNIT, PRESSURE_WINDOW_KPA
@@ -294,8 +294,8 @@ def scan_findings(scan: Scan) -> tuple[Finding, ...]:
     found = with_times(scan.findings, Span.of(scan.frames.time_s), Span.of(scan.poses.time_s))
     jumps = Jumps.of(scan.poses).cautions()  # the recorder noted them too
     kept = [one for one in found if one.text not in jumps]
-    frozen = (Finding("times_apart", text) for text in _frozen_cautions(scan.poses))
-    return (*kept, *frozen, *(Finding("poses_jump", text) for text in jumps))
+    frozen = (finding("times_apart", text) for text in _frozen_cautions(scan.poses))
+    return (*kept, *frozen, *(finding("poses_jump", text) for text in jumps))
 
 
 def _frozen_cautions(poses: TrackerPoses) -> list[str]:
@@ -318,7 +318,7 @@ def with_times(findings: Sequence[Finding], frames: Span, poses: Span) -> tuple[
     """Findings of a scan's file, and of its times where its recorder did not note them."""
     cautions = overlap_cautions(frames, poses)
     told = [one for one in findings if one.text not in cautions]
-    return (*told, *(Finding("times_apart", text) for text in cautions))
+    return (*told, *(finding("times_apart", text) for text in cautions))
 
 
 # --- Selection of the frames that go into a map, and the reasons for leaving others out (paper step ii, the gate).

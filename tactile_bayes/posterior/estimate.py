@@ -11,7 +11,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import NO_LUMP, Abstention, BadDataError, NotConvergedError
-from tactile_bayes.findings import Finding, by_weight
+from tactile_bayes.findings import Finding, by_weight, finding
 from tactile_bayes.inference.ensemble import convergence
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plausibility import map_findings
@@ -213,7 +213,7 @@ OTHER_HEAD = (
     "calibrate size population.csv --form eq6-residual -o size.json`, and give --size-calibration size.json"
 )
 """How to make a calibration for another head."""
-_IRREGULAR = Finding(
+_IRREGULAR = finding(
     "irregular",
     "irregular outline, unlike a ball's or an ellipsoid's: two lumps that touch, or an upright, tilted or rough one "
     "look so, and the interval is wider",
@@ -403,13 +403,13 @@ def _findings(made: MapDraws, *, cell_mm: float) -> Iterator[Finding]:
     if calibration is not None:
         beyond = [] if made.size is None else calibration.beyond_lumps(made.size.median_mm)
         for text in (*calibration.outside(*posterior.medians), *beyond):
-            yield Finding("outside_calibration", f"{terms.UNLIKE_LEARNED}: {text}")
+            yield finding("outside_calibration", f"{terms.UNLIKE_LEARNED}: {text}")
     if posterior.irregular:
         yield _IRREGULAR
     if cell_mm > CELL_PER_SIGMA * min(posterior.medians[1:]):
         text = f"the map's cells of {cell_mm:g} mm are coarse for so small a lump"
         remedy, on_paper = "map again with a smaller --cell-mm", "have the scan mapped again with smaller cells"
-        yield Finding("coarse_cells", text, remedy, on_paper)
+        yield finding("coarse_cells", text, remedy, on_paper)
     offset = made.figures.get("level_offset")
     if offset is not None and abs(offset) >= _NEAR_LEVEL:
         text = (
@@ -417,7 +417,7 @@ def _findings(made: MapDraws, *, cell_mm: float) -> Iterator[Finding]:
             "bears on the head (a rib, a second mass), or the lump is large for it; the size is less certain than the "
             "interval says"
         )
-        yield Finding("uneven_level", text)
+        yield finding("uneven_level", text)
 
 
 def _left_out(tactile_map: TactileMap, options: SamplerSettings, made: MapDraws) -> tuple[str, ...]:

@@ -8,9 +8,9 @@ from typing import Annotated, Any, Final, Literal
 import numpy as np
 from scipy.special import ndtri
 
-from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, field
+from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.files.reports import Chance, Entries, EstimateReport, Interval, Judgement, Number1, Report
+from tactile_bayes.files.reports import Chance, EstimateReport, Findings, Interval, Judgement, Number1, Report
 from tactile_bayes.findings import capital, finding_lines, finding_summary
 from tactile_bayes.findings import verdict as verdict_of
 from tactile_bayes.inference.draws import Quantity
@@ -142,7 +142,7 @@ class CompareReport(Report, kw_only=True):
     status: Literal["compared", "not_one_mass", "no_estimate"]
     """not_one_mass: the visits were not shown to be of one mass; no_estimate: a visit has no size."""
     verdict: Judgement
-    entries: Entries = field(name="findings")
+    findings: Findings
     reason: str  #: Why nothing is compared; empty otherwise.
     advice: str  #: What would help where nothing is compared.
     visits: Annotated[tuple[Visit, ...], Meta(min_length=2)]
@@ -203,7 +203,7 @@ def compare_report(
         schema=COMPARE,
         status=compared.status,
         verdict=verdict_of(compared.findings, answered=joint is not None),
-        entries=tuple(one.entry for one in compared.findings),
+        findings=compared.findings,
         reason=compared.reason,
         advice=compared.advice,
         visits=tuple(

@@ -13,7 +13,7 @@ from tactile_bayes.declarations import as_dict, rounded
 from tactile_bayes.files import reports
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import EstimateReport, MassReport
-from tactile_bayes.findings import Finding, capital, verdict
+from tactile_bayes.findings import Finding, capital, finding, verdict
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.inference.draws import Quantity, summarise
 from tactile_bayes.mapping.clock import SIDES, ClockPosition, Position, clock_position, clock_text
@@ -120,7 +120,7 @@ def side_findings(side: str, patient_mm: tuple[float, float] | None) -> tuple[Fi
     if other == side:
         return ()
     place = f"the landmarks put the lump {abs(patient_mm[0]):.0f} mm to the patient's {other} of the xiphoid"
-    return (Finding("side", f"the scan says {side} breast, and {place}: side or landmarks are wrong"),)
+    return (finding("side", f"the scan says {side} breast, and {place}: side or landmarks are wrong"),)
 
 
 # --- Masses of a map that may be one lump: whether they touch, and how long they are together.
@@ -161,7 +161,7 @@ def together_words(pair: reports.Touching) -> str:
 def touching_findings(pairs: Sequence[reports.Touching]) -> list[Finding]:
     """Which masses may be one lump."""
     return [
-        Finding("touching", "masses {} and {} may be one lump: ".format(*one.masses) + together_words(one))
+        finding("touching", "masses {} and {} may be one lump: ".format(*one.masses) + together_words(one))
         for one in pairs
     ]
 
@@ -458,7 +458,7 @@ def estimate_report(
         schema=reports.ESTIMATE,
         status=estimate.status,
         verdict=verdict(estimate.findings, answered=size is not None),
-        entries=tuple(one.entry for one in estimate.findings),
+        findings=estimate.findings,
         reason=estimate.reason,
         reason_code=cast("reports.ReasonCode", estimate.code),
         advice=estimate.advice,

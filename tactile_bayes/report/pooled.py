@@ -9,7 +9,7 @@ import numpy as np
 from tactile_bayes.declarations import UNSET
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
 from tactile_bayes.files.reports import POOLED, EstimateReport, Interval, MassReport, PooledMap, PooledReport
-from tactile_bayes.findings import Finding, capital, finding_lines, finding_summary, verdict
+from tactile_bayes.findings import Finding, capital, finding, finding_lines, finding_summary, verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.presets import MATCH_MM, RESEARCH_USE
@@ -105,7 +105,7 @@ def pooled_report(
         schema=POOLED,
         status=pooled.status,
         verdict=verdict(pooled.findings, answered=size is not None),
-        entries=tuple(one.entry for one in pooled.findings),
+        findings=pooled.findings,
         reason=pooled.reason,
         max_size_mm=largest,
         min_size_mm=smallest,
@@ -152,21 +152,21 @@ def pooled_findings(pooled: PooledEstimate, reports: Sequence[EstimateReport]) -
                 yield one.at(_number(index))
     apart = apart_from_others(reports)
     for index, words in (apart or {}).items():
-        yield Finding("another_mass", words, about=_number(index))
+        yield finding("another_mass", words, about=_number(index))
     for index, earlier in repeated_scans([scans_of(one.provenance) for one in reports]).items():
         words = f"a map of the same scan as {_number(earlier)} is no repeat: the interval is too narrow"
-        yield Finding("same_scan", words, about=_number(index))
+        yield finding("same_scan", words, about=_number(index))
     if pooled.fat_apart_mm is not None:
         yield fat_apart(pooled.fat_apart_mm)
     for text in pooled.outside:
-        yield Finding("outside_calibration", f"{UNLIKE_LEARNED}: {text}")
+        yield finding("outside_calibration", f"{UNLIKE_LEARNED}: {text}")
     for index in pooled.outlying:
-        yield Finding("outlying", "lies apart from the others: look at this map", about=_number(index))
+        yield finding("outlying", "lies apart from the others: look at this map", about=_number(index))
     for index, report in enumerate(reports):
         for rise in () if apart == {} else report.other_rises:
             text = f"another rise stands at ({rise.x_mm:.1f}, {rise.y_mm:.1f}) mm"
             same = "check that every map was sized at the same mass"
-            yield Finding("several_masses", text, same, same, _number(index))
+            yield finding("several_masses", text, same, same, _number(index))
 
 
 def disagreement(what: str, probability: float, if_exams_differ: float | None = None) -> Finding:
@@ -176,7 +176,7 @@ def disagreement(what: str, probability: float, if_exams_differ: float | None = 
         patients = f" ({chance_text(if_exams_differ, 3)} if exams differ as those of patients did)"
     text = f"{what}; one mass gives maps so far apart with a probability of {chance_text(probability, 3)}{patients}"
     on_paper = "look at each map: one may be of another mass or of another day"
-    return Finding("maps_disagree", text, f"{on_paper}, or exams differ more at this site (--repeatability)", on_paper)
+    return finding("maps_disagree", text, f"{on_paper}, or exams differ more at this site (--repeatability)", on_paper)
 
 
 def _number(index: int) -> str:
@@ -187,7 +187,7 @@ def _number(index: int) -> str:
 def fat_apart(depths_mm: tuple[float, float]) -> Finding:
     """Caution where maps differ too much in the depth of fat to be of one breast."""
     text = "the fat under the head is {:.1f} mm deep on one map and {:.1f} mm on another: they may be of two bodies"
-    return Finding("fat_apart", text.format(*depths_mm))
+    return finding("fat_apart", text.format(*depths_mm))
 
 
 def pooled_summary(report: PooledReport) -> str:

@@ -16,7 +16,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import read_map, read_map_and_header
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
-from tactile_bayes.findings import Finding
+from tactile_bayes.findings import finding
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.map import map_summary
@@ -90,7 +90,7 @@ def test_a_verdict_leads_and_laboratory_figures_are_for_v(folder, run_cli):
 
 def test_a_caution_makes_the_verdict_doubtful():
     sound = build_map(small_scan())
-    late = replace(sound, findings=(*sound.findings, Finding("late_poses", "poses came late")))
+    late = replace(sound, findings=(*sound.findings, finding("late_poses", "poses came late")))
     assert [map_summary(one, written="a.nc").split(":")[0] for one in (sound, late)] == ["sound", "CAUTION"]
     assert "\ndoubtful: 115 of 120" in map_summary(late, written="a.nc")
 

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 from export_files import exported
 
-from tactile_bayes.declarations import from_plain, replace
+from tactile_bayes.declarations import as_dict, from_plain, replace
 from tactile_bayes.exports.exam import masses_of
 from tactile_bayes.files.reports import EstimateReport, Place
-from tactile_bayes.findings import Finding
+from tactile_bayes.findings import finding
 
 bundles = pytest.importorskip("fhir.resources.R4B.bundle")
 
@@ -130,7 +130,7 @@ def test_cells_too_large_are_no_verdict_on_the_breast(exam: Path, tmp_path: Path
 def test_markup_in_words_stays_words(estimate: dict[str, Any], tmp_path: Path) -> None:
     hostile = estimate | {
         "verdict": "doubtful",
-        "findings": [Finding("side", "<script>alert(1)</script>").as_dict()],
+        "findings": [as_dict(finding("side", "<script>alert(1)</script>"))],
     }
     (tmp_path / "h.json").write_text(json.dumps(hostile))
     (report,) = resources(bundle(tmp_path, tmp_path / "b.json", "h.json"), "DiagnosticReport")

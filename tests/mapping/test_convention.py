@@ -10,7 +10,7 @@ import pytest
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.findings import Finding
+from tactile_bayes.findings import finding
 from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid, rotation_from_quaternion
 from tactile_bayes.mapping import convention
 from tactile_bayes.mapping.build import build_map
@@ -146,6 +146,6 @@ def test_rotations_that_the_frames_ask_for_too_are_told_once():
     doubted = {"other_convention": 2.0, "other_agreement": 0.999, "normal_agreement": 0.95}
     (alone,) = convention_findings(doubted)
     assert "import the scan again with --correct inverse-rotation" in alone.remedy
-    asked = Finding("wrong_arrangement", "words", import_again(["rows-reversed", "inverse-rotation"]))
+    asked = finding("wrong_arrangement", "words", import_again(["rows-reversed", "inverse-rotation"]))
     assert convention_findings(doubted, [asked]) == ()
     assert convention_findings(doubted, [replace(asked, remedy=import_again(["rows-reversed"]))]) == (alone,)

@@ -22,7 +22,7 @@ from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
-from tactile_bayes.findings import Finding
+from tactile_bayes.findings import finding
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior import masses as masses_module
 from tactile_bayes.posterior.bump import Detection
@@ -90,7 +90,7 @@ def test_a_shoulder_sized_larger_than_the_lump_beside_it_is_not_reported() -> No
 
 def ranked(*masses: tuple[float, float | None, float, bool]) -> list[int]:
     """Order of masses of some amplitude, size, evidence, and whether the calibration holds them."""
-    outside = (Finding("outside_calibration", "outside"),)
+    outside = (finding("outside_calibration", "outside"),)
     found = []
     for amplitude, size, evidence, held in masses:
         draws = None if size is None else SizePosterior(*[np.full((1, 3), size)] * 2, {}, 0, np.zeros(3))

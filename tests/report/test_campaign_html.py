@@ -17,7 +17,7 @@ from posterior_maps import bump_map
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.reports import EstimateReport, Point
-from tactile_bayes.findings import Finding, finding_lines
+from tactile_bayes.findings import Finding, finding, finding_lines
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.presets import RESEARCH_USE
@@ -66,7 +66,7 @@ def page_of(*rows: MassRow) -> str:
 
 
 def told(text: str) -> tuple[Finding, ...]:
-    return (Finding("side", text, about=text), Finding("few_strokes", text, on_paper=text))
+    return (finding("side", text, about=text), finding("few_strokes", text, on_paper=text))
 
 
 def row_of(text: str) -> MassRow:
@@ -117,8 +117,8 @@ def test_the_worst_come_first_as_the_page_says() -> None:
     rows = [
         mass("narrow", sized(narrow), size=narrow),
         mass("wide", sized(SIZE), size=SIZE),
-        mass("checked", sized(SIZE, Finding("few_strokes", "a"), Finding("curved_skin", "b")), size=SIZE),
-        mass("doubtful", sized(SIZE, Finding("side", "a")), size=SIZE),
+        mass("checked", sized(SIZE, finding("few_strokes", "a"), finding("curved_skin", "b")), size=SIZE),
+        mass("doubtful", sized(SIZE, finding("side", "a")), size=SIZE),
         mass("one lost", sized(narrow), failed, size=narrow),
         mass("empty", ExamEntry("visit 1, exam 1", "no lump")),
         mass("lost", failed),
@@ -129,7 +129,7 @@ def test_the_worst_come_first_as_the_page_says() -> None:
 
 
 def test_a_mass_is_of_its_last_visit_and_names_the_exams_that_a_finding_is_of() -> None:
-    doubt = Finding("side", "words")
+    doubt = finding("side", "words")
     visits = (
         VisitEntry("1", (sized(SIZE, doubt),), SIZE),
         VisitEntry("2", (ExamEntry("visit 2, exam 1", "no lump"),), why="no lump"),
@@ -140,7 +140,7 @@ def test_a_mass_is_of_its_last_visit_and_names_the_exams_that_a_finding_is_of() 
 
 
 def test_what_speaks_against_a_comparison_is_told_once_beside_what_speaks_against_its_exams() -> None:
-    of_exam, of_pair = Finding("side", "another side"), Finding("taken_as_one", "two places")
+    of_exam, of_pair = finding("side", "another side"), finding("taken_as_one", "two places")
     visits = tuple(VisitEntry(code, (sized(SIZE, of_exam),), SIZE) for code in "12")
     growth = Growth("P", "1", "1", "2", "compared", verdict="grown", findings=(of_exam.at("visit 1"), of_pair))
     row = MassRow("P", "1", visits, growth=growth)
@@ -153,7 +153,7 @@ def test_what_speaks_against_a_comparison_is_told_once_beside_what_speaks_agains
 def test_each_mass_can_be_filtered_and_put_in_order() -> None:
     page = page_of(
         mass("a", ExamEntry("visit 1, exam 1", "x")),
-        mass("b", sized(SIZE, Finding("few_strokes", "look")), size=SIZE),
+        mass("b", sized(SIZE, finding("few_strokes", "look")), size=SIZE),
     )
     found = {attrs["data-status"]: attrs["data-flagged"] for tag, attrs in Tags(page).tags if "data-status" in attrs}
     assert found == {UNSIZED: "no", SIZED: "yes"}

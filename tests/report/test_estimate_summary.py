@@ -16,7 +16,7 @@ from tactile_bayes.declarations import from_plain, replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import AnotherExam, EstimateReport, Supposed
-from tactile_bayes.findings import Finding, joined
+from tactile_bayes.findings import finding, joined
 from tactile_bayes.inference.draws import summarise
 from tactile_bayes.mapping.map import TactileMap, broken_assumptions
 from tactile_bayes.posterior.draw import SamplerSettings
@@ -135,7 +135,7 @@ def test_what_a_soft_lump_would_measure_is_what_it_does_where_it_is_known(folder
     assert supposed_line(exchanged, supposed_median, places=1) == [f"{words.format(*sizes[::-1])}."]
 
 
-CHECKS = tuple(Finding(kind, f"a reason for {kind}") for kind in ("coarse_cells", "uneven_level", "irregular"))
+CHECKS = tuple(finding(kind, f"a reason for {kind}") for kind in ("coarse_cells", "uneven_level", "irregular"))
 
 
 def crowded() -> tuple[Estimate, EstimateReport]:
@@ -148,7 +148,7 @@ def crowded() -> tuple[Estimate, EstimateReport]:
         found,
         masses=(Mass(-10.0, 2.0, 1.0, found, reported=True), *((mass,) * 9)),
         diagnostics=odd,
-        findings=(*(Finding("outside_calibration", f"reason {i}") for i in range(9)), *CHECKS),
+        findings=(*(finding("outside_calibration", f"reason {i}") for i in range(9)), *CHECKS),
         reason="of a reason",
         advice="advice",
     )
@@ -174,8 +174,8 @@ def test_the_worst_case_takes_at_most_12_lines_and_counts_what_it_does_not_show(
 
 def test_a_broken_assumption_stands_first_and_one_to_check_after_the_size() -> None:
     full, report = crowded()
-    told = (Finding("curved_skin", "the skin is curved"), Finding("lump_dragged", "the lump lags"))
-    marked = replace(report, entries=tuple(one.entry for one in (*told, *full.findings)))
+    told = (finding("curved_skin", "the skin is curved"), finding("lump_dragged", "the lump lags"))
+    marked = replace(report, findings=(*told, *full.findings))
     short = estimate_summary(full, marked).splitlines()
     assert short[0].startswith("CAUTION: the lump lags; reason 0; reason 1 (and 7 more).")
     assert len(short) <= MOST_LINES

@@ -40,7 +40,7 @@ from tactile_bayes.files.manifest_csv import Exam as Listed
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
-from tactile_bayes.findings import KINDS, LEADS, Finding, by_weight, verdict
+from tactile_bayes.findings import KINDS, LEADS, Finding, by_weight, finding, verdict
 from tactile_bayes.geometry import rigid
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.build import build_map
@@ -58,8 +58,8 @@ FAST = Settings(method="laplace")
 SCANS = ({"sha256": "ab" * 32, "side": "right", "posture": "supine"},)
 
 
-def finding(kind: str) -> Finding:
-    return Finding(kind, f"words for {kind}", f"give --{kind}", f"ask about {kind}")
+def one_of(kind: str) -> Finding:
+    return finding(kind, f"words for {kind}", f"give --{kind}", f"ask about {kind}")
 
 
 def plain_map(seed: int) -> TactileMap:
@@ -91,7 +91,7 @@ class Made:
     def __init__(self, findings: Sequence[Finding]) -> None:
         self.findings = by_weight(findings)
         one, pooled, compared = sound()
-        told: Any = {"entries": tuple(each.entry for each in self.findings)}
+        told: Any = {"findings": self.findings}
         told["verdict"] = verdict(findings, answered=True)
         self.map = replace(one.tactile_map, findings=self.findings)
         estimate = replace(one.estimate, findings=self.findings)
@@ -298,7 +298,7 @@ def plain(text: str) -> str:
 
 @cache
 def said(output: str, kinds: tuple[str, ...]) -> str:
-    return plain(OUTPUTS[output].made(Made([finding(kind) for kind in kinds])))
+    return plain(OUTPUTS[output].made(Made([one_of(kind) for kind in kinds])))
 
 
 def in_twos() -> list[tuple[str, ...]]:
@@ -313,7 +313,7 @@ def test_every_finding_is_said(output: str) -> None:
     how = OUTPUTS[output]
     for kinds in in_twos() if how.shortens else [tuple(KINDS)]:
         text = said(output, kinds)
-        for number, one in enumerate(map(finding, kinds)):
+        for number, one in enumerate(map(one_of, kinds)):
             lead = LEADS[one.severity] if not (how.shortens and number) else ""
             assert f"{lead}{one.sentence(paper=how.paper)}" in text
             assert (one.remedy in text) is not how.paper
@@ -331,7 +331,7 @@ def test_nothing_is_said_where_nothing_speaks_against_it_and_the_verdict_is_told
 
 @pytest.mark.parametrize("kind", [kind for kind, severity in KINDS.items() if severity == "caution"])
 def test_python_begins_with_the_caution(kind: str) -> None:
-    made = Made([finding("few_strokes"), finding(kind)])
+    made = Made([one_of("few_strokes"), one_of(kind)])
     for one in (made.estimate, made.pooled, made.compared):
         assert repr(one).split(" ", 1)[1].startswith(f"CAUTION: words for {kind}; ask about {kind}.")
         assert [each.kind for each in one.findings] == [kind, "few_strokes"]
@@ -348,7 +348,7 @@ def test_a_notebook_has_both_intervals_and_the_probability() -> None:
 def test_what_speaks_against_a_map_reaches_pool_comparison_and_campaign(tmp_path: Path) -> None:
     """Written to a file, estimated by commands; only what is of one size alone is judged anew from all maps."""
     for number in (1, 2):
-        made = replace(plain_map(number), findings=(finding("late_poses"),) if number == 2 else ())
+        made = replace(plain_map(number), findings=(one_of("late_poses"),) if number == 2 else ())
         scans = ({"sha256": f"{number:064x}", "side": "right", "subject": "P"},)
         write_map(tmp_path / f"{number}.nc", made, provenance=Provenance("test", {}, scans=scans))
     sentence = "CAUTION: {}words for late_poses; give --late_poses"
@@ -374,7 +374,7 @@ def test_the_live_view_says_a_caution_before_the_size() -> None:
     from tactile_bayes.actions.live_view import Turn, live_estimate
 
     shipped = Path(tb.__file__).parent / "calibrations" / "solid.json"
-    live = replace(plain_map(1), findings=(finding("late_poses"), finding("few_strokes")))
+    live = replace(plain_map(1), findings=(one_of("late_poses"), one_of("few_strokes")))
     assert live_estimate(live, str(shipped), Turn()).text.startswith(
         "CAUTION: words for late_poses; give --late_poses."
     )

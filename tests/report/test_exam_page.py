@@ -29,7 +29,7 @@ from tactile_bayes.files.reports import (
     SmallestAt,
     SmallestLump,
 )
-from tactile_bayes.findings import Finding
+from tactile_bayes.findings import finding
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import RESEARCH_USE
@@ -407,9 +407,9 @@ def full() -> Exam:
     reason = "a reason that is long " * 20
     masses = tuple(unsized(reason, number=n, reported=n == 1) for n in range(1, 12))
     told = replace(report, masses=masses)
-    entries = tuple(Finding("side", f"caution {n} " * 80).entry for n in range(9))
+    entries = tuple(finding("side", f"caution {n} " * 80) for n in range(9))
     tall = replace(tactile_map, patient_from_plane=np.eye(4)[[1, 0, 2, 3]] * np.array([1, 1, -1, 1])[:, None])
-    pooled = pooled_as(report, 12, entries=entries)
+    pooled = pooled_as(report, 12, findings=entries)
     facts = dict.fromkeys(("subject", "posture", "examiner", "visit", "mass"), "W" * 99)
     scans = tuple({**facts, "side": "left", "sha256": f"{n}" * 64, "subject": f"{n}" + "W" * 99} for n in range(12))
     maps = (exam_map(tall, told, side="left"),) * 12

@@ -15,7 +15,7 @@ from tactile_bayes.report import estimate_document
 from tactile_bayes.report.compare import COMPARE, CompareReport
 from tactile_bayes.report.estimate_text import estimate_text
 
-_HEAD: dict[str, Any] = {"status": "no_estimate", "verdict": "no_answer", "entries": (), "reason": "", "left_out": ()}
+_HEAD: dict[str, Any] = {"status": "no_estimate", "verdict": "no_answer", "findings": (), "reason": "", "left_out": ()}
 _FOOT: dict[str, Any] = {"research_use": RESEARCH_USE, "provenance": {"settings": {}, "inputs": []}}
 
 
