@@ -96,17 +96,13 @@ def _files(**tables: Path | Sheet | None) -> dict[str, Path]:
     return {role: table for role, table in tables.items() if isinstance(table, Path)}
 
 
-def _declared(asked: LearnOptions) -> dict[str, Any]:
-    return {name: getattr(asked, name) for name in _MAPS}
-
-
 def _eq6(table: Path | Sheet, asked: LearnOptions, progress: Progress | None) -> Learned:
     """Learn Eq 6 from a table of lumps, of which those softer than asked take no part.
 
     By the posterior of all coefficients from all rows (``"joint"``), or as printed, with a bootstrap (``"two-stage"``).
     """
     rows = read_table(table, "size_table.table.json")
-    recipe, least = table_recipe(rows, _declared(asked)), asked.least_stiffness_ratio
+    recipe, least = table_recipe(rows, asked), asked.least_stiffness_ratio
     with in_file(rows.path):
         lumps = size_table(rows, least_stiffness_ratio=least)
         rng = np.random.default_rng(asked.seed)
@@ -121,14 +117,8 @@ def _eq6(table: Path | Sheet, asked: LearnOptions, progress: Progress | None) ->
             left_out = eq6.left_out_of_study(lumps, least_stiffness_ratio=least, fit=one_axis)
         except (NotConvergedError, BadDataError) as error:
             silent = str(error)
-    settings = {
-        "normalise": recipe.normalise,
-        "background": recipe.background,
-        "fit_radius_mm": recipe.radius_mm,
-        "noise": recipe.noise,
-        "least_stiffness_ratio": least,
-        "fit": asked.fit,
-    }
+    made = (recipe.normalise, recipe.background, recipe.radius_mm, recipe.noise)
+    settings = {**dict(zip(_MAPS, made, strict=True)), "least_stiffness_ratio": least, "fit": asked.fit}
     cautions = table_cautions(rows.columns, least_stiffness_ratio=least)
     learned = replace(calibration, left_out=left_out, cautions=cautions)
     return Learned(learned, settings, _files(table=table), asked.seed, None, lumps, silent, other)
@@ -178,18 +168,18 @@ def _over_bodies(table: Path | Sheet, asked: LearnOptions, against: Path | None)
     return Learned(found, settings, _files(table=table, against=against))
 
 
-def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
-    """Recipe of a size table's maps: from its columns, else as the options of these names declare, else the default."""
-    said = {name: _alike(table, name) for name in (*declared, "flat_field")}
-    for name, value in declared.items():
-        if None not in (value, said[name]) and value != said[name]:
+def table_recipe(table: Table, asked: LearnOptions) -> Recipe:
+    """Recipe of a size table's maps: from its columns, else as the options declare, else the default."""
+    said = {name: _alike(table, name) for name in (*_MAPS, "flat_field")}
+    found = {name: getattr(asked, name) if said[name] is None else said[name] for name in _MAPS}
+    for name, value in found.items():
+        if getattr(asked, name) not in (None, value):
             option, also = f"--{name.replace('_', '-')}", ""
             if name == "normalise":
-                also = f", and size maps made with `map --normalise {said[name]}`; "
+                also = f", and size maps made with `map --normalise {value}`; "
                 also += "`population` gives a table for --normalise gain"
-            what = f"its {name} is {said[name]}, not {value} as {option} says"
+            what = f"its {name} is {value}, not {getattr(asked, name)} as {option} says"
             raise BadDataError(what, way_out=f"leave out {option}{also}", path=str(table.path))
-    found = {name: value if said[name] is None else said[name] for name, value in declared.items()}
     normalise: Normalise = found["normalise"] or "mean"
     background: Background = found["background"] or ("free" if normalise == "none" else "fixed")
     if normalise == "none" and background == "fixed":
@@ -198,7 +188,7 @@ def table_recipe(table: Table, declared: Mapping[str, Any]) -> Recipe:
         normalise,
         background,
         found["fit_radius_mm"] or FIT_RADIUS_MM,
-        declared=any(said[name] is None for name in declared),
+        declared=any(said[name] is None for name in _MAPS),
         noise=found["noise"] or "independent",
         flat_field=said["flat_field"],
         head=_named_head(table),
@@ -291,7 +281,7 @@ def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Pr
     `table`: a row for each map of a phantom: its bump (size_table) or its file (phantom_maps); `base`: name or path of
     the calibration.
     """
-    path, declared = size_calibration_path(base), _declared(asked)
+    path = size_calibration_path(base)
     calibration = None if path is None else read_size_calibration(path)
     if path is None or not isinstance(calibration, BodyCalibration):
         raise UsageError(
@@ -301,17 +291,15 @@ def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Pr
     by_files, inputs = "file" in header_of(table), {**_files(table=table), "size_calibration": path}
     with in_file(table if isinstance(table, Path) else table.name):
         if by_files:
-            for name in (name for name, value in declared.items() if value is not None):
-                what = f"--{name.replace('_', '-')} is for tables of amplitudes and widths"
-                raise UsageError(f"{what}: map files state how they were made")
+            declared = [name for name in _MAPS if getattr(asked, name) is not None]
+            _refuse(declared, "is for tables of amplitudes and widths: map files state how they were made", *_MAPS)
             rows = read_table(table, "phantom_maps.table.json")
             names = [str(one) for one in rows.columns["file"]]
             folder = table.parent if isinstance(table, Path) else Path()
             inputs |= {f"map_{i}": folder / name for i, name in enumerate(names, start=1)}
         else:
             rows = read_table(table, "size_table.table.json")
-            _check_recipe(rows, calibration, declared)
-            _check_head(rows, calibration)
+            _check_table(rows, calibration, asked)
             names = [f"line {line}" for line in rows.line_numbers]
         maps, left_out, by_recipe = [], [], Settings(size_calibration=base, seed=asked.seed)
         lines = [dict(zip(rows.columns, cells, strict=True)) for cells in zip(*rows.columns.values(), strict=True)]
@@ -383,26 +371,20 @@ def _unfit(row: Mapping[str, Any]) -> str:
     return f"its stiffness_ratio is {ratio:g}, and the calibration's lumps have {LEAST_HARD_RATIO:g} and more"
 
 
-def _check_recipe(rows: Table, calibration: BodyCalibration, declared: Mapping[str, Any]) -> None:
-    """Refuse a table of maps that were made or fitted otherwise than the calibration's."""
+def _check_table(rows: Table, calibration: BodyCalibration, asked: LearnOptions) -> None:
+    """Refuse a table of maps that were made or fitted otherwise than the calibration's, or with another head."""
     ours = calibration.recipe
-    if differs := ours.differences(table_recipe(rows, declared)):
+    if differs := ours.differences(table_recipe(rows, asked)):
         raise BadDataError(
             f"its maps were made by another recipe: {'; '.join(differs)}",
             way_out=f"a correction needs maps made with {ours.map_command}, fitted by `estimate` with the calibration "
             f"({ours}), and the table's columns must say so; or list the map files in a column named file",
         )
-
-
-def _check_head(rows: Table, calibration: BodyCalibration) -> None:
-    """Refuse a table of maps from a head with another radius than the calibration's, where it names no more of it."""
-    head = calibration.recipe.head
-    if head is None:
-        return
-    ours = "that is flat" if head.radius_mm is None else f"with a radius of {head.radius_mm:g} mm"
-    for i, radius_mm in enumerate(rows.columns["head_radius_mm"]):
-        if radius_mm is not None and head.differences(replace(head, radius_mm=radius_mm)):
-            what = f"is {radius_mm:g}, and the calibration is for a head {ours}"
+    head = ours.head
+    for i, radius_mm in enumerate(rows.columns["head_radius_mm"]):  # the table may name no more of its head
+        if head is not None and radius_mm is not None and head.differences(replace(head, radius_mm=radius_mm)):
+            shape = "that is flat" if head.radius_mm is None else f"with a radius of {head.radius_mm:g} mm"
+            what = f"is {radius_mm:g}, and the calibration is for a head {shape}"
             raise rows.error(i, "head_radius_mm", what, way_out="learn a calibration for this head")
 
 

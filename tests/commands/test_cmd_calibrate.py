@@ -15,6 +15,7 @@ import tactile_bayes
 from tactile_bayes.api.size_calibration import table_recipe
 from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.tables import read_table
+from tactile_bayes.options import LearnOptions
 from tactile_bayes.size.terms import Recipe
 
 Run = Callable[..., "CompletedProcess[str]"]
@@ -57,7 +58,7 @@ def test_the_packaged_phantoms_say_how_their_maps_were_made(tmp_path: Path) -> N
     assert done.returncode == 3
     assert "its normalise is mean, not gain as --normalise says" in done.stderr
     table = read_table(PHANTOMS, "size_table.table.json")
-    same = table_recipe(table, {"normalise": "mean", "background": None, "fit_radius_mm": 20.0, "noise": None})
+    same = table_recipe(table, LearnOptions(normalise="mean", fit_radius_mm=20.0))
     assert same == Recipe("mean", "fixed", 20.0, declared=False, noise="independent", flat_field=None)
 
 

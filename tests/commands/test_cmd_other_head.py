@@ -24,6 +24,7 @@ from tactile_bayes.files.tables import Sheet, Table, read_table
 from tactile_bayes.forward.scene import Head, Lump, Scene, Strokes
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
+from tactile_bayes.options import LearnOptions
 from tactile_bayes.scans import DEFAULT_HEAD, HeadShape
 from tactile_bayes.studies.population import MassRow, head_columns
 
@@ -189,15 +190,15 @@ def lumps(columns: str, *cells: str) -> Table:
 
 
 def test_a_table_of_phantoms_may_name_its_head() -> None:
-    declared = dict.fromkeys(("normalise", "background", "fit_radius_mm", "noise"))
+    asked = LearnOptions()
     named = ",head_rows,head_columns,head_pitch_mm,head_radius_mm"
-    assert table_recipe(lumps("", ""), declared).head is None
-    assert table_recipe(lumps(named, ",12,12,2,", ",12,12,2,"), declared).head == HeadShape(12, 12, 2.0, None)
-    assert table_recipe(lumps(named, ",16,26,1.5,35"), declared).head == DEFAULT_HEAD
+    assert table_recipe(lumps("", ""), asked).head is None
+    assert table_recipe(lumps(named, ",12,12,2,", ",12,12,2,"), asked).head == HeadShape(12, 12, 2.0, None)
+    assert table_recipe(lumps(named, ",16,26,1.5,35"), asked).head == DEFAULT_HEAD
     with pytest.raises(BadDataError, match="names a head without head_pitch_mm"):
-        table_recipe(lumps(named, ",12,12,,"), declared)
+        table_recipe(lumps(named, ",12,12,,"), asked)
     with pytest.raises(BadDataError, match="head_rows differs between rows"):
-        table_recipe(lumps(named, ",12,12,2,", ",16,12,2,"), declared)
+        table_recipe(lumps(named, ",12,12,2,", ",16,12,2,"), asked)
 
 
 @pytest.mark.slow
