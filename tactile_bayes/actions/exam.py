@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import click
 
@@ -23,6 +23,7 @@ from tactile_bayes.files.estimate_json import StatedSize, read_stated_size
 from tactile_bayes.files.instrument import write_head
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report
 from tactile_bayes.mapping.arrangement import check_scan
+from tactile_bayes.options import FitSettings
 from tactile_bayes.presets import RESEARCH_USE
 
 _OF_RECORDING: Final = ("data_lost", "recorder_noted", "times_apart")
@@ -77,18 +78,15 @@ PROGRAM = "tactile-bayes"
 def demo_action(output: Path, method: str, force: bool) -> None:
     """Run the main job on an embedded scan: map, estimate, and the report of a trial."""
 
-    def step(words: str, command: click.Command, **parameters: Any) -> None:
+    def step(told: str, command: click.Command, *words: str) -> None:
         """Run a step and print it as the command that does it by hand; typed again, that meets what the demo made."""
-        click.echo(f"\n{words}\n\n$ {PROGRAM} {command.name} {_as_typed(command, parameters | {'force': True})}")
-        try:
-            click.get_current_context().invoke(command, **parameters, force=force)
-        except click.exceptions.Exit as end:  # a step that says its exit code; anything but 0 ends the demo with it
-            if end.exit_code:
-                raise
+        typed = [str(Path(word.format(output))) for word in words]  # ./map.nc is map.nc
+        click.echo(f"\n{told}\n\n$ {PROGRAM} {shlex.join([str(command.name), *typed, '--force'])}")
+        with command.make_context(command.name, typed + ["--force"] * force) as context:
+            command.invoke(context)
         click.echo()
 
     _prepare(output, force=force)
-    tactile_map, posterior, paper_posterior = (output / f"{name}.nc" for name in ("map", "posterior", "posterior_eq6"))
     recorded = read_scan_report(output / "scan.mcap").truth
     assert recorded is not None  # the embedded scan is simulated
     truth = float(recorded["lumps"][0]["d_mm"])
@@ -96,24 +94,24 @@ def demo_action(output: Path, method: str, force: bool) -> None:
     click.echo(f"Each step is printed as the command that repeats it by hand.{_how_to_type()}")
     step(
         "1. Build the tactile map: all readings of the scan, averaged in cells of 1 mm.",
-        estimate.map_command, scans=(output / "scan.mcap",), output=tactile_map,
+        estimate.map_command, "{}/scan.mcap", "-o", "{}/map.nc",
     )  # fmt: skip
     step(
         "2. Estimate the size of the lump, with the calibration that comes with the program.",
-        estimate.estimate_command, maps=(tactile_map,), method=method, output=posterior,
-        figure=output / "size.png", map_figure=output / "map.png",
+        estimate.estimate_command, "{}/map.nc", *(() if method == FitSettings().method else ("--method", method)),
+        "-o", "{}/posterior.nc", "--figure", "{}/size.png", "--map-figure", "{}/map.png",
     )  # fmt: skip
     step(
         "3. The same map by the paper's own road: Markov chains over the bump, each draw through Eq 6.",
-        estimate.estimate_command, maps=(tactile_map,), method="ensemble", size_calibration="eq6",
-        output=paper_posterior,
+        estimate.estimate_command, "{}/map.nc", "--size-calibration", "eq6", "--method", "ensemble",
+        "-o", "{}/posterior_eq6.nc",
     )  # fmt: skip
     step(
         "4. Compare sizes with excision, in a synthetic trial of the paper's size.",
-        validate.validate_command, trial=output / "trial.csv", excision=output / "excision.csv",
-        output=output / "trial.json", html=output / "trial.html",
+        validate.validate_command, "{}/trial.csv", "--excision", "{}/excision.csv",
+        "-o", "{}/trial.json", "--html", "{}/trial.html",
     )  # fmt: skip
-    default, paper = read_stated_size(posterior), read_stated_size(paper_posterior)
+    default, paper = (read_stated_size(output / f"{name}.nc") for name in ("posterior", "posterior_eq6"))
     click.echo(_summary(truth, {"estimate, the default": default, "the paper's Eq 6": paper}))
     click.echo(_apart(default, paper))
     click.echo(f"Written to {output}: {', '.join(sorted(path.name for path in output.iterdir()))}.")
@@ -142,21 +140,6 @@ def _how_to_type(which: Callable[[str], str | None] = shutil.which) -> str:
     started = Path(sys.argv[0])
     typed = str(started) if started.name == PROGRAM else f"{shlex.quote(sys.executable)} -m tactile_bayes"
     return f" {PROGRAM} is not on your PATH: type {typed} for it."
-
-
-def _as_typed(command: click.Command, parameters: dict[str, Any]) -> str:
-    """Options of a step as the user would type them."""
-    words: list[str] = []
-    for parameter in command.params:
-        value = parameters.get(parameter.name or "")
-        if value is None or value is False or value == parameter.get_default(click.Context(command)):
-            continue
-        values = [str(one) for one in value] if isinstance(value, tuple) else [str(value)]
-        if isinstance(parameter, click.Option):
-            words.append(parameter.opts[0])
-            values = [] if parameter.is_flag else values
-        words += values
-    return shlex.join(words)
 
 
 def _apart(default: StatedSize | None, paper: StatedSize | None) -> str:
