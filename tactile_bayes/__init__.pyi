@@ -4,7 +4,10 @@ from tactile_bayes.api.comparing import Comparison as Comparison
 from tactile_bayes.api.comparing import compare as compare
 from tactile_bayes.api.diagnosing import Diagnosis as Diagnosis
 from tactile_bayes.api.diagnosing import diagnose as diagnose
+from tactile_bayes.api.estimates import ExportedFiles as ExportedFiles
 from tactile_bayes.api.estimates import estimate as estimate
+from tactile_bayes.api.estimates import exam_report as exam_report
+from tactile_bayes.api.estimates import export as export
 from tactile_bayes.api.estimates import pool as pool
 from tactile_bayes.api.maps import Map as Map
 from tactile_bayes.api.maps import build_map as build_map
@@ -18,9 +21,6 @@ from tactile_bayes.api.maps import scan as scan
 from tactile_bayes.api.maps import simulate as simulate
 from tactile_bayes.api.pooled import PooledSize as PooledSize
 from tactile_bayes.api.repeatability import calibrate_repeatability as calibrate_repeatability
-from tactile_bayes.api.reports import ExportedFiles as ExportedFiles
-from tactile_bayes.api.reports import exam_report as exam_report
-from tactile_bayes.api.reports import export as export
 from tactile_bayes.api.size_calibration import calibrate_size as calibrate_size
 from tactile_bayes.api.sized import SizeEstimate as SizeEstimate
 from tactile_bayes.api.trials import TrialPlan as TrialPlan

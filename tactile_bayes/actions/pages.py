@@ -10,8 +10,8 @@ from typing import Any
 import click
 
 from tactile_bayes.api.comparing import compare_estimates
+from tactile_bayes.api.estimates import exam_of_files, export
 from tactile_bayes.api.estimating import estimate_file
-from tactile_bayes.api.reports import exam_of_files, export
 from tactile_bayes.api.settings import dates_of, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.commands.options import settings_of, typed_options

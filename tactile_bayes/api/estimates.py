@@ -1,22 +1,42 @@
-"""Estimates from Python: `estimate` and `pool`, with their keywords."""
+"""Estimates from Python: `estimate`, `pool`, the page of an exam, and exports of maps and estimates."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import path_of, plain, sequence_of, takes
-from tactile_bayes.api.estimating import estimate_one
+from tactile_bayes.api.arguments import PathLike, path_of, plain, sequence_of, takes
+from tactile_bayes.api.estimating import Notice, estimate_file, estimate_one
 from tactile_bayes.api.maps import Map, map_of
 from tactile_bayes.api.pooled import PooledSize, pool_estimates
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
 from tactile_bayes.api.sized import SizeEstimate
-from tactile_bayes.declarations import replace
-from tactile_bayes.errors import UsageError, check_number
+from tactile_bayes.declarations import Record, replace
+from tactile_bayes.errors import BadDataError, UsageError, check_choice, check_number
+from tactile_bayes.exports.exam import EstimateFile, MapFile, estimate_of, identity_of, read_exam, shared_facts
+from tactile_bayes.exports.run import FORMATS, Outputs, refuse_untaken
+from tactile_bayes.exports.run import ExportFormat as Format
+from tactile_bayes.exports.run import export as exported_files
+from tactile_bayes.files.atomic import given_twice, sha256
+from tactile_bayes.files.documents import load_json
+from tactile_bayes.files.estimate_json import checked_report
+from tactile_bayes.files.map_nc import read_map_and_scans
+from tactile_bayes.files.posterior_nc import is_posterior, read_estimate
+from tactile_bayes.files.provenance import scans_of
+from tactile_bayes.files.reading import HDF5_MAGIC, first_bytes
+from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.files.size_json import read_repeatability
+from tactile_bayes.options import IdentityOptions
+from tactile_bayes.report.estimate_document import side_of
+from tactile_bayes.report.exam_page import exam_page
+from tactile_bayes.report.exam_words import Exam, Given, exam_map, headline
+from tactile_bayes.report.pages import PageFiles
+
+# --- One map estimated, and several of one mass pooled.
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
@@ -131,3 +151,237 @@ def listed(given: Any) -> list[Any]:
     if isinstance(given, str | Path | Map | SizeEstimate | PooledSize):
         return [given]
     return list(sequence_of("files", given, "maps, estimates or paths"))
+
+
+# --- The page of an exam from files: maps are estimated, an estimate is taken as it is, repeats are pooled.
+
+
+def exam_of_files(
+    paths: Sequence[Path], given: Callable[[], Settings], *, typed: Collection[str], notice: Notice | None = None
+) -> Exam:
+    """Read maps, or an estimate and its map, in any order, and put a page's exam together.
+
+    `paths`: maps of one mass; or an estimate, best with its map: what ``estimate`` printed with ``--json`` or wrote
+    with ``-o``; `given`: makes the settings, of which an estimate takes none; `typed`: those that somebody gave;
+    `notice`: called with a line that a user may want to read while waiting.
+    """
+    if twice := given_twice(paths):
+        raise UsageError(f"{twice} is given twice; give each file once")
+    estimates = [
+        path
+        for path in paths
+        if path.suffix.lower() == ".json" or (first_bytes(path, len(HDF5_MAGIC)) == HDF5_MAGIC and is_posterior(path))
+    ]
+    maps = [path for path in paths if path not in estimates]
+    if len(estimates) > 1 or (estimates and len(maps) > 1):
+        raise UsageError("an estimate goes with one map; several maps are estimated and pooled: give maps alone")
+    if estimates:
+        for name in typed:  # they would change nothing
+            option = "--settings" if name == "settings_file" else f"--{name.replace('_', '-')}"
+            raise UsageError(f"an estimate has settings of its own; leave out {option}, or give the map alone")
+        return _from_estimate(estimates[0], maps[0] if maps else None)
+    settings = given()
+    if len(maps) > 1:
+        refuse_checkpoint(settings)
+    found = []
+    for path in maps:
+        tell = None if notice is None else lambda line, path=path: notice(f"{path}: {line}")
+        found.append(estimate_file(path, settings, notice=tell))
+    return exam_of(found, settings, files=maps)
+
+
+def exam_of(found: Sequence[SizeEstimate], settings: Settings, *, files: Sequence[Path] = ()) -> Exam:
+    """Exam of maps that were estimated; several are pooled."""
+    if len(found) == 1:
+        return found[0].exam()
+    names = [f"map {number}" for number in range(1, len(found) + 1)]
+    return pool_estimates(found, settings, names=names, files=files).exam()
+
+
+def _from_estimate(source: Path, path: Path | None) -> Exam:
+    """Exam of an estimate, and of its map where that is given: the estimate must name it by its digest."""
+    if source.suffix.lower() == ".json":
+        document = load_json(source, way_out="give what `estimate --json` printed for one map")
+        report = checked_report(document, EstimateReport, path=source)
+    else:
+        report = read_estimate(source)
+    tactile_map, scans = None, scans_of(report.provenance)
+    if path is not None:
+        if sha256(path) not in [one.sha256 for one in report.origin.inputs if one.role == "map"]:
+            raise BadDataError(f"is not the estimate of {path}", way_out="give the map it names", path=str(source))
+        tactile_map, scans = read_map_and_scans(path)
+    return Exam((exam_map(tactile_map, report, side=side_of(scans)),), None, scans)
+
+
+# --- The page of an exam from Python.
+
+
+@takes(Settings, without=["settings_file"])
+def exam_report(
+    files: Any,
+    path: PathLike,
+    *,
+    pdf: PathLike | None = None,
+    title: str = "",
+    name: str = "",
+    day: str = "",
+    force: bool = False,
+    **settings: Any,
+) -> str:
+    """Write one page of an exam as HTML, as ``tactile-bayes report`` does.
+
+    Parameters
+    ----------
+    files
+        Maps, estimates and pooled sizes, or the paths of their files; one, or a list. Several maps are repeats of one
+        mass and are pooled. A path of an estimate (JSON or posterior) goes alone, or with the path of its map.
+    path
+        Usually ``*.html``.
+    pdf
+        Also print the page there, by an installed Chromium or WeasyPrint.
+    title, name, day
+        To print on the page; nothing is where they are not given. The day as YEAR-MONTH-DAY.
+    **settings
+        As of `estimate`; estimates that are given keep their own.
+
+    Returns
+    -------
+    str
+        The page's headline.
+
+    Raises
+    ------
+    UsageError
+        When files do not fit each other, settings are given for an estimate's file, nothing is installed that prints,
+        or a file exists and `force` is false.
+    BadDataError
+        When a file is damaged or of another kind, or the maps are of different exams.
+    """
+    page, words = PageFiles(path_of(path), path_of(pdf), force), Given(title, name, day)
+    page.check()
+    given = listed(files)
+    if not given:
+        raise UsageError("nothing was given to report; give maps, or an estimate")
+    exam: Exam
+    if all(isinstance(one, str | Path) for one in given):
+        exam = exam_of_files([path_of(one) for one in given], lambda: settings_of(settings), typed=settings)
+    elif len(given) == 1 and isinstance(given[0], PooledSize):
+        exam = given[0].exam()
+    else:
+        used = settings_of(settings)
+        if len(given) > 1:
+            refuse_checkpoint(used)
+        exam = exam_of(estimated(given, settings), used)
+    exam = replace(exam, given=words)
+    page.write(exam_page(exam))
+    return headline(exam)
+
+
+# --- Export of maps and estimates to the files that other systems take.
+
+_IN_PYTHON = Path("what was given in Python")  #: What messages call a map or an estimate that is in no file.
+
+
+class ExportedFiles(Record):
+    """What an export wrote."""
+
+    paths: tuple[Path, ...]  #: Of the files.
+    notes: tuple[str, ...] = ()  #: What a user should know of them, such as that they name no patient.
+
+
+@takes(IdentityOptions)
+def export(
+    files: Any = (),
+    path: PathLike | None = None,
+    *,
+    to: Format,
+    worklist: PathLike | None = None,
+    patient_id_from_scan: bool = False,
+    dictionary: PathLike | None = None,
+    force: bool = False,
+    **identity: Any,
+) -> ExportedFiles:
+    """Write maps and estimates as the files that other systems take, as ``tactile-bayes export`` does.
+
+    Parameters
+    ----------
+    files
+        Maps, estimates and pooled sizes, or the paths of their files; one, or a list. An estimate brings its map where
+        `to` is ``"dicom"``. None at all where only a dictionary is wanted.
+    path
+        File to write; for ``"dicom"`` the folder of the files.
+    to
+        ``"dicom"``, ``"fhir"``, ``"nrrd"`` (3D Slicer) or ``"csv"`` (REDCap).
+    worklist
+        File of a modality worklist item, or of plain keys in JSON, that says who was examined.
+    patient_id_from_scan
+        Use the scan's subject code as the patient ID.
+    dictionary
+        With ``"csv"``: also write the data dictionary of the REDCap form there.
+    **identity
+        patient_id, patient_name, birth_date, sex, issuer, accession, referring_physician, study_id, study_description,
+        study_uid, study_date and content_date, each a text; a format refuses what it does not hold.
+
+    Raises
+    ------
+    UsageError
+        When files do not fit the format or each other, something that the format needs is missing, its extra is not
+        installed, or a file exists and `force` is false.
+    BadDataError
+        When a file is damaged or of another kind.
+
+    Examples
+    --------
+    >>> import tactile_bayes as tb
+    >>> tb.export(tb.estimate(tb.demo_map()), "records.csv", to="csv").paths  # doctest: +SKIP
+    (PosixPath('records.csv'),)
+    """
+    check_choice("to", to, FORMATS)
+    for name, value in identity.items():
+        if not isinstance(value, str):
+            raise UsageError(f"{name} is {value!r}; give a text")
+    refuse_untaken(to, identity)
+    several = listed(files)
+    outputs = Outputs(path_of(path), path_of(dictionary), to=to, force=force)
+    outputs.check(files=bool(several))
+    exported, notes = dict[str, bytes](), tuple[str, ...]()
+    if several:
+        read = [_read(one) for one in several]
+        if to == "dicom" and not any(isinstance(one, MapFile) for one in read):  # a report refers to its maps
+            read = [*(_map_file(*one) for estimate in several for one in _maps_of(estimate)), *read]
+        who = identity_of(path_of(worklist), identity)
+        exported, notes = exported_files(read, to=to, identity=who, id_from_scan=patient_id_from_scan)
+    return ExportedFiles(outputs.write(exported), notes)
+
+
+def _read(given: Any) -> MapFile | Sequence[EstimateFile]:
+    if isinstance(given, str | Path):
+        return read_exam(path_of(given))
+    if isinstance(given, Map):
+        return _map_file(given)
+    if isinstance(given, SizeEstimate | PooledSize):
+        document = given.answer.document if isinstance(given, SizeEstimate) else given.document
+        digests = tuple(_map_file(*one).digest for one in _maps_of(given))
+        return [replace(estimate_of(document, _IN_PYTHON), maps=digests)]
+    raise UsageError(f"{type(given).__name__} is nothing to export; give a map, an estimate, or the path of one")
+
+
+def _maps_of(given: Any) -> list[tuple[Map, str]]:
+    """The maps of an estimate, with the digests of the files that they were read from, empty for a map in none."""
+    found = (given,) if isinstance(given, SizeEstimate) else given.maps if isinstance(given, PooledSize) else ()
+    return [
+        (Map(one.tactile_map, scans=tuple(map(dict, one.provenance.scans))), one.provenance.inputs.get("map", ""))
+        for one in found
+    ]
+
+
+def _map_file(given: Map, digest: str = "") -> MapFile:
+    """A map as an export takes it; one that is in no file has the digest of the file that `save` would write."""
+    facts = shared_facts(given.scans)
+    if digest or given.path is not None:
+        path = given.path or _IN_PYTHON
+        return MapFile(path, digest or sha256(path), given.tactile_map, facts)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "map.nc"
+        given.save(path)
+        return MapFile(_IN_PYTHON, sha256(path), given.tactile_map, facts)

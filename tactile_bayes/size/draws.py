@@ -227,7 +227,6 @@ class SizePosterior(Record, eq=False):
     """(chain * draw,) label of the independent replicate of each draw: their spread is the Monte-Carlo error."""
     figures: Mapping[str, float] = field(default_factory=dict)
     """Further figures: the probability of a lump that is not round, the spread between maps..."""
-    outliers: tuple[int, ...] = ()  #: Those of several maps that lie apart from the rest, by their place in the list.
     another_exam: SizePosterior | None = None
     """The same if another exam of the mass may come out as far apart as in the paper's trial; None where not told."""
     supposing: Mapping[str, Supposition] = field(default_factory=dict)

@@ -170,7 +170,7 @@ def pooled_size(
 
     In (`number`,) draws; None keeps those of a single map one by one. `figures` holds ``between_map_sd`` (root mean
     square), ``oval_probability``, ``oval_half_log_ratio``, ``irregular_outline`` (1 where at least half of the maps
-    have one) and, for several maps, ``weight_1``...; `outliers` the maps that lie apart.
+    have one) and, for several maps, ``weight_1``...
 
     Given tau and B, what the maps leave open of ln d is a sum of normals, so it is one normal. It, tau, the spread of B
     and the lump's shape are the coordinates of low-discrepancy points, paired with the draws of the maps in order of
@@ -197,7 +197,6 @@ def pooled_size(
     variance = float(np.nanvar(np.log(size.max_size_mm)))
     return replace(
         size,
-        outliers=outlying_maps(centre, noise, priors.spread_of_others),
         another_exam=None if priors.another_exam is None else pool.size(priors.another_exam),
         supposing=suppositions(calibration, priors.known, (middle[0], middle[1]), variance=variance),
     )

@@ -67,7 +67,7 @@ def test_the_json_of_an_estimate_gives_the_same_page_without_estimating(
 ) -> None:
     assert run_here("report", "a.nc", "-o", "alone.html", cwd=folder).returncode == 0
 
-    monkeypatch.setattr("tactile_bayes.api.reports.estimate_file", None)
+    monkeypatch.setattr("tactile_bayes.api.estimates.estimate_file", None)
     done = run_here("report", "a.json", "a.nc", "-o", "both.html", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert (folder / "both.html").read_bytes() == (folder / "alone.html").read_bytes()
@@ -75,7 +75,7 @@ def test_the_json_of_an_estimate_gives_the_same_page_without_estimating(
 
 @pytest.mark.long
 def test_a_posterior_gives_the_page_of_its_estimate(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tactile_bayes.api.reports.estimate_file", None)
+    monkeypatch.setattr("tactile_bayes.api.estimates.estimate_file", None)
     run_here("report", "a.json", "a.nc", "-o", "by_json.html", cwd=folder)
     done = run_here("report", "a.nc", "post.nc", "-o", "by_posterior.html", cwd=folder)
     assert done.returncode == 0, done.stderr
