@@ -70,8 +70,9 @@ _SWAYS_TRIED, _SWAY_STEPS = 4, 5
 _LEAST_SWAY_START: Final = 0.03
 """Of the squared errors, what the first step must take off for more: it does in 22 of 88 right scans whose errors last,
 and in all of 32 that breathe."""
-_LEAST_SWAY_HALFWAY: Final = 0.1
-"""Gain after two steps, for more: 25 scans of bodies that breathe and come to `LEAST_SWAY_GAIN` have 0.14 by then."""
+_LEAST_SWAY_GAINS: Final = {1: 0.04, 2: 0.1}
+"""Gain after one and two steps, for more: 25 scans of bodies that breathe and come to `LEAST_SWAY_GAIN` have 0.067 and
+0.14 at least by then."""
 _SWAY_NUMBERS: Final = 5  # that are fitted: a rate, and cosine and sine along two axes
 _LEAST_OTHERS: Final = 2  #: Readings of other times that predict one.
 NOTHING_SHOWN: Final = "too little stands out to show that array, lever arm and quaternions are as stated"
@@ -481,7 +482,7 @@ class _Overlap(Record, eq=False, dict=True):
             return None
         found = []
         for rate in sorted(gains, key=gains.__getitem__)[-_SWAYS_TRIED:]:
-            made, sway = self._moving(waves[rate], least=_LEAST_SWAY_HALFWAY)
+            made, sway = self._moving(waves[rate], least=_LEAST_SWAY_GAINS)
             found.append(replace(made, sway_mm=2 * float(np.linalg.norm(sway, 2)), sways_a_minute=60 * rate))
         return min(found, key=lambda one: one.spread)
 
@@ -493,18 +494,18 @@ class _Overlap(Record, eq=False, dict=True):
         """
         path = self.stated_places[0].mean(axis=1)
         strokes = (path - path.mean(axis=0)) @ principal_axes(path)[:, [-1]]
-        return self._moving(strokes)[0]
+        return self._moving(strokes, least={})[0]
 
-    def _moving(self, course: FloatArray, *, least: float = -np.inf) -> tuple[Arrangement, FloatArray]:
+    def _moving(self, course: FloatArray, *, least: Mapping[int, float]) -> tuple[Arrangement, FloatArray]:
         """What is stated, of a body that moves with (m, a) courses, by Gauss-Newton steps; and its (a, 2) moves, mm.
 
-        Two steps where they gain less than `least`.
+        It is given up after a step, by its number, that has gained less than `least`.
         """
         moves, (made, cells, levelled, error) = np.zeros((course.shape[1], 2)), self.still
         for step in range(1, _SWAY_STEPS + 1):
             moves += _moves(course, cells.gradient(levelled), error)[1]
             made, cells, levelled, error = self._fitted((), (course @ moves)[:, None])
-            if step == 2 and made.gain_over(self.still[0]) < least:
+            if made.gain_over(self.still[0]) < least.get(step, -np.inf):
                 break
         return made, moves
 
