@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -10,7 +9,6 @@ import time
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
 
 import click
 
@@ -28,15 +26,25 @@ from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
+from tactile_bayes.forward.plane import outside_range
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
-from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.laboratory import TradeoffReport, draw_tradeoff, tradeoff_document, tradeoff_text
-from tactile_bayes.report.tradeoff import DIGITS, draw_ladder, ladder_file, ladder_text
+from tactile_bayes.report.paper_head import finite
+from tactile_bayes.report.tradeoff import DIGITS, Varied, draw_ladders, ladder_file, tradeoff_text
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.pooling import PooledEstimate
-from tactile_bayes.studies import tradeoffs
-from tactile_bayes.studies.estimate_tradeoff import SIZE, Clock, Ladder, PooledRow, SizeAnswer, Work, measure
+from tactile_bayes.studies import paper, tradeoffs
+from tactile_bayes.studies.estimate_tradeoff import (
+    SIZE,
+    Clock,
+    Ladder,
+    PooledRow,
+    SizeAnswer,
+    Work,
+    intervals,
+    measure,
+    no_number,
+)
 
 
 def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> tuple[PooledRow, ...]:
@@ -55,14 +63,14 @@ def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> t
     return tuple(rows)
 
 
-def _pooled_answer(pooled: PooledEstimate, settings: Settings) -> tuple[SizeAnswer, float]:
+def _pooled_answer(pooled: PooledEstimate, settings: Settings) -> tuple[SizeAnswer, float | None]:
     """The size of this exam, and half the width of the interval of another one."""
     if pooled.size is None:
-        return SizeAnswer(pooled.reason), float("nan")
+        return no_number(pooled.reason), None
     found = {SIZE: pooled.size.summarise(SIZE, probability=settings.interval)}
-    answer = SizeAnswer("", None, found, settings.method, pooled.size.variance_share)
+    answer = SizeAnswer("", None, settings.method, intervals(found), pooled.size.variance_share)
     if pooled.size.another_exam is None:
-        return answer, float("nan")
+        return answer, None
     another = pooled.size.another_exam.summarise(SIZE, probability=settings.interval)
     return answer, 0.5 * (another.high - another.low)
 
@@ -94,26 +102,28 @@ def forecast(seconds: float) -> None:
 
 
 def show(
-    ladder: Ladder,
+    ladders: Mapping[str, Ladder],
     *,
-    varied: Literal["estimate", "map"],
-    title: str,
+    varied: Varied,
     figure: Path | None,
     as_json: bool,
     force: bool,
-    provenance: Mapping[str, Any],
+    provenance: Sequence[Provenance],
 ) -> int:
-    """Draw and print; the exit code."""
+    """Draw and print ladders, by their titles, each with its provenance; the exit code."""
     try:
         if figure is not None:
-            draw_ladder(ladder, figure, title=title, force=force)
+            draw_ladders(ladders, figure, force=force)
     finally:  # what was measured is not lost with the figure
         if as_json:
-            found = ladder_file(ladder, varied=varied, provenance=provenance)
-            click.echo(dump_json(to_plain(found, digits=DIGITS)), nl=False)
+            found = [
+                to_plain(ladder_file(one, varied=varied, provenance=made.as_dict()), digits=DIGITS)
+                for one, made in zip(ladders.values(), provenance, strict=True)
+            ]
+            click.echo(dump_json(found[0] if len(found) == 1 else found), nl=False)
         else:
-            click.echo(ladder_text(ladder))
-    return EXIT_NO_ESTIMATE if ladder.reference.answer is None else EXIT_DONE
+            click.echo(tradeoff_text(ladders))
+    return EXIT_DONE if all(one.reference.answer for one in ladders.values()) else EXIT_NO_ESTIMATE
 
 
 LEARNED = "learned"
@@ -129,41 +139,38 @@ def tradeoff_forward_action(
     runs: int,
     as_json: bool,
     force: bool,
-) -> None:
+) -> int:
     """Measure error in amplitude, width and size against CPU time, for the lump of a scene."""
-    if size_calibration not in (None, "learned"):
+    if size_calibration not in (None, LEARNED):
         also_read(size_calibration_path(size_calibration))
     with in_file(scene or ""):
         drawn = Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)) if scene is None else read_scene(scene)
         case = tradeoffs.case_of(drawn, head=head)
-    report = run_tradeoff(case, size_calibration, tolerance=tolerance_percent / 100, runs=runs)
-    try:
-        if figure is not None:
-            draw_tradeoff(report, figure, force=force)
-    finally:  # what was measured is not lost with the figure
-        click.echo(json.dumps(tradeoff_document(report), indent=2) if as_json else tradeoff_text(report))
-    if as_json:
-        return
-    if figure is not None:
-        click.echo(f"the figure is in {figure}")
-    click.echo(RESEARCH_USE)
-
-
-def run_tradeoff(case: tradeoffs.LumpCase, calibration: str | None, *, tolerance: float, runs: int) -> TradeoffReport:
-    """Learn Eq 6 or read the calibrations, then measure all settings."""
     # a raster's frames are divided by their means
     own = {tradeoffs.PLANE: "plane-strain", tradeoffs.SOLID: "solid-mean"}
-    rules = {model: _rule(case, model, calibration or own[model]) for model in (tradeoffs.PLANE, tradeoffs.SOLID)}
-    found: list[tradeoffs.Measured] = []
-    settings = tradeoffs.forward_settings(case)
-    measure = partial(tradeoffs.measure_forward, case, clock=time.process_time)
-    measure(settings[0])  # imports cost nothing afterwards
-    measure(settings[-1])
-    with progress_bar("settings") as progress:
-        for number, setting in enumerate(settings, start=1):
-            found.append(measure(setting, runs=runs))
-            progress(number, len(settings))
-    return TradeoffReport(case, tuple(found), rules, tolerance)
+    rules = {model: _rule(case, model, size_calibration or name) for model, name in own.items()}
+    found = {model: _climbed(case, model, rule, tolerance_percent / 100, runs) for model, rule in rules.items()}
+    plane = found[tradeoffs.PLANE]
+    notes = (*plane.notes, tradeoffs.dimensions_note(case, plane, found[tradeoffs.SOLID], rules))
+    warning = outside_range(case.d_mm, case.depth_ratio)
+    found[tradeoffs.PLANE] = replace(plane, notes=(*notes, f"{warning}.") if warning else notes)
+    lump = {name: getattr(case, name) for name in ("d_mm", "depth_ratio", "stiffness_ratio", "seat")}
+    words = f"lump of {case.d_mm:g} mm, h/d {case.depth_ratio:g}, {case.stiffness_ratio:g} times as stiff as fat"
+    ladders, provenance, inputs = {}, [], hash_inputs(scene=scene)
+    for model, ladder in found.items():
+        shoulders, rule = case.of(model).head.shoulders, rules[model]
+        ladders[f"{model}: {words}, {paper.seat_name(case.seat)}; head: {shoulders}"] = ladder
+        kept = {"model": model, **lump, "head": shoulders, "size_calibration": size_calibration}
+        kept |= {"sizes_by": rule.source, "sd_ln_d": finite(rule.scatter)}
+        kept |= {"tolerance_percent": tolerance_percent, "runs": runs}
+        provenance.append(Provenance("tradeoff forward", kept, inputs))
+    return show(ladders, varied="forward", figure=figure, as_json=as_json, force=force, provenance=provenance)
+
+
+def _climbed(case: tradeoffs.LumpCase, model: str, rule: tradeoffs.SizeRule, share: float, runs: int) -> Ladder:
+    with progress_bar(f"settings, {model}") as progress:
+        work = Work(time.process_time, share, runs, progress=progress)
+        return tradeoffs.measure_forward(case, model, rule, share=share, work=work)
 
 
 def _rule(case: tradeoffs.LumpCase, model: str, name: str) -> tradeoffs.SizeRule:
@@ -216,11 +223,9 @@ def tradeoff_estimate_action(
         ladder = replace(ladder, shared_cpu_s=shared)
     inputs = hash_inputs(**{f"map_{number}": path for number, path in enumerate(maps, start=1)})
     kept = {"size_calibration": size_calibration, "tolerance_mm": tolerance_mm, "runs": runs}
-    provenance = Provenance("tradeoff estimate", kept, inputs, seed=seed).as_dict()
-    title = f"{maps[0].stem}: what more time for `estimate` buys"
-    return show(
-        ladder, varied="estimate", title=title, figure=figure, as_json=as_json, force=force, provenance=provenance
-    )
+    provenance = [Provenance("tradeoff estimate", kept, inputs, seed=seed)]
+    ladders = {f"{maps[0].stem}: what more time for `estimate` buys": ladder}
+    return show(ladders, varied="estimate", figure=figure, as_json=as_json, force=force, provenance=provenance)
 
 
 def tradeoff_map_action(
@@ -237,6 +242,6 @@ def tradeoff_map_action(
         ladder = tradeoffs.measure_map(loaded, inputs=partial(estimate_inputs, settings), work=work)
     ladder = replace(ladder, shared_cpu_s={"reading the scan": read_s})
     kept = {"tolerance_mm": tolerance_mm, "runs": runs}
-    provenance = Provenance("tradeoff map", kept, hash_inputs(scan=scan), seed=seed).as_dict()
-    title = f"{scan.stem}: what finer cells and more frames buy"
-    return show(ladder, varied="map", title=title, figure=figure, as_json=as_json, force=force, provenance=provenance)
+    provenance = [Provenance("tradeoff map", kept, hash_inputs(scan=scan), seed=seed)]
+    ladders = {f"{scan.stem}: what finer cells and more frames buy": ladder}
+    return show(ladders, varied="map", figure=figure, as_json=as_json, force=force, provenance=provenance)

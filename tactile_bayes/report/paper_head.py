@@ -15,7 +15,6 @@ from tactile_bayes.posterior.white import BumpFit
 from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE
 from tactile_bayes.report.figure_file import figure_file, finish
 from tactile_bayes.report.study import COLOURS
-from tactile_bayes.report.tradeoff import finite
 from tactile_bayes.studies.model_comparison import (
     NEAR_MM,
     MeasuredScan,
@@ -295,6 +294,11 @@ def _columns(measured: MeasuredScan, found: Sequence[ModelComparison]) -> Iterat
 
 def _cells(words: str, beside: str, *models: str) -> str:
     return f"{words:<39}{beside:>10}{''.join(f'{cell:>10}' for cell in models)}"
+
+
+def finite(value: float) -> float | None:
+    """The number; null in a file for what is none."""
+    return float(value) if np.isfinite(value) else None
 
 
 def _plain(value: float) -> str:

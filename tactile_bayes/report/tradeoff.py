@@ -8,15 +8,26 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from tactile_bayes.declarations import Meta, Record, says
+from tactile_bayes.declarations import Meta, Record
 from tactile_bayes.posterior.verdict import LIKELY, chance_text
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import SOURCES
 from tactile_bayes.report.figure_file import figure_file
-from tactile_bayes.studies.estimate_tradeoff import SIZE, Ladder, PooledRow, Priced, SizeAnswer
+from tactile_bayes.studies.estimate_tradeoff import (
+    SIZE,
+    WIDTHS,
+    Ladder,
+    PooledRow,
+    Priced,
+    Reference,
+    Seconds,
+    SizeAnswer,
+)
+from tactile_bayes.studies.tradeoffs import AMPLITUDE, ELEMENT
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 # --- One paragraph at the end of a trade-off: which setting is enough, and what would help instead.
@@ -26,9 +37,9 @@ def advice(ladder: Ladder) -> list[str]:
     """What to choose, why more buys nothing, and what moves the answer more than any arithmetic."""
     answer, limit = ladder.reference.answer, ladder.tolerance_mm
     if answer is None:
-        return [_without_number(ladder)]
+        return [_without_number(ladder), *ladder.notes]
     lines = [f"Advice: {_enough(ladder, answer)}"]
-    far = [f"{one.label} {one.off.ends:.1f} mm" for one in ladder.rows if one.off.ends > limit]
+    far = [f"{one.label} {one.ends_off_mm:.1f} mm" for one in ladder.rows if ladder.beyond(one)]
     if far:
         lines.append(f"What moves the ends more than {limit:g} mm: {'; '.join(far)}.")
     silent = [one.label for one in ladder.rows if one.answer.reported is None]
@@ -37,27 +48,28 @@ def advice(ladder: Ladder) -> list[str]:
     sized = [one for one in ladder.pooled if one.answer.reported is not None]
     if len(sized) > 1:
         first, last = sized[0], sized[-1]
-        ends, another = (first.another_half_mm, last.another_half_mm), ""
-        if all(map(math.isfinite, ends)):
+        ends, another = (first.another_half_width_mm, last.another_half_width_mm), ""
+        if None not in ends:
             another = ", and from {:.1f} to {:.1f} mm if exams differ as in the paper".format(*ends)
         lines.append(
             f"{last.maps} maps pooled instead of {first.maps} change the half width from "
             f"{first.answer.half_width_mm:.1f} to {last.answer.half_width_mm:.1f} mm for "
             f"{last.cpu_s - first.cpu_s:.2f} s of CPU{another}."
         )
-    return lines
+    return [*lines, *ladder.notes]
 
 
 def _enough(ladder: Ladder, reference: SizeAnswer) -> str:
-    best, default, shares = ladder.enough(), ladder.default, reference.shares
+    best, default, shares = ladder.enough(), ladder.default, reference.variance_share
     half = f"the interval's half width is {reference.half_width_mm:.1f} mm"
-    if best is None:
+    if best is None or best.ends_off_mm is None:
+        off = math.nan if default.ends_off_mm is None else default.ends_off_mm
         return (
             f"no setting has its interval ends within {ladder.tolerance_mm:g} mm of the reference; the default's are "
-            f"{default.off.ends:.2g} mm off, and {half}."
+            f"{off:.2g} mm off, and {half}."
         )
     took = f"{best.label}{' (the default)' if best.default else ''}: {best.seconds:.2f} s"
-    text = f"{took}, interval ends within {max(best.off.ends, 0.01):.2g} mm; more buys nothing: {half}"
+    text = f"{took}, interval ends within {max(best.ends_off_mm, 0.01):.2g} mm; more buys nothing: {half}"
     if not shares:
         return f"{text}."
     source, share = max(shares.items(), key=lambda one: one[1])
@@ -70,7 +82,7 @@ def _enough(ladder: Ladder, reference: SizeAnswer) -> str:
 def _without_number(ladder: Ladder) -> str:
     """Nothing to compare: what the settings say of a lump."""
     sized = [one.label for one in ladder.rows if one.answer.reported is not None]
-    chances = [one.answer.probability for one in ladder.rows if one.answer.probability is not None]
+    chances = [one for row in ladder.rows if (one := row.answer.detected_probability) is not None]
     span = ""
     if chances:
         ends = (chance_text(one, 3) for one in (min(chances), max(chances)))
@@ -84,138 +96,47 @@ def _without_number(ladder: Ladder) -> str:
     )
 
 
-# --- What `tradeoff estimate --json` and `tradeoff map --json` print.
+# --- What `tradeoff ... --json` prints.
 
 DIGITS: Final = 6
-Seconds = Annotated[dict[str, float], says("CPU seconds by part.")]
-
-
-class QuantityFile(Record):
-    """A median with its interval, mm."""
-
-    median: float | None
-    low: float | None
-    high: float | None
-    mc_error: float | None  #: Monte-Carlo error of the interval's ends.
-
-
-class AnswerFile(Record):
-    """What one estimate says."""
-
-    reason: str  #: Why there is no number; empty where there is one.
-    detected_probability: Annotated[float, Meta(ge=0, le=1)] | None
-    method: str  #: The method that drew.
-    quantities: dict[str, QuantityFile]  #: Medians and 95 % intervals, mm: max_size_mm, sigma_x_mm, sigma_y_mm.
-    variance_share: dict[str, float]  #: Percent of the variance of ln(largest size) by source.
-
-
-class ReferenceFile(Record):
-    """What the settings are compared with."""
-
-    words: str
-    mc_error_mm: float | None
-    half_width_mm: float | None
-    cpu_s: float
-    answer: AnswerFile | None
-
-
-class SettingFile(Record):
-    """One setting, its cost and its distance from the reference."""
-
-    axis: str
-    setting: str
-    default: bool
-    usable: bool  #: Whether it may be chosen to save time; other settings are another model or less data.
-    runs: Annotated[int, Meta(ge=1)]
-    cpu_s: Seconds
-    median_off_mm: float | None
-    ends_off_mm: float | None  #: Root mean square over runs and both ends of the reported interval.
-    width_ends_off_mm: float | None
-    answer: AnswerFile
-    frontier: bool  #: No other setting is quicker and nearer at once.
-
-
-class PooledFile(Record):
-    """The size by the first few maps of a mass."""
-
-    maps: Annotated[int, Meta(ge=1)]
-    cpu_s: float
-    answer: AnswerFile
-    another_half_width_mm: float | None  #: Half width of the interval of another exam, mm.
+Varied = Literal["estimate", "map", "forward"]
 
 
 class TradeoffFile(Record):
-    """Time against accuracy of estimates or maps."""
+    """Time against accuracy of estimates, maps or forward models."""
 
     schema: Literal["tactile-bayes/tradeoff/1"]
-    varied: Literal["estimate", "map"]
+    varied: Varied
     tolerance_mm: Annotated[float, Meta(gt=0)]
-    reference: ReferenceFile
-    settings: Annotated[tuple[SettingFile, ...], Meta(min_length=1)]
+    reference: Reference
+    settings: Annotated[tuple[Priced, ...], Meta(min_length=1)]
     enough: str | None  #: The cheapest usable setting within the tolerance.
-    pooled: tuple[PooledFile, ...]
+    pooled: tuple[PooledRow, ...]
     shared_cpu_s: Seconds
     advice: Annotated[tuple[str, ...], Meta(min_length=1)]
     provenance: dict[str, Any]
     research_use: Annotated[str, Meta(min_length=1)]
 
 
-def ladder_file(ladder: Ladder, *, varied: Literal["estimate", "map"], provenance: Mapping[str, Any]) -> TradeoffFile:
+def ladder_file(ladder: Ladder, *, varied: Varied, provenance: Mapping[str, Any]) -> TradeoffFile:
     """A ladder as its file."""
-    reference, enough, frontier = ladder.reference, ladder.enough(), set(map(id, ladder.frontier()))
-    answer = reference.answer
+    enough = ladder.enough()
     return TradeoffFile(
-        schema="tactile-bayes/tradeoff/1",
-        varied=varied,
-        tolerance_mm=ladder.tolerance_mm,
-        reference=ReferenceFile(
-            reference.words,
-            finite(reference.error_mm),
-            None if answer is None else finite(answer.half_width_mm),
-            reference.cpu_s,
-            None if answer is None else _answer(answer),
-        ),
-        settings=tuple(
-            SettingFile(
-                axis=one.axis,
-                setting=one.label,
-                default=one.default,
-                usable=one.usable,
-                runs=len(one.answers),
-                cpu_s=one.cpu_s,
-                median_off_mm=finite(one.off.median),
-                ends_off_mm=finite(one.off.ends),
-                width_ends_off_mm=finite(one.off.width_ends),
-                answer=_answer(one.answer),
-                frontier=id(one) in frontier,
-            )
-            for one in ladder.rows
-        ),
-        enough=None if enough is None else enough.label,
-        pooled=tuple(
-            PooledFile(one.maps, one.cpu_s, _answer(one.answer), finite(one.another_half_mm)) for one in ladder.pooled
-        ),
-        shared_cpu_s=ladder.shared_cpu_s,
-        advice=tuple(advice(ladder)),
-        provenance=dict(provenance),
-        research_use=RESEARCH_USE,
+        "tactile-bayes/tradeoff/1",
+        varied,
+        ladder.tolerance_mm,
+        ladder.reference,
+        ladder.rows,
+        None if enough is None else enough.label,
+        ladder.pooled,
+        ladder.shared_cpu_s,
+        tuple(advice(ladder)),
+        dict(provenance),
+        RESEARCH_USE,
     )
 
 
-def _answer(answer: SizeAnswer) -> AnswerFile:
-    quantities = {
-        name: QuantityFile(*map(finite, (one.median, one.low, one.high, one.mc_error)))
-        for name, one in answer.quantities.items()
-    }
-    return AnswerFile(answer.reason, answer.probability, answer.method, quantities, answer.shares)
-
-
-def finite(value: float) -> float | None:
-    """The number; null in a file for what is none."""
-    return value if math.isfinite(value) else None
-
-
-# --- Reports of `tradeoff estimate` and `tradeoff map` as text: the table of settings.
+# --- The report as text: the table of settings.
 
 _COLUMNS, _REASON = 80, 100
 _COST = 7  #: Columns of a part's seconds.
@@ -223,8 +144,16 @@ _SHORT = {"estimate": "est."}
 _NUMBERS = 36  #: Columns of a size with its interval and how far that is off.
 
 
+def tradeoff_text(ladders: Mapping[str, Ladder]) -> str:
+    """The whole report, ending with the research-use line; several ladders each under their title."""
+    if len(ladders) == 1:
+        return "\n".join([*map(ladder_text, ladders.values()), RESEARCH_USE])
+    parts = [f"{title}\n{ladder_text(ladder)}\n" for title, ladder in ladders.items()]
+    return "\n".join([*parts, RESEARCH_USE])
+
+
 def ladder_text(ladder: Ladder) -> str:
-    """The whole report: what to choose, the table behind it, notes and the research-use line."""
+    """What to choose, the table behind it, and notes."""
     parts, width = [_SHORT.get(name, name) for name in ladder.default.cpu_s], _name(ladder)
     costs, units = ("".join(f"{word:>{_COST}}" for word in words) for words in (parts, ["s"] * len(parts)))
     what = "size" if sized(ladder) else "sigma"
@@ -238,7 +167,8 @@ def ladder_text(ladder: Ladder) -> str:
         lines += [axis, *(line for one in rows for line in _row(one, ladder))]
     if ladder.pooled:
         lines += ["maps pooled", *(line for one in ladder.pooled for line in _pooled(one, ladder))]
-    return "\n".join([*lines, "", *_notes(ladder), RESEARCH_USE])
+    lines += _exact_maps(ladder)
+    return "\n".join([*lines, "", *_notes(ladder)])
 
 
 def _name(ladder: Ladder) -> int:
@@ -257,8 +187,8 @@ def _row(one: Priced, ladder: Ladder) -> list[str]:
     numbers = "".join(f"{seconds:>{_COST}.3f}" for seconds in one.cpu_s.values()) + _number(one.answer)
     notes = []
     if one.answer.reported is not None:
-        for off in (one.off.ends, one.off.width_ends):
-            numbers += f"{f'{off:.3f}' if math.isfinite(off) else '-':>7}"
+        for off in (one.ends_off_mm, one.width_ends_off_mm):
+            numbers += f"{'-' if off is None else f'{off:.3f}':>7}"
         if SIZE not in one.answer.quantities and sized(ladder):
             notes.append("    (a width: this map has no size)")
         if one.answer.method == "ensemble" and "ensemble" not in one.label:
@@ -274,8 +204,9 @@ def _number(answer: SizeAnswer) -> str:
         return f"{found.median:>7.2f}{f'{found.low:.2f} to {found.high:.2f}':>15}"
     if len(reason) > _REASON:
         reason = f"{reason[: _REASON - 3]}..."
-    named = answer.probability is None or "probability" in reason
-    return f"  {reason}" if named else f"  probability of a lump {answer.probability:.2g}: {reason}"
+    chance = answer.detected_probability
+    named = chance is None or "probability" in reason
+    return f"  {reason}" if named else f"  probability of a lump {chance:.2g}: {reason}"
 
 
 def _pooled(one: PooledRow, ladder: Ladder) -> list[str]:
@@ -284,21 +215,47 @@ def _pooled(one: PooledRow, ladder: Ladder) -> list[str]:
     if one.answer.reported is None:
         return [line]
     half = f"    half width {one.answer.half_width_mm:.2f} mm"
-    if math.isfinite(one.another_half_mm):
-        half += f", {one.another_half_mm:.2f} if exams differ as in the paper"
+    if one.another_half_width_mm is not None:
+        half += f", {one.another_half_width_mm:.2f} if exams differ as in the paper"
     return [line, half]
 
 
+def _exact(answer: SizeAnswer) -> bool:
+    """Whether an answer is of a forward model's map, which has no errors."""
+    return AMPLITUDE in answer.quantities
+
+
+def _exact_maps(ladder: Ladder) -> Iterator[str]:
+    """Of maps without errors what they show, and how far that is off the reference, with its sign."""
+    best = ladder.reference.answer
+    if best is None or not _exact(best):
+        return
+    columns = ((ELEMENT, 6, 2), (AMPLITUDE, 7, 4), (WIDTHS[0], 7, 3), (WIDTHS[1], 7, 3))
+    yield from ("", f"{'the map':<25}{'mesh':>6}{'a':>7}{'sig. x':>7}{'sig. y':>7}   off, %")
+    yield f"{'':<25}{'mm':>6}{'':>7}{'mm':>7}{'mm':>7}{'a':>7}{'x':>7}{'y':>7}{'size':>7}"
+    for label, answer in (("the finest", best), *((one.label, one.answer) for one in ladder.rows)):
+        told, line = answer.quantities, f"{label:<25}"
+        for name, width, digits in columns:
+            line += f"{f'{told[name].median:.{digits}f}' if name in told else '':>{width}}"
+        for name in (AMPLITUDE, *WIDTHS, SIZE) if answer is not best else ():
+            known = name in told and name in best.quantities
+            line += f"{f'{100 * (told[name].median / best.quantities[name].median - 1):+.2f}' if known else '':>7}"
+        yield line.rstrip()
+
+
 def _notes(ladder: Ladder) -> Iterator[str]:
-    yield "* is the default. CPU seconds of this machine, warm, the least of the runs; the interval is of this exam."
+    reference, interval, error = ladder.reference, "of this exam", ""
+    if reference.answer is not None and _exact(reference.answer):
+        interval = "what the calibration leaves"
+    elif reference.answer is not None:
+        error = f"its own Monte-Carlo error is {reference.mc_error_mm:.2g} mm, "
+    yield f"* is the default. CPU seconds of this machine, warm, the least of the runs; the interval is {interval}."
     if any("optimise" in one.label or one.axis == "fit window" for one in ladder.rows) and sized(ladder):
         yield "Least squares and other windows: sized as if the calibration were learned so; `estimate` refuses that."
-    reference = ladder.reference
     if reference.answer is not None:
         yield (
             "ends, widths: mm off, root mean square over runs and both ends, from a reference: "
-            f"{reference.words}; its own Monte-Carlo error is {reference.error_mm:.2g} mm, its cost "
-            f"{reference.cpu_s:.1f} s."
+            f"{reference.words}; {error}its cost {reference.cpu_s:.1f} s."
         )
     else:
         yield "There is no reference to compare with: what it would be made from has no size."
@@ -315,68 +272,73 @@ Box = tuple[float, float, float, float]
 _LEAST_MM = 1e-3  #: Smaller distances are drawn here: below rounding of what anybody reads.
 
 
-def draw_ladder(ladder: Ladder, path: Path, *, title: str, force: bool = False) -> None:
-    """Draw every setting as a point, with the frontier and the lines that say what matters.
+def draw_ladders(ladders: Mapping[str, Ladder], path: Path, *, force: bool = False) -> None:
+    """Draw every setting as a point, with the frontier and the lines that say what matters; ladders by their titles.
 
     Without a reference there is no distance: then the probability of a lump is drawn.
     """
-    with figure_file(path, size_in=(10.0, 6.0), force=force) as figure:
-        axes = figure.subplots()
-        shown = [one for one in ladder.rows if math.isfinite(_height(one, ladder))]
-        for i, axis in enumerate(dict.fromkeys(one.axis for one in shown)):
-            rows = [one for one in shown if one.axis == axis]
-            axes.plot(*_places(rows, ladder), _MARKS[i % 6], color=_COLOURS[i % 6], label=axis, zorder=3)
-        default = [one for one in shown if one.default]
-        axes.plot(*_places(default, ladder), "o", ms=15, mfc="none", mec="k", mew=1.5, label="the default", zorder=4)
-        answer = ladder.reference.answer
-        if answer is not None:
-            frontier = _places(ladder.frontier(), ladder)
-            axes.step(*frontier, where="post", color="0.3", lw=1.0, label="frontier", zorder=2)
-            axes.set_ylabel("distance of the interval's ends from the reference, mm (rms)")
-            axes.set_yscale("log")
-            axes.yaxis.set_major_formatter("{x:g}")
-            _draw_level(axes, answer.half_width_mm, "k", "-", "half width of the interval")
-            _draw_level(axes, ladder.tolerance_mm, "0.5", "--", "tolerance")
-            _draw_level(axes, ladder.reference.error_mm, "0.5", ":", "the reference's own error")
-        else:
-            axes.set_ylabel("probability of a lump (no size to compare)")
-            axes.set_ylim(-0.05, 1.15)
-            axes.axhline(LIKELY, color="0.5", ls="--", lw=1.0, label=f"needed for a size, {LIKELY:g}")
-        if shown:
-            axes.set_xscale("log")
-            axes.xaxis.set_major_formatter("{x:g}")
-            axes.xaxis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "235" else "")
-            axes.margins(x=0.12, y=0.08)
-            _draw_names(axes, shown, ladder)
-        axes.set_xlabel("CPU time, s")
-        axes.set_title(title, fontsize=10)
-        figure.legend(loc="outside right upper", fontsize=8, frameon=False)
+    with figure_file(path, size_in=(10.0, 6.0 * len(ladders)), force=force) as figure:
+        parts: Any = [figure] if len(ladders) == 1 else figure.subfigures(len(ladders), 1)
+        for part, (title, ladder) in zip(parts, ladders.items(), strict=True):
+            axes = part.subplots()
+            _draw_ladder(figure, axes, ladder)
+            axes.set_title(title, fontsize=10)
+            part.legend(loc="outside right upper", fontsize=8, frameon=False)
+
+
+def _draw_ladder(figure: Figure, axes: Axes, ladder: Ladder) -> None:
+    shown = [one for one in ladder.rows if math.isfinite(_height(one, ladder))]
+    for i, axis in enumerate(dict.fromkeys(one.axis for one in shown)):
+        rows = [one for one in shown if one.axis == axis]
+        axes.plot(*_places(rows, ladder), _MARKS[i % 6], color=_COLOURS[i % 6], label=axis, zorder=3)
+    default = [one for one in shown if one.default]
+    axes.plot(*_places(default, ladder), "o", ms=15, mfc="none", mec="k", mew=1.5, label="the default", zorder=4)
+    reference = ladder.reference
+    if reference.answer is not None:
+        frontier = _places(ladder.frontier(), ladder)
+        axes.step(*frontier, where="post", color="0.3", lw=1.0, label="frontier", zorder=2)
+        axes.set_ylabel("distance of the interval's ends from the reference, mm (rms)")
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        _draw_level(axes, reference.half_width_mm, "k", "-", "half width of the interval")
+        _draw_level(axes, ladder.tolerance_mm, "0.5", "--", "tolerance")
+        _draw_level(axes, reference.mc_error_mm, "0.5", ":", "the reference's own error")
+    else:
+        axes.set_ylabel("probability of a lump (no size to compare)")
+        axes.set_ylim(-0.05, 1.15)
+        axes.axhline(LIKELY, color="0.5", ls="--", lw=1.0, label=f"needed for a size, {LIKELY:g}")
+    if shown:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "235" else "")
+        axes.margins(x=0.12, y=0.08)
+        _draw_names(figure, axes, shown, ladder)
+    axes.set_xlabel("CPU time, s")
 
 
 def _height(one: Priced, ladder: Ladder) -> float:
     """Distance from the reference, mm; without a reference the probability of a lump."""
     if ladder.reference.answer is not None:
-        return max(one.off.ends, _LEAST_MM)
-    return float("nan") if one.answer.probability is None else one.answer.probability
+        return math.nan if one.ends_off_mm is None else max(one.ends_off_mm, _LEAST_MM)
+    return math.nan if one.answer.detected_probability is None else one.answer.detected_probability
 
 
 def _places(rows: Sequence[Priced], ladder: Ladder) -> tuple[list[float], list[float]]:
     return [max(one.seconds, 1e-4) for one in rows], [_height(one, ladder) for one in rows]
 
 
-def _draw_level(axes: Axes, value: float, colour: str, style: str, name: str) -> None:
+def _draw_level(axes: Axes, value: float | None, colour: str, style: str, name: str) -> None:
     """A level line, named at the right; none for 0."""
-    if value > 0:
+    if value:
         place, text = (1.0, max(value, _LEAST_MM)), f"{name}, {value:.2g} mm"
         axes.axhline(place[1], color=colour, ls=style, lw=1.0, zorder=1)
         how: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
         axes.annotate(text, place, xytext=(-4, 3), fontsize=8, ha="right", color=colour, **how)
 
 
-def _draw_names(axes: Axes, shown: Sequence[Priced], ladder: Ladder) -> None:
+def _draw_names(figure: Figure, axes: Axes, shown: Sequence[Priced], ladder: Ladder) -> None:
     """A name beside each point, moved up or down until it covers no other name and no point."""
-    figure = axes.figure
-    figure.draw_without_rendering()  # type: ignore[union-attr]
+    figure.draw_without_rendering()
     scale = 72.0 / figure.dpi
     right = axes.get_window_extent().x1 * scale
     points = zip(*_places(shown, ladder), strict=True)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, Generic, TypeVar
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, Generic, TypeVar
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, field, replace
+from tactile_bayes.declarations import Meta, Record, field, replace, says
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.inference.draws import Quantity, summarise
 from tactile_bayes.mapping.map import TactileMap
@@ -18,89 +19,100 @@ from tactile_bayes.presets import INTERVAL, MOST_FIELD_COSINES, Background
 from tactile_bayes.progress import Progress, untold
 from tactile_bayes.size.pooling import Calibration
 
-# --- The reported numbers of one estimate, and how far they lie from a reference.
+# --- The reported numbers of one setting, and how far they lie from a reference.
 
 SIZE = "max_size_mm"
 WIDTHS = ("sigma_x_mm", "sigma_y_mm")
 
 
+class Interval(Record):
+    """A median with its interval."""
+
+    median: float
+    low: float
+    high: float
+    mc_error: float  #: Monte-Carlo error of the interval's ends.
+
+
 class SizeAnswer(Record):
-    """Reported numbers of one estimate."""
+    """What one setting says."""
 
     reason: str  #: Why there is no number; empty where there is one.
-    probability: float | None = None  #: Of a lump; None where nothing could be tested.
-    quantities: dict[str, Quantity] = field(default_factory=dict)
-    """The largest size and the two widths by name, mm: the size is missing without a calibration, all are without an
-    estimate."""
-    method: str = ""  #: The method that drew; empty where none did.
-    shares: dict[str, float] = field(default_factory=dict)
-    """Percent of the variance of ln(largest size) by source, see `SizePosterior.variance_share`."""
-    code: str = ""  #: Of the reason, see `posterior.abstention`; ``"method"`` where no method converged.
+    detected_probability: Annotated[float, Meta(ge=0, le=1)] | None
+    method: str  #: The method that drew.
+    quantities: dict[str, Interval]
+    """Medians and 95 % intervals, mm: max_size_mm, sigma_x_mm, sigma_y_mm; of a forward model also amplitude, and
+    element_mm of its mesh."""
+    variance_share: dict[str, float]  #: Percent of the variance of ln(largest size) by source.
 
     @property
-    def reported(self) -> Quantity | None:
+    def reported(self) -> Interval | None:
         """The largest size; without a calibration the width across the head, without an estimate None."""
         return self.quantities.get(SIZE, self.quantities.get(WIDTHS[0]))
 
     @property
-    def half_width_mm(self) -> float:
-        """Half the width of the reported interval; NaN where there is none."""
+    def half_width_mm(self) -> float | None:
+        """Half the width of the reported interval; None where there is none."""
         found = self.reported
-        return float("nan") if found is None else 0.5 * (found.high - found.low)
+        return None if found is None else 0.5 * (found.high - found.low)
+
+
+class Unconverged(SizeAnswer):
+    """An answer without numbers because no method converged."""
+
+
+def no_number(reason: str, probability: float | None = None, *, converged: bool = True) -> SizeAnswer:
+    """An answer without numbers, with the probability of a lump where that could be tested."""
+    kind = SizeAnswer if converged else Unconverged
+    return kind(reason, probability, "", {}, {})
 
 
 def answer_of(estimate: Estimate, *, probability: float) -> SizeAnswer:
     """An estimate as its reported numbers, with intervals of the given probability."""
     if estimate.map_posterior is None or estimate.draws is None:
-        return SizeAnswer(estimate.reason, estimate.probability, code=estimate.code)
+        return no_number(estimate.reason, estimate.probability, converged=estimate.code != "method")
     replicates = estimate.draws.replicates
     found = {
         name: summarise(getattr(estimate.map_posterior, name), probability=probability, replicates=replicates)
         for name in WIDTHS
     }
-    shares: dict[str, float] = {}
     if estimate.size is not None:
         found[SIZE] = estimate.size.summarise(SIZE, probability=probability)
-        shares = estimate.size.variance_share
-    return SizeAnswer("", estimate.probability, found, estimate.draws.method, shares)
+    shares = {} if estimate.size is None else estimate.size.variance_share
+    return SizeAnswer("", estimate.probability, estimate.draws.method, intervals(found), shares)
 
 
-class Deviation(Record):
-    """Root mean square distances from a reference, mm."""
-
-    median: float
-    ends: float
-    """`median`, `ends`: Of the reported quantity: its median, and both ends of its interval."""
-    width_ends: float  #: Of both widths: the ends of their intervals.
+def intervals(found: Mapping[str, Quantity]) -> dict[str, Interval]:
+    """Of summaries what a trade-off reports."""
+    return {name: Interval(one.median, one.low, one.high, one.mc_error) for name, one in found.items()}
 
 
-UNKNOWN = Deviation(float("nan"), float("nan"), float("nan"))
+Distances = tuple[float | None, float | None, float | None]
 
 
-def deviation(answers: Sequence[SizeAnswer], reference: SizeAnswer | None) -> Deviation:
-    """How far answers lie from a reference; NaN where one of them, or the reference, has no number of the same kind."""
+def distances(answers: Sequence[SizeAnswer], reference: SizeAnswer | None) -> Distances:
+    """How far answers lie from a reference, mm: the reported median, the ends of its interval, and those of the widths.
+
+    Root mean squares over answers and ends; None where one of them, or the reference, has no number of the same kind.
+    """
     if reference is None or reference.reported is None or not answers:
-        return UNKNOWN
+        return None, None, None
     if any(one.quantities.keys() != reference.quantities.keys() for one in answers):
-        return UNKNOWN
-    name = SIZE if SIZE in reference.quantities else WIDTHS[0]
-    return Deviation(
-        _apart(answers, reference, [name], ["median"]),
-        _apart(answers, reference, [name], ["low", "high"]),
-        _apart(answers, reference, WIDTHS, ["low", "high"]),
-    )
+        return None, None, None
+    name, widths = SIZE if SIZE in reference.quantities else WIDTHS[0], [x for x in WIDTHS if x in reference.quantities]
 
+    def apart(names: Sequence[str], ends: Sequence[str]) -> float:
+        pairs = [(one.quantities[name], reference.quantities[name]) for one in answers for name in names]
+        gaps = [getattr(ours, end) - getattr(theirs, end) for ours, theirs in pairs for end in ends]
+        return float(np.sqrt(np.mean(np.square(gaps))))
 
-def _apart(answers: Sequence[SizeAnswer], reference: SizeAnswer, names: Sequence[str], ends: Sequence[str]) -> float:
-    """Root mean square distance of numbers of answers, by name and end, from the reference's."""
-    pairs = [(one.quantities[name], reference.quantities[name]) for one in answers for name in names]
-    gaps = [getattr(ours, end) - getattr(theirs, end) for ours, theirs in pairs for end in ends]
-    return float(np.sqrt(np.mean(np.square(gaps))))
+    return apart([name], ["median"]), apart([name], ["low", "high"]), apart(widths, ["low", "high"])
 
 
 # --- Settings with what each costs and answers, against one reference; the frontier, and which setting is enough.
 
 Clock = Callable[[], float]
+Seconds = Annotated[dict[str, float], says("CPU seconds by part.")]
 WORTH = 0.8  #: A setting that takes more than this share of the default's time is not worth a choice.
 MOST_S = 4.0  #: CPU seconds after which a setting is not run again: its least time is known well enough.
 
@@ -134,50 +146,50 @@ class Choice(Record, Generic[How]):
 
 
 class Priced(Record):
-    """A setting with its cost and answers; `axis`, `label`, `default` and `usable` as of `Choice`."""
+    """One setting, its cost and its distance from the reference."""
 
     axis: str
-    label: str
-    cpu_s: dict[str, float]
-    """Least CPU time of the runs, each part by name ("map", "estimate"); their sum is the setting's cost."""
-    answers: tuple[SizeAnswer, ...]  #: One for each run.
-    off: Deviation  #: From the reference.
-    default: bool = False
-    usable: bool = True
+    label: str = field(name="setting")
+    default: bool
+    usable: bool  #: Whether it may be chosen to save time; other settings are another model or less data.
+    runs: Annotated[int, Meta(ge=1)]
+    cpu_s: Seconds
+    median_off_mm: float | None
+    ends_off_mm: float | None  #: Root mean square over runs and both ends of the reported interval.
+    width_ends_off_mm: float | None
+    answer: SizeAnswer  #: The first run's.
+    frontier: bool  #: No other setting is quicker and nearer at once.
 
     @property
     def seconds(self) -> float:
-        """CPU time of all parts."""
+        """CPU time of all parts, of the run that took least."""
         return sum(self.cpu_s.values())
-
-    @property
-    def answer(self) -> SizeAnswer:
-        """The first run's."""
-        return self.answers[0]
 
 
 class Reference(Record):
     """What the settings are compared with."""
 
-    words: str  #: How it was made.
-    answer: SizeAnswer | None  #: None where there is none.
-    cpu_s: float  #: What it took.
+    words: str
+    mc_error_mm: float | None
+    half_width_mm: float | None
+    cpu_s: float
+    answer: SizeAnswer | None
 
-    @property
-    def error_mm(self) -> float:
-        """Monte-Carlo error of the reported interval's ends; NaN where there is no number."""
-        found = None if self.answer is None else self.answer.reported
-        return float("nan") if found is None else found.mc_error
+
+def reference_of(words: str, answer: SizeAnswer | None, cpu_s: float) -> Reference:
+    """A reference with the half width of its reported interval and the Monte-Carlo error of its ends."""
+    if answer is None or answer.reported is None:
+        return Reference(words, None, None, cpu_s, answer)
+    return Reference(words, answer.reported.mc_error, answer.half_width_mm, cpu_s, answer)
 
 
 class PooledRow(Record):
-    """The size by the first few of several maps of one mass."""
+    """The size by the first few maps of a mass."""
 
-    maps: int  #: How many.
+    maps: Annotated[int, Meta(ge=1)]
     cpu_s: float  #: Of their estimates and of pooling.
-    answer: SizeAnswer  #: The reported size; a reason where there is none.
-    another_half_mm: float = float("nan")
-    """Half width of the second interval, of another exam that may differ as in the paper; NaN where there is none."""
+    answer: SizeAnswer
+    another_half_width_mm: float | None  #: Half width of the interval of another exam, mm.
 
 
 class Ladder(Record):
@@ -190,6 +202,7 @@ class Ladder(Record):
     """What every setting needs besides, by name, such as reading the file or starting the program."""
     pooled: tuple[PooledRow, ...] = ()
     """The size by the first map of one mass, by the first two, and so on; empty where one was given."""
+    notes: tuple[str, ...] = ()  #: What else matters for the choice, in sentences.
 
     @property
     def default(self) -> Priced:
@@ -198,19 +211,25 @@ class Ladder(Record):
 
     def enough(self) -> Priced | None:
         """The cheapest usable setting within the tolerance, or the default where that costs hardly more."""
-        within = [one for one in self.rows if one.usable and one.off.ends <= self.tolerance_mm]
+        within = [one for one in self.rows if one.usable and not self.beyond(one) and one.ends_off_mm is not None]
         if not within:
             return None
         best = min(within, key=lambda one: one.seconds)
         return self.default if self.default in within and best.seconds > WORTH * self.default.seconds else best
 
+    def beyond(self, one: Priced) -> bool:
+        """Whether a setting's interval ends are further off than the tolerance."""
+        return one.ends_off_mm is not None and one.ends_off_mm > self.tolerance_mm
+
     def frontier(self) -> list[Priced]:
         """The settings that no other beats in time and distance at once, the cheapest first."""
         found: list[Priced] = []
-        known = [one for one in self.rows if one.off.ends == one.off.ends]
-        for one in sorted(known, key=lambda one: (one.seconds, one.off.ends)):
-            if not found or one.off.ends < found[-1].off.ends:
+        least = math.inf
+        known = [(one.seconds, one.ends_off_mm, one) for one in self.rows if one.ends_off_mm is not None]
+        for _, off, one in sorted(known, key=lambda each: each[:2]):
+            if off < least:
                 found.append(one)
+                least = off
         return found
 
 
@@ -229,8 +248,8 @@ def priced(one: Choice[How], run: Run[How], reference: Reference, *, runs: int) 
         # the first run also imports: a second one is worth its wait
         if number >= 1 and sum(sum(parts.values()) for parts in spent) > MOST_S:
             break
-    least, off = min(spent, key=lambda parts: sum(parts.values())), deviation(answers, reference.answer)
-    return Priced(one.axis, one.label, least, tuple(answers), off, one.default, one.usable)
+    least, off = min(spent, key=lambda parts: sum(parts.values())), distances(answers, reference.answer)
+    return Priced(one.axis, one.label, one.default, one.usable, len(answers), least, *off, answers[0], False)
 
 
 def default_run(how: How, run: Run[How]) -> tuple[float, SizeAnswer]:
@@ -254,7 +273,9 @@ def climbed(
     for number, one in enumerate(choices, start=1):
         rows.append(priced(one, run, made, runs=work.runs))
         work.progress(number, len(choices))
-    return Ladder(tuple(rows), made, work.tolerance_mm)
+    ladder = Ladder(tuple(rows), made, work.tolerance_mm)
+    best = set(map(id, ladder.frontier()))
+    return replace(ladder, rows=tuple(replace(one, frontier=id(one) in best) for one in rows))
 
 
 # --- Cost of accuracy on one map: whole estimates at many settings against a long run of the default's posterior.
@@ -313,7 +334,7 @@ def worth_trying(settings: list[Setting], answer: SizeAnswer) -> list[Setting]:
     Without draws their number plays no part. Where the default has fallen through to chains, noise fields and windows
     are tried by laplace: chains for each would take minutes.
     """
-    if answer.reported is None and answer.code != "method":
+    if answer.reported is None and not isinstance(answer, Unconverged):
         kept = [one for one in settings if one.axis != ACCURACY]
         return [replace(one, weight=min(one.weight, 1.0)) if one.axis == METHOD else one for one in kept]
     default = settings[0].how
@@ -359,21 +380,22 @@ class Estimator(Record):
             found = estimate_map(self.tactile_map, calibration=calibration, options=options, rng=rng)
             answer = answer_of(found, probability=self.work.probability)
         except NotConvergedError as error:
-            answer = SizeAnswer(str(error), code="method")
+            answer = no_number(str(error), converged=False)
         return {"estimate": self.work.clock() - begun}, answer
 
     def reference(self, options: SamplerSettings) -> Reference:
         """The same posterior by the first long run that converges; without one, or without a lump, no answer."""
-        spent, answer = 0.0, SizeAnswer("")
+        spent, why = 0.0, ""
         for method, accuracy in LONG_RUNS:
             seconds, answer = self.run(_by(options, method, accuracy), -1 % 2**32)
-            spent += seconds["estimate"]
+            spent, why = spent + seconds["estimate"], answer.reason
             if answer.reported is not None:
                 name = "importance sampling" if method == "importance" else "MCMC (four ensembles)"
-                return Reference(f"{name} of the default's posterior, asked for {accuracy:g} SD", answer, spent)
-            if answer.code != "method":  # no draws are made, so none can be more exact
+                words = f"{name} of the default's posterior, asked for {accuracy:g} SD"
+                return reference_of(words, answer, spent)
+            if not isinstance(answer, Unconverged):  # no draws are made, so none can be more exact
                 break
-        return Reference(f"none: {answer.reason}", None, spent)
+        return reference_of(f"none: {why}", None, spent)
 
 
 def measure(

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, cast
 
 import numpy as np
+from scipy.special import ndtri
 
 from tactile_bayes.declarations import Record, as_dict, field, replace
 from tactile_bayes.errors import BadDataError
@@ -21,27 +22,31 @@ from tactile_bayes.presets import CELL_MM, DEFAULT_NORMALISE, NORMALISE, SHOULDE
 from tactile_bayes.scans import Scan
 from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
 from tactile_bayes.size.pooling import Calibration
-from tactile_bayes.size.terms import outside_domain
 from tactile_bayes.studies import paper
 from tactile_bayes.studies.estimate_tradeoff import (
+    SIZE,
+    WIDTHS,
     Choice,
-    Clock,
     Estimator,
+    Interval,
     Ladder,
     Reference,
     SizeAnswer,
     Work,
     climbed,
     default_run,
+    no_number,
+    reference_of,
 )
 from tactile_bayes.studies.paper_solid import SolidSettings
 
 # --- Cost and error of each forward model and setting for one lump, measured on this machine.
 #
-# The same lump is mapped by the empirical model, by the plane-strain one at several cells, and by the solid one at
+# The same lump is mapped by the plane-strain model at several cells, with Eqs 1 to 4 beside it, and by the solid one at
 # several meshes, ranks and rims. Each model's finest setting is the reference of its others.
 
-EMPIRICAL, PLANE, SOLID = "empirical", "plane-strain", "solid"
+PLANE, SOLID = "plane-strain", "solid"
+AMPLITUDE, ELEMENT = "amplitude", "element_mm"
 # Fineness of the mesh and cell of the contact in mm, the finest last.
 _PLANE = ((1, 0.5), (1, 0.25), (2, 0.5), (2, 0.25), (3, 0.25), (4, 0.125))
 _RANKS = (1e-3, 1e-4)
@@ -69,41 +74,16 @@ class LumpCase(Record):
         """Geometry and tissues of the body."""
         return self.plane.body(self.d_mm, self.depth_ratio, seat=self.seat)
 
-    @property
-    def heads(self) -> dict[str, str]:
-        """Place of the shoulders of each model's head, one of `presets.HEADS`."""
-        return {PLANE: self.plane.head.shoulders, SOLID: self.solid.head.shoulders}
+    def of(self, model: str) -> paper.StudySettings | SolidSettings:
+        """The default settings of a model, `PLANE` or `SOLID`."""
+        return self.solid if model == SOLID else self.plane
 
 
-class Setting(Record):
+class Computed(Record):
     """One way to compute the map."""
 
-    model: str
-    """``"empirical"``, ``"plane-strain"`` or ``"solid"``."""
-    label: str  #: For people.
     settings: paper.StudySettings | SolidSettings
-    """Of the model; the empirical one is fitted to plane-strain frames of these."""
-    kind: str
-    """``"mesh"`` where only the elements differ from the default, ``"default"``, ``"reference"`` for the finest mesh,
-    else what differs."""
-
-
-class Measured(Record):
-    """Cost and map of one setting."""
-
-    setting: Setting  #: What was measured.
-    element_mm: float  #: Mean length of an element on the lump's surface.
-    lump_s: float  #: CPU for a lump: mesh, factorisation, condensing, the head on the body.
-    map_s: float  #: CPU for another stiffness of it: its frames and their map.
-    amplitude: float
-    sigma_x_mm: float
-    sigma_y_mm: float | None
-    """`amplitude`, `sigma_x_mm`, `sigma_y_mm`: The map's Gaussian; no `sigma_y_mm` in two dimensions."""
-
-    @property
-    def seconds(self) -> float:
-        """CPU seconds for one map from scratch."""
-        return self.lump_s + self.map_s
+    empirical: bool = False  #: By Eqs 1 to 4, fitted to plane-strain frames of these settings.
 
 
 def case_of(scene: Scene, *, head: str | None = None) -> LumpCase:
@@ -134,52 +114,101 @@ def case_of(scene: Scene, *, head: str | None = None) -> LumpCase:
     return case
 
 
-def forward_settings(case: LumpCase) -> list[Setting]:
-    """All settings to compare: within a model the cheap ones first, its reference last."""
-    plane, solid = case.plane, case.solid
-    found = [Setting(EMPIRICAL, "Eqs 1 to 4", plane, "default")]
-    for fineness, cell in _PLANE[:-1]:
-        chosen = replace(plane, fineness=fineness, cell_mm=cell)
-        kind = "default" if chosen == plane else "mesh" if cell == plane.cell_mm else "contact cell"
-        found.append(Setting(PLANE, f"fineness {fineness}, cell {cell:g} mm", chosen, kind))
-    for fineness in _FINENESSES[:-1]:
-        finer = replace(solid, fineness=fineness)
-        found.append(Setting(SOLID, f"fineness {fineness}", finer, "default" if finer == solid else "mesh"))
-    for rank in _RANKS:
-        found.append(Setting(SOLID, f"rank tolerance {rank:g}", replace(solid, rank_tolerance=rank), "rank"))
+def forward_settings(case: LumpCase, model: str) -> tuple[list[Choice[Computed]], Choice[Computed]]:
+    """All settings of a model to compare, the cheap ones first, and the finest, which is their reference."""
+    if model == SOLID:
+        return _solid_settings(case.solid)
+    found = []
+    for fineness, cell in _PLANE:
+        chosen = replace(case.plane, fineness=fineness, cell_mm=cell)
+        words = f"fineness {fineness}, cell {cell:g} mm"
+        found.append(Choice("mesh and contact", words, Computed(chosen), default=chosen == case.plane))
+    empirical = Choice("another model", "Eqs 1 to 4", Computed(case.plane, empirical=True), usable=False)
+    return [*found[:-1], empirical], found[-1]
+
+
+def _solid_settings(solid: SolidSettings) -> tuple[list[Choice[Computed]], Choice[Computed]]:
+    finer = [replace(solid, fineness=fineness) for fineness in _FINENESSES]
+    found = [Choice("mesh", f"fineness {one.fineness}", Computed(one), default=one == solid) for one in finer]
     edge = "shoulders" if solid.head.shoulders == SHOULDERS_INSIDE else "rim"
-    bare = replace(solid, head=replace(solid.head, shoulder_mm=0.0, rim_mm=0.0))
-    (fineness, cell), finest = _PLANE[-1], _FINENESSES[-1]
-    reference = replace(plane, fineness=fineness, cell_mm=cell)
-    return [
-        *found,
-        Setting(SOLID, f"mesh ends at {_REACH_MM:g} mm", replace(solid, mesh_reach_mm=_REACH_MM), "reach"),
-        Setting(SOLID, f"head without its {edge}", bare, "rim"),
-        Setting(PLANE, f"fineness {fineness}, cell {cell:g} mm", reference, "reference"),
-        Setting(SOLID, f"fineness {finest}", replace(solid, fineness=finest), "reference"),
-    ]
+    bare = replace(solid.head, shoulder_mm=0.0, rim_mm=0.0)
+    others = [("rank", f"rank tolerance {rank:g}", replace(solid, rank_tolerance=rank)) for rank in _RANKS]
+    others.append(("reach", f"mesh ends at {_REACH_MM:g} mm", replace(solid, mesh_reach_mm=_REACH_MM)))
+    others.append(("head", f"head without {edge}", replace(solid, head=bare)))
+    choices = [Choice(axis, label, Computed(how), usable=False) for axis, label, how in others]
+    return [*found[:-1], *choices], found[-1]
 
 
-def measure_forward(case: LumpCase, setting: Setting, *, clock: Clock, runs: int = 1) -> Measured:
-    """Compute the map by one setting and measure the time, of so many `runs` the least.
+def measure_forward(case: LumpCase, model: str, rule: SizeRule, *, share: float, work: Work) -> Ladder:
+    """Compute the lump's map at every setting of a model.
 
-    `clock` is called before and after each part.
+    The ladder's tolerance is a `share` of the reference's size.
     """
-    times: list[tuple[float, float]] = []
-    settings: paper.CaseSettings = setting.settings
-    for _ in range(runs):
-        begun = clock()
-        maps = _empirical(case) if setting.model == EMPIRICAL else settings.maps(case.body)
-        middle = clock()
+
+    def run(how: Computed, _number: int) -> tuple[dict[str, float], SizeAnswer]:
+        begun, settings = work.clock(), cast("paper.CaseSettings", how.settings)
+        maps = _empirical(case) if how.empirical else settings.maps(case.body)
+        middle = work.clock()
         found = settings.fitted(maps(case.stiffness_ratio))
-        times.append((middle - begun, clock() - middle))
-    lump, one_map = np.min(times, axis=0)
+        seconds = {"lump": middle - begun, "map": work.clock() - middle}
+        return seconds, _exact_answer(found, _element_mm(case.body, how.settings), rule)
+
+    choices, finest = forward_settings(case, model)
+    default_s, _ = default_run(Computed(case.of(model)), run)
+    seconds, answer = run(finest.how, 0)
+    made = reference_of(f"{model}, {finest.label}", answer, sum(seconds.values()))
+    assert answer.reported is not None  # a width at least
+    limit = float(f"{share * answer.reported.median:.3g}")
+    ladder = climbed(choices, run, lambda: made, default_s=default_s, work=replace(work, tolerance_mm=limit))
+    left = f"leaves {100 * rule.scatter:.0f} % (SD of ln d): that is the interval, for these maps have no errors"
+    notes = [f"Sizes by {rule.source}, which itself {left}."]
+    if outside := rule.outside(*numbers_of(answer)):
+        notes.append(f"The map is none of the calibration's: {', '.join(outside)}.")
+    return replace(ladder, notes=tuple(notes))
+
+
+def _element_mm(body: Body, settings: paper.StudySettings | SolidSettings) -> float:
+    """Mean length of an element on the lump's surface: half the circumference over its elements."""
     if isinstance(settings, SolidSettings):
-        mesh = lump_mesh(settings.geometry(case.body), settings.mesh_size)
+        mesh = lump_mesh(settings.geometry(body), settings.mesh_size)
     else:
-        mesh = body_mesh(case.body, fineness=settings.fineness, layered=False)
-    element = float(np.pi * case.body.radius_mm / ((len(mesh.rim) - 1) / 2))  # half the circumference over its elements
-    return Measured(setting, element, float(lump), float(one_map), found.amplitude, *found.widths_mm)
+        mesh = body_mesh(body, fineness=settings.fineness, layered=False)
+    return float(np.pi * body.radius_mm / ((len(mesh.rim) - 1) / 2))
+
+
+def _exact_answer(fitted: paper.MapFit, element_mm: float, rule: SizeRule) -> SizeAnswer:
+    """A map without errors; the interval of its size is what the calibration leaves."""
+    exact = {AMPLITUDE: fitted.amplitude, **dict(zip(WIDTHS, fitted.widths_mm, strict=True)), ELEMENT: element_mm}
+    found = {name: Interval(value, value, value, 0.0) for name, value in exact.items() if value is not None}
+    size = rule.size_mm(fitted.amplitude, *fitted.widths_mm)
+    if np.isfinite(size):
+        low, high = (size * float(np.exp(z * np.nan_to_num(rule.scatter))) for z in ndtri([0.025, 0.975]))
+        found[SIZE] = Interval(size, low, high, 0.0)
+    return SizeAnswer("", None, "", found, {})
+
+
+def numbers_of(answer: SizeAnswer) -> tuple[float, float, float | None]:
+    """Amplitude and both widths of a map without errors."""
+    amplitude, across = (answer.quantities[name].median for name in (AMPLITUDE, WIDTHS[0]))
+    along = answer.quantities.get(WIDTHS[1])
+    return amplitude, across, None if along is None else along.median
+
+
+def dimensions_note(case: LumpCase, plane: Ladder, solid: Ladder, rules: Mapping[str, SizeRule]) -> str:
+    """What two dimensions themselves get wrong of a ball, however fine they are."""
+    cylinder, ball = plane.reference.answer, solid.reference.answer
+    assert cylinder is not None
+    assert ball is not None
+    same = rules[PLANE].source == rules[SOLID].source
+    read, whose = (
+        (cylinder, "a cylinder's map read by the same") if same else (ball, "a ball's map read by the cylinder's")
+    )
+    (a, sigma, _), (ball_a, ball_sigma, _) = numbers_of(cylinder), numbers_of(ball)
+    return (
+        f"Two dimensions: a cylinder shows {100 * (a / ball_a - 1):+.1f} % in amplitude and "
+        f"{100 * (sigma / ball_sigma - 1):+.1f} % in width against a ball; {whose} calibration gives "
+        f"{rules[PLANE].size_mm(*numbers_of(read)):.1f} mm for {case.d_mm:g}: no mesh mends that."
+    )
 
 
 def _empirical(case: LumpCase) -> Callable[[float], TactileLine]:
@@ -195,7 +224,7 @@ def teach(case: LumpCase, model: str, *, progress: Callable[[int, int], None]) -
     geometries = [paper.Geometry(case.seat, d, h, (paper.HARD_RATIO,)) for d in _TAUGHT_MM for h in _TAUGHT_DEPTHS]
     deepest = max(d * (h + max(0.6, 0.5 * case.seat)) + 2.0 for d in _TAUGHT_MM for h in _TAUGHT_DEPTHS)
     thickness = max(case.solid.thickness_mm or THICKNESS_MM, deepest)
-    settings = replace(case.solid if model == SOLID else case.plane, thickness_mm=thickness)
+    settings = replace(case.of(model), thickness_mm=thickness)
     rows: list[paper.StudyRow] = []
     for number, geometry in enumerate(geometries, start=1):
         rows += settings.rows(geometry)
@@ -203,38 +232,24 @@ def teach(case: LumpCase, model: str, *, progress: Callable[[int, int], None]) -
     return rows
 
 
-def change(value: float | None, reference: float | None) -> float:
-    """Relative difference; NaN where either is missing."""
-    if value is None or reference is None:
-        return float("nan")
-    return value / reference - 1.0
-
-
 # --- Point estimates of size from one map's Gaussian, by either form of the size calibration.
-
-Sizes = Callable[[float, float, float | None], list[float]]
-"""Diameters in mm from an amplitude and the widths across and along the head."""
-Outside = Callable[[float, float, float | None], list[str]]
-"""In what the same lie outside the table that a calibration was learned from, in words."""
 
 
 class SizeRule(Record, eq=False):
-    """Rule that converts amplitude and widths to a size."""
+    """Rule that converts amplitude and the widths across and along the head to a size.
 
-    sizes: Sizes  #: Diameters; the largest is the size.
+    A map in two dimensions has one width, which stands for both.
+    """
+
+    largest: Callable[[float, float, float | None], float]  #: The largest diameter, mm, for an amplitude above 0.
     scatter: float  #: Standard deviation of ln d that it leaves: of what Eq 6 was learned from, or of bodies left out.
     source: str  #: In words.
-    outside_of: Outside = lambda *_: []  #: What of a map is none of the calibration's.
+    outside: Callable[[float, float, float | None], list[str]] = lambda *_: []
+    """In what a map lies outside the table that a calibration was learned from, in words."""
 
-    def size_mm(self, one: Measured) -> float:
-        """Size of a measured map; NaN where its amplitude allows none."""
-        if not one.amplitude > 0:
-            return float("nan")
-        return max(self.sizes(one.amplitude, one.sigma_x_mm, one.sigma_y_mm))
-
-    def outside(self, one: Measured) -> list[str]:
-        """Quantities of a measured map that lie outside the calibration's table, in words."""
-        return self.outside_of(one.amplitude, one.sigma_x_mm, one.sigma_y_mm)
+    def size_mm(self, amplitude: float, across_mm: float, along_mm: float | None) -> float:
+        """Size of a map; NaN where its amplitude allows none."""
+        return self.largest(amplitude, across_mm, along_mm) if amplitude > 0 else float("nan")
 
 
 def learned_rule(rows: Sequence[paper.StudyRow]) -> SizeRule:
@@ -242,50 +257,50 @@ def learned_rule(rows: Sequence[paper.StudyRow]) -> SizeRule:
     axes = ["x", "y"] if rows[0].sigma_y_mm is not None else ["x"]
     learned = [paper.learn_as_printed(rows, axis=axis) for axis in axes]
 
-    def sizes(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
-        widths = (sigma_x_mm, sigma_y_mm)
-        return [
+    def largest(amplitude: float, *widths_mm: float | None) -> float:
+        sizes = [
             one.m * width / (one.e * amplitude**one.f) + one.b_mm
-            for one, width in zip(learned, widths, strict=False)
+            for one, width in zip(learned, widths_mm, strict=False)
             if one is not None and width is not None
-        ] or [float("nan")]
+        ]
+        return max(sizes, default=float("nan"))
 
     shown = [row for row in rows if row.detectable]
-    left = [max(sizes(row.amplitude, row.sigma_x_mm, row.sigma_y_mm)) / row.d_mm for row in shown]
+    left = [largest(row.amplitude, row.sigma_x_mm, row.sigma_y_mm) / row.d_mm for row in shown]
     scatter = float(np.sqrt(np.mean(np.log(np.maximum(left, 1e-3)) ** 2))) if shown else float("nan")
     kind = "balls" if len(axes) == 2 else "cylinders"
-    return SizeRule(sizes, scatter, f"Eq 6 in two stages from {len(shown)} hard {kind} of 10 to 25 mm in this body")
+    return SizeRule(largest, scatter, f"Eq 6 in two stages from {len(shown)} hard {kind} of 10 to 25 mm in this body")
 
 
 def calibrated_rule(calibration: Calibration, *, name: str) -> SizeRule:
     """The point estimate of a calibration of either form, with its mean coefficients; `name` is for people.
 
     Over a population it is the median of what `pooled_size` draws for a round lump in a body of which nothing is known,
-    where the map says a and the widths exactly. A map in two dimensions has one width, which stands for both.
+    where the map says a and the widths exactly.
     """
     if isinstance(calibration, BodyCalibration):
         population = calibration
 
-        def size(amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None) -> list[float]:
-            width = mean_width_mm(sigma_x_mm, sigma_y_mm)
-            return [float(np.exp(population.corrected_log_size(np.log(np.array(amplitude)), np.log(np.array(width)))))]
+        def by_bodies(amplitude: float, across: float, along: float | None) -> float:
+            width = np.array(mean_width_mm(across, along))
+            return float(np.exp(population.corrected_log_size(np.log(np.array(amplitude)), np.log(width))))
 
-        scatter = calibration.fit.get("left_out_sd", float(np.exp(calibration.spread.mean[0])))
-        form = "Eq 6" if calibration.residual is None else "Eq 6 and its residual"
-        return SizeRule(size, float(scatter), f"{form} of {name}", calibration.outside)
-    axes = (calibration.x, calibration.y)
+        scatter = population.fit.get("left_out_sd", float(np.exp(population.spread.mean[0])))
+        form = "Eq 6" if population.residual is None else "Eq 6 and its residual"
+        return SizeRule(by_bodies, float(scatter), f"{form} of {name}", population.outside)
+    axes = calibration.x, calibration.y
 
-    def sizes(amplitude: float, *widths_mm: float | None) -> list[float]:
-        a, given = np.array([amplitude]), zip(axes, widths_mm, strict=True)
-        return [float(axis.size_mm(np.array([width]), a)[0]) for axis, width in given if width is not None]
-
-    def outside(amplitude: float, *widths_mm: float | None) -> list[str]:
-        given = [(axis, width) for axis, width in zip(axes, widths_mm, strict=True) if width is not None]
-        return list(
-            dict.fromkeys(one for axis, width in given for one in outside_domain(axis.domain, amplitude, width))
+    def by_axes(amplitude: float, across: float, along: float | None) -> float:
+        widths = across, across if along is None else along
+        return max(
+            float(axis.size_mm(np.array([mm]), np.array([amplitude]))[0]) for axis, mm in zip(axes, widths, strict=True)
         )
 
-    return SizeRule(sizes, float(calibration.x.draws.mean(axis=0)[4]), f"Eq 6 of {name}", outside)
+    def outside(amplitude: float, across: float, along: float | None) -> list[str]:
+        texts = calibration.outside(amplitude, across, across if along is None else along)
+        return texts[len(calibration.cautions) :]
+
+    return SizeRule(by_axes, float(calibration.x.draws.mean(axis=0)[4]), f"Eq 6 of {name}", outside)
 
 
 # --- Cost of accuracy before the map: cells, frames, time of strokes and normalising, each up to the size.
@@ -337,7 +352,7 @@ def measure_map(scan: Scan, *, inputs: Inputs, work: Work) -> Ladder:
         except BadDataError as error:
             if one == settings[0].how:
                 raise
-            return {"map": clock() - begun, "estimate": 0.0}, SizeAnswer(str(error))
+            return {"map": clock() - begun, "estimate": 0.0}, no_number(str(error))
         return {"map": built_s, **seconds}, answer
 
     def reference() -> Reference:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import re
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
@@ -12,70 +13,96 @@ from subprocess import CompletedProcess
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from published_schemas import check_document
 
 from tactile_bayes.actions import tradeoff as tradeoff_forward
 from tactile_bayes.commands.laboratory import tradeoff_forward_command
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import replace, to_plain
 from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.forward.scene import Head, Lump, Scene
 from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump
 from tactile_bayes.presets import HEADS, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
-from tactile_bayes.report.laboratory import TradeoffReport, tradeoff_document, tradeoff_text
+from tactile_bayes.report.tradeoff import draw_ladders, ladder_file, tradeoff_text
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws, ShapePrior
 from tactile_bayes.size.eq6 import SizeCalibration
 from tactile_bayes.size.pooling import SizePriors, pooled_size
-from tactile_bayes.studies.paper import Geometry, StudyRow, StudySettings
+from tactile_bayes.studies import tradeoffs
+from tactile_bayes.studies.estimate_tradeoff import SIZE, Ladder, Work
+from tactile_bayes.studies.paper import Geometry, LineFit, StudyRow, StudySettings
+from tactile_bayes.studies.paper_solid import RasterFit, SolidSettings
 from tactile_bayes.studies.tradeoffs import (
-    EMPIRICAL,
     PLANE,
     SOLID,
     LumpCase,
-    Measured,
     SizeRule,
     calibrated_rule,
     case_of,
+    dimensions_note,
     learned_rule,
+    measure_forward,
 )
 from tactile_bayes.studies.tradeoffs import forward_settings as settings_of
-from tactile_bayes.studies.tradeoffs import measure_forward as measure
 
 Run = Callable[..., "CompletedProcess[str]"]
 BALL = SolidLump(seat=0.0)
 CASE = case_of(Scene(body=SceneBody(), solid_lumps=(BALL,)))
-SETTINGS = settings_of(CASE)
+RULE = SizeRule(lambda _, x, y: max(3 * x, 3 * (y or 0.0)), 0.12, "a rule")
 
 
-def report(case: LumpCase = CASE) -> TradeoffReport:
+def off_of(settings: StudySettings | SolidSettings) -> float:
+    """Made-up errors of a width: the finer the smaller, of a head without its rim large."""
+    if isinstance(settings, SolidSettings) and settings.head.rim_mm == 0.0:
+        return 0.4
+    finest = 4 if isinstance(settings, StudySettings) else 3
+    return {1: 0.05, 2: 0.002, 3: 0.001, finest: 0.0}[settings.fineness]
+
+
+def ladders(case: LumpCase = CASE, rule: SizeRule = RULE, share: float = 0.005) -> dict[str, Ladder]:
     """Made-up measurements: the finer, the dearer and the nearer to a = 0.3, sigma = 5 mm."""
-    found = []
-    for setting in SETTINGS:
-        fineness = setting.settings.fineness
-        off = {"reference": 0.0, "default": 0.002, "rim": 0.4}.get(setting.kind, 0.004 if fineness > 1 else 0.05)
-        sigma_y = 4.0 * (1 + off) if setting.model == SOLID else None
-        found.append(Measured(setting, 3 / fineness, 0.1 * fineness**2, 0.1, 0.3, 5.0 * (1 + off), sigma_y))
-    rule = SizeRule(lambda _, x, y: [3 * x, 3 * (y or 0.0)], 0.12, "a rule")
-    return TradeoffReport(case, tuple(found), {PLANE: rule, SOLID: rule}, 0.005)
+    spent = [0.0]
+
+    def maps(
+        settings: StudySettings | SolidSettings, _body: object
+    ) -> Callable[[float], StudySettings | SolidSettings]:
+        spent[0] += 0.1 * settings.fineness**2
+        return lambda _: settings
+
+    def fitted(_settings: object, made: StudySettings | SolidSettings) -> LineFit | RasterFit:
+        spent[0] += 0.1
+        off = off_of(made)
+        flat = isinstance(made, StudySettings)
+        return LineFit(0.3, 5 * (1 + off), 0.0) if flat else RasterFit(0.3, (5 * (1 + off), 4 * (1 + off)), 0.0, True)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for kind in (StudySettings, SolidSettings):
+            patch.setattr(kind, "maps", maps)
+            patch.setattr(kind, "fitted", fitted)
+        patch.setattr(tradeoffs, "_empirical", lambda case: lambda _: replace(case.plane, fineness=1))
+        work = Work(lambda: spent[0], 1.0, 1)
+        return {model: measure_forward(case, model, rule, share=share, work=work) for model in (PLANE, SOLID)}
 
 
-def test_each_model_has_one_default_and_one_reference() -> None:
+def test_each_model_has_one_default_and_a_finer_reference() -> None:
     for model in (PLANE, SOLID):
-        kinds = [setting.kind for setting in SETTINGS if setting.model == model]
-        assert kinds.count("default") == kinds.count("reference") == 1
-        (default,) = (one for one in SETTINGS if one.model == model and one.kind == "default")
-        assert default.settings == (CASE.plane if model == PLANE else CASE.solid)
-    assert [setting.model for setting in SETTINGS].count(EMPIRICAL) == 1
+        settings, finest = settings_of(CASE, model)
+        (default,) = (one.how.settings for one in settings if one.default)
+        assert default == (CASE.plane if model == PLANE else CASE.solid)
+        assert finest.how.settings.fineness > max(one.how.settings.fineness for one in settings if one.usable)
+    assert [one.label for one in settings_of(CASE, PLANE)[0] if one.how.empirical] == ["Eqs 1 to 4"]
 
 
-def test_the_default_plane_setting_is_the_study() -> None:
-    (setting,) = (one for one in SETTINGS if one.model == PLANE and one.kind == "default")
+def test_the_default_plane_setting_is_the_study(monkeypatch: pytest.MonkeyPatch) -> None:
     ticks = count()
-    found = measure(CASE, setting, clock=lambda: float(next(ticks)), runs=2)
+    monkeypatch.setattr(tradeoffs, "_PLANE", ((2, 0.25), (1, 0.5)))
+    found = measure_forward(CASE, PLANE, RULE, share=0.005, work=Work(lambda: float(next(ticks)), 1.0, 2))
     (row,) = StudySettings().rows(Geometry(0.0, 15.0, 1.0, (100.0,)))
-    assert (found.amplitude, found.sigma_x_mm) == pytest.approx((row.amplitude, row.sigma_x_mm), rel=1e-9)
-    assert (found.lump_s, found.map_s, found.sigma_y_mm) == (1.0, 1.0, None)
-    assert found.element_mm == pytest.approx(0.74, abs=0.01)  # half of 47.1 mm over 32 elements
+    told = {name: one.median for name, one in found.default.answer.quantities.items()}
+    assert (told["amplitude"], told["sigma_x_mm"]) == pytest.approx((row.amplitude, row.sigma_x_mm), rel=1e-9)
+    assert (found.default.cpu_s, found.default.runs) == ({"lump": 1.0, "map": 1.0}, 2)
+    assert "sigma_y_mm" not in told
+    assert told["element_mm"] == pytest.approx(0.74, abs=0.01)  # half of 47.1 mm over 32 elements
 
 
 def test_a_scene_gives_its_body_and_head_to_both_models() -> None:
@@ -98,34 +125,38 @@ def test_the_head_is_that_of_both_models_and_moves_their_numbers() -> None:
     cases = {head: case_of(scene, head=head) for head in (None, *HEADS)}
     plain, inside, outside = cases.values()
     assert (plain.plane, plain.solid) == (inside.plane, outside.solid)  # each model's default, by name
-    assert plain.heads == {PLANE: SHOULDERS_INSIDE, SOLID: SHOULDERS_OUTSIDE}
-    for head in HEADS:
-        assert cases[head].heads == dict.fromkeys((PLANE, SOLID), head)
+    heads = {name: [case.of(model).head.shoulders for model in (PLANE, SOLID)] for name, case in cases.items()}
+    assert heads == {None: [SHOULDERS_INSIDE, SHOULDERS_OUTSIDE]} | {head: [head, head] for head in HEADS}
     assert inside.solid.head.surface_mm()[0, 0, 2] < outside.solid.head.surface_mm()[0, 0, 2]
-    seen = []
-    for case in (inside, outside):
-        setting = next(one for one in settings_of(case) if one.model == PLANE)
-        seen.append(measure(case, setting, clock=lambda: 0.0).amplitude)
+    seen = [case.plane.fitted(case.plane.maps(case.body)(100.0)).amplitude for case in (inside, outside)]
     assert seen[1] > 1.2 * seen[0]
 
 
 @pytest.mark.parametrize(("head", "edge"), [(None, "rim"), (SHOULDERS_INSIDE, "shoulders")])
 def test_the_head_without_its_edge_is_another_head(head: str | None, edge: str) -> None:
     case = case_of(Scene(body=SceneBody(), solid_lumps=(BALL,)), head=head)
-    (bare,) = (one for one in settings_of(case) if one.kind == "rim")
-    assert bare.label == f"head without its {edge}"
-    assert (bare.settings.head.shoulder_mm, bare.settings.head.rim_mm) == (0.0, 0.0)
-    assert bare.settings != case.solid
+    (bare,) = (one for one in settings_of(case, SOLID)[0] if one.axis == "head")
+    assert bare.label == f"head without {edge}"
+    assert (bare.how.settings.head.shoulder_mm, bare.how.settings.head.rim_mm) == (0.0, 0.0)
+    assert bare.how.settings != case.solid
 
 
 @pytest.mark.parametrize("head", [None, *HEADS])
 def test_the_command_hands_its_head_on_and_names_it(head: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tradeoff_forward, "run_tradeoff", lambda case, *_, **__: report(case))
+    made = ladders()
+    monkeypatch.setattr(tradeoff_forward, "_climbed", lambda _case, model, *_: made[model])
     words = [] if head is None else ["--head", head]
     found = {form: CliRunner().invoke(tradeoff_forward_command, [*words, *form]) for form in ((), ("--json",))}
-    heads = case_of(Scene(body=SceneBody(), solid_lumps=(BALL,)), head=head).heads
-    assert json.loads(found[("--json",)].stdout)["head"] == heads
-    assert f"head: {heads[PLANE]} (plane-strain), {heads[SOLID]} (solid)" in found[()].stdout
+    case, documents = (
+        case_of(Scene(body=SceneBody(), solid_lumps=(BALL,)), head=head),
+        json.loads(found[("--json",)].stdout),
+    )
+    for model, document in zip((PLANE, SOLID), documents, strict=True):
+        check_document(document, "tradeoff.schema.json")
+        kept, shoulders = document["provenance"]["settings"], case.of(model).head.shoulders
+        assert (kept["model"], kept["d_mm"], kept["head"]) == (model, 15.0, shoulders)
+        title = f"{model}: lump of 15 mm, h/d 1, 100 times as stiff as fat, centred; head: {shoulders}"
+        assert title in found[()].stdout
 
 
 def test_eq_6_is_learned_axis_by_axis_and_says_what_it_leaves() -> None:
@@ -137,7 +168,9 @@ def test_eq_6_is_learned_axis_by_axis_and_says_what_it_leaves() -> None:
             x, y = (d + 5) / 6 * change, (d + 2) / 5 * change
             rows.append(StudyRow("centred", d, h, 100.0, a, x, 0.0, True, y))
     rule = learned_rule(rows)
-    assert rule.sizes(0.9, rows[0].sigma_x_mm, rows[0].sigma_y_mm) == pytest.approx([10.0, 10.0])
+    assert rule.size_mm(0.9, rows[0].sigma_x_mm, rows[0].sigma_y_mm) == pytest.approx(10.0)
+    assert rule.size_mm(0.9, 0.0, rows[0].sigma_y_mm) == pytest.approx(10.0)
+    assert np.isnan(rule.size_mm(0.0, 5.0, 4.0))
     assert rule.scatter < 1e-9
 
 
@@ -154,7 +187,7 @@ def test_a_quadratic_gives_the_median_of_what_estimate_draws() -> None:
     assert isinstance(quadratic, BodyCalibration)
     a, x, y = 0.3, 5.2, 4.0
     rule = calibrated_rule(quadratic, name="solid.json")
-    (size,) = rule.sizes(a, x, y)
+    size = rule.size_mm(a, x, y)
     p, q = 0.5 * np.log(x * y), float(quadratic.round_excess(np.log(np.array(a)), 0.5 * np.log(np.array(x * y))))
     draws = ShapeDraws(np.full(8000, np.log(a)), np.full(8000, p), np.full(8000, q), np.zeros(8000))
     priors = SizePriors(shape=ShapePrior(oval_probability=1e-12))
@@ -162,8 +195,8 @@ def test_a_quadratic_gives_the_median_of_what_estimate_draws() -> None:
     spread = float(np.std(np.log(pooled.d_x_mm)))
     assert np.median(np.log(pooled.d_x_mm)) == pytest.approx(np.log(size), abs=4 * 1.25 * spread / np.sqrt(8000))
     # the control: the widest of two sizes by each width, as Eq 6 has it, is another number
-    assert max(rule.sizes(a, x, None)[0], rule.sizes(a, y, None)[0]) > 1.05 * size
-    assert rule.sizes(a, x, None) == pytest.approx(rule.sizes(a, x, x))
+    assert max(rule.size_mm(a, x, None), rule.size_mm(a, y, None)) > 1.05 * size
+    assert rule.size_mm(a, x, None) == pytest.approx(rule.size_mm(a, x, x))
 
 
 def test_each_form_says_what_it_leaves_and_where_it_ends() -> None:
@@ -171,20 +204,20 @@ def test_each_form_says_what_it_leaves_and_where_it_ends() -> None:
         rule = calibrated_rule(shipped(name), name="file.json")
         assert rule.source == words
         assert 0.05 < rule.scatter < 0.4
-        found = report().found[-1]
-        assert rule.outside(found) == []
-        (said, *_) = rule.outside(replace(found, amplitude=30.0))
-        assert said.startswith("amplitude 30 (table: ")
+        assert rule.outside(0.3, 5.0, 4.0) == []
+        (said, *_) = rule.outside(30.0, 5.0, 4.0)
+        assert "amplitude 30 (table: " in said
 
 
-def test_the_change_in_size_is_told_in_mm() -> None:
-    made = report()
-    (default,) = (one for one in made.of(SOLID) if one.setting.kind == "default")
-    assert made.size_change_mm(default) == pytest.approx(15.0 * 0.002)
-    text = tradeoff_text(made)
-    assert "the default mesh leaves +0.2 % (+0.030 mm)" in text
-    line, _ = (line for line in text.splitlines() if line.startswith("solid, fineness 2 (default)"))
-    assert line.endswith("+0.20  +0.030")
+def test_the_change_in_size_is_told_in_mm_and_percent() -> None:
+    found = ladders()[SOLID]
+    assert found.default.median_off_mm == pytest.approx(15.0 * 0.002)
+    size = found.default.answer.quantities[SIZE]
+    assert size.high / size.median == pytest.approx(np.exp(1.96 * 0.12), rel=1e-4)
+    text = tradeoff_text({"a lump": found})
+    assert re.search(r"\* fineness 2 +0\.400 +0\.100 +15\.03 +11\.88 to 19\.02 +0\.032 +0\.009", text)
+    assert re.search(r"the finest +0\.87 +0\.3000 +5\.000 +4\.000\n", text)
+    assert re.search(r"fineness 2 +1\.39 +0\.3000 +5\.010 +4\.008 +\+0\.00 +\+0\.20 +\+0\.20 +\+0\.20", text)
 
 
 def test_a_calibration_without_sizes_or_not_there_is_refused(run_cli: Run, tmp_path: Path) -> None:
@@ -197,30 +230,42 @@ def test_a_calibration_without_sizes_or_not_there_is_refused(run_cli: Run, tmp_p
 
 
 def test_the_advice_names_the_cheapest_that_is_enough() -> None:
-    made = report()
+    made = ladders()
+    assert (made[PLANE].tolerance_mm, made[SOLID].tolerance_mm) == (0.075, 0.075)
     text = tradeoff_text(made)
-    assert "solid: fineness 2 (elements of 1.5 mm) keeps the size within 0.5 % at 0.50 s CPU" in text
-    assert "a mesh finer than 1.5 mm is wasted below that, the finest costs 2 times as much" in text
-    assert "plane-strain: fineness 2, cell 0.5 mm" in text
-    assert "a rule, which itself leaves 12 % (SD of ln d)" in text
-    strict = replace(made, tolerance=1e-9)
-    assert "solid: only the finest setting keeps the size within" in tradeoff_text(strict)
-    none = SizeRule(lambda *_: [float("nan")], 0.12, "a rule")
-    assert "solid: only the finest setting" in tradeoff_text(replace(made, rules={PLANE: none, SOLID: none}))
+    assert "Advice: fineness 2 (the default): 0.50 s, interval ends within 0.032 mm" in text
+    assert "What moves the ends more than 0.075 mm: fineness 1 0.8 mm; head without rim 6.3 mm." in text
+    assert "Sizes by a rule, which itself leaves 12 % (SD of ln d)" in text
+    assert text.count("the interval is what the calibration leaves") == 2
+    strict = ladders(share=1e-9)
+    assert strict[SOLID].enough() is None
+    assert "no setting has its interval ends within" in tradeoff_text(strict)
+    none = ladders(rule=replace(RULE, largest=lambda *_: float("nan")))[SOLID]
+    assert SIZE not in none.default.answer.quantities
+    assert none.default.median_off_mm == pytest.approx(5.0 * 0.002)  # then the width is what is compared
+    assert re.search(r"sigma +95 % interval", tradeoff_text({"": none}))
 
 
-def test_the_document_is_plain_data() -> None:
-    document = json.loads(json.dumps(tradeoff_document(report())))
-    assert len(document["settings"]) == len(SETTINGS)
-    (finest,) = (row for row in document["settings"] if (row["model"], row["kind"]) == (SOLID, "reference"))
-    assert finest["size_error"] == 0.0
+def test_what_two_dimensions_get_wrong_is_told() -> None:
+    made = ladders()
+    said = dimensions_note(CASE, made[PLANE], made[SOLID], {PLANE: RULE, SOLID: RULE})
+    assert "+0.0 % in width against a ball; a cylinder's map read by the same calibration gives 15.0 mm for 15" in said
+    other = replace(RULE, source="another rule", largest=lambda _a, x, _y: 6 * x)
+    said = dimensions_note(CASE, made[PLANE], made[SOLID], {PLANE: other, SOLID: RULE})
+    assert "a ball's map read by the cylinder's calibration gives 30.0 mm for 15: no mesh mends that." in said
+
+
+def test_the_document_is_the_one_of_all_trade_offs() -> None:
+    for model, made in ladders().items():
+        document = json.loads(json.dumps(to_plain(ladder_file(made, varied="forward", provenance={}))))
+        check_document(document, "tradeoff.schema.json")
+        assert len(document["settings"]) == len(settings_of(CASE, model)[0])
+        assert document["reference"]["words"].startswith(f"{model}, fineness")
 
 
 def test_the_figure_is_the_same_bytes_each_time(tmp_path: Path) -> None:
-    from tactile_bayes.report.laboratory import draw_tradeoff
-
     for name in ("one.png", "two.png"):
-        draw_tradeoff(report(), tmp_path / name)
+        draw_ladders(ladders(), tmp_path / name)
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
 
 
@@ -252,8 +297,8 @@ def test_a_scene_that_cannot_be_is_told_with_its_file(run_cli: Run, tmp_path: Pa
 def test_the_command_measures_draws_and_advises(run_cli: Run, tmp_path: Path) -> None:
     done = run_cli("tradeoff", "forward", "--figure", "t.png", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "solid: fineness 2" in done.stdout
-    assert "sizes by Eq 6 and its residual of solid_mean.json" in done.stdout
-    assert "sizes by Eq 6 of plane_strain.json" in done.stdout
-    assert "plane-strain: fineness 1" in done.stdout  # elements of 1.5 mm are enough for 0.5 % in this lump's size
+    assert "* fineness 2" in done.stdout
+    assert "Sizes by Eq 6 and its residual of solid_mean.json" in done.stdout
+    assert "Sizes by Eq 6 of plane_strain.json" in done.stdout
+    assert "Advice: fineness 1" in done.stdout  # elements of 1.5 mm are enough for 0.5 % in this cylinder's size
     assert (tmp_path / "t.png").read_bytes().startswith(b"\x89PNG")
