@@ -333,7 +333,7 @@ def test_more_maps_of_one_mass_narrow_the_interval(tmp_path: Path):
     spread = pooled_rows(paths, replace(quick, between_map_sd=0.15), clock=time.process_time)
     one, three = (found.answer.half_width_mm / found.answer.reported.median for found in (spread[0], spread[2]))
     assert three < 0.9 * one
-    assert rows[2].another_half_mm < 0.85 * rows[0].another_half_mm
+    assert rows[2].another_half_width_mm < 0.85 * rows[0].another_half_width_mm
     assert rows[2].cpu_s > rows[0].cpu_s
 
 
