@@ -30,8 +30,8 @@ from tactile_bayes.size.eq6 import SizeCalibration
 from tactile_bayes.size.pooling import SizePriors, pooled_size
 from tactile_bayes.studies import tradeoffs
 from tactile_bayes.studies.estimate_tradeoff import SIZE, Ladder, Work
-from tactile_bayes.studies.paper import Geometry, LineFit, StudyRow, StudySettings
-from tactile_bayes.studies.paper_solid import RasterFit, SolidSettings
+from tactile_bayes.studies.paper import Geometry, MapFit, StudyRow, StudySettings
+from tactile_bayes.studies.paper_solid import SolidSettings
 from tactile_bayes.studies.tradeoffs import (
     PLANE,
     SOLID,
@@ -69,11 +69,11 @@ def ladders(case: LumpCase = CASE, rule: SizeRule = RULE, share: float = 0.005) 
         spent[0] += 0.1 * settings.fineness**2
         return lambda _: settings
 
-    def fitted(_settings: object, made: StudySettings | SolidSettings) -> LineFit | RasterFit:
+    def fitted(_settings: object, made: StudySettings | SolidSettings) -> MapFit:
         spent[0] += 0.1
         off = off_of(made)
-        flat = isinstance(made, StudySettings)
-        return LineFit(0.3, 5 * (1 + off), 0.0) if flat else RasterFit(0.3, (5 * (1 + off), 4 * (1 + off)), 0.0, True)
+        along = 4 * (1 + off) if isinstance(made, SolidSettings) else None
+        return MapFit(0.3, (5 * (1 + off), along), 0.0)
 
     with pytest.MonkeyPatch.context() as patch:
         for kind in (StudySettings, SolidSettings):
