@@ -10,8 +10,6 @@ import numpy as np
 
 from tactile_bayes.forward.contact import Head
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.posterior.white import BumpFit
 from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE
 from tactile_bayes.report.figure_file import figure_file, finish
 from tactile_bayes.report.study import COLOURS
@@ -20,9 +18,6 @@ from tactile_bayes.studies.model_comparison import (
     MeasuredScan,
     ModelComparison,
     centre_row,
-    line_bump,
-    residual_map,
-    residual_slope,
 )
 from tactile_bayes.studies.paper import HomogeneousTissue, Uniformity, centre_line, most_even, narrowest
 
@@ -235,19 +230,28 @@ def _draw_shares(axes: Axes, one: Uniformity, tissue: HomogeneousTissue, limit: 
 
 _BESIDE = 3  #: Models that stand side by side in 80 columns.
 DEFINITION = "MSD = sum of squared differences over the sum of squares of the model (docs/decisions/0007)"
-_SLOPE = {
-    "slope_x_per_10mm": "map: residual's slope in x, per 10 mm",
-    "slope_y_per_10mm": "the same in y",
-    "rms_beside_slope": "RMS beside the slope",
-}
 _PRINTED = {"frames_centre": "below 15", "map_centre": "below 2.6"}
-_ROWS = {
-    "frames_all": "frames, all taxels, MSD %",
-    "frames_centre": "frames, centre line, MSD %",
-    "frames_near": "frames within 12 mm of the lump, MSD %",
-    "map_all": f"map within {NEAR_MM:g} mm, MSD %",
-    "map_centre": "map, centre line, MSD %",
-    "map_strict": "map over (map - 1), MSD %",
+# Figures of a model by name: in words, what they are multiplied by, and decimals.
+_DIFFERENCES = {
+    "frames_all": ("frames, all taxels, MSD %", 100, 2),
+    "frames_centre": ("frames, centre line, MSD %", 100, 2),
+    "frames_near": ("frames within 12 mm of the lump, MSD %", 100, 2),
+    "map_all": (f"map within {NEAR_MM:g} mm, MSD %", 100, 2),
+    "map_centre": ("map, centre line, MSD %", 100, 2),
+    "map_strict": ("map over (map - 1), MSD %", 100, 2),
+    "rms_kpa": ("taxel, root mean square difference, kPa", 1, 3),
+    "slope_x_per_10mm": ("map: residual's slope in x, per 10 mm", 1, 4),
+    "slope_y_per_10mm": ("the same in y", 1, 4),
+    "rms_beside_slope": ("RMS beside the slope", 1, 4),
+}
+# Figures of the measured map and of a model's, below a title each.
+_BUMPS = {
+    "Eq 7 on the map, level 1": {
+        "amplitude": "amplitude",
+        "sigma_x_mm": "sigma across the head, mm",
+        "sigma_y_mm": "sigma along it, mm",
+    },
+    "Eq 5 on its centre line across the lump, level 1": {"line_amplitude": "amplitude", "line_sigma_mm": "sigma, mm"},
 }
 
 
@@ -256,7 +260,8 @@ def comparison_text(measured: MeasuredScan, found: Sequence[ModelComparison]) ->
     place = measured.place_mm
     lines = [
         *(
-            f"{one.fidelity}: frames differ by {100 * one.frames_all:.2f} % MSD, the map by {100 * one.map_all:.2f} %"
+            f"{one.fidelity}: frames differ by {100 * one.figures['frames_all']:.2f} % MSD, "
+            f"the map by {100 * one.figures['map_all']:.2f} %"
             for one in found
         ),
         f"{len(measured.level_kpa)} frames, mean pressure {measured.level_kpa.mean():.2f} kPa; "
@@ -274,22 +279,14 @@ def _columns(measured: MeasuredScan, found: Sequence[ModelComparison]) -> Iterat
     yield _cells("", "paper", *(first for first, _, _ in names))
     if any(second for _, _, second in names):
         yield _cells("", "", *(second for _, _, second in names))
-    for name, words in _ROWS.items():
-        yield _cells(words, _PRINTED.get(name, ""), *(f"{100 * getattr(one, name):.2f}" for one in found))
-    yield _cells("taxel, root mean square difference, kPa", "", *(f"{one.rms_kpa:.3f}" for one in found))
-    slopes = np.transpose([residual_slope(measured, one) for one in found])
-    for words, values in zip(_SLOPE.values(), slopes, strict=True):
-        yield _cells(words, "", *(f"{value:.4f}" for value in values))
-    every: list[MeasuredScan | ModelComparison] = [measured, *found]
-    bumps = np.transpose([_shape(one.lump) for one in every])
-    on_line = np.transpose([line_bump(measured, one.tactile_map) for one in every])
+    for name, (words, times, digits) in _DIFFERENCES.items():
+        yield _cells(words, _PRINTED.get(name, ""), *(f"{times * one.figures[name]:.{digits}f}" for one in found))
     yield ""
-    yield _cells("Eq 7 on the map, level 1", "measured")
-    for words, values in zip(("amplitude", "sigma across the head, mm", "sigma along it, mm"), bumps, strict=True):
-        yield _cells(words, *map(_plain, values))
-    yield "Eq 5 on its centre line across the lump, level 1"
-    for words, values in zip(("amplitude", "sigma, mm"), on_line, strict=True):
-        yield _cells(words, *map(_plain, values))
+    every = [measured.figures, *(one.figures for one in found)]
+    for beside, (title, rows) in zip(("measured", ""), _BUMPS.items(), strict=True):
+        yield _cells(title, beside)
+        for name, words in rows.items():
+            yield _cells(words, *(_plain(one[name]) for one in every))
 
 
 def _cells(words: str, beside: str, *models: str) -> str:
@@ -316,32 +313,12 @@ def comparison_document(
         "inputs": inputs,
         "frames": len(measured.level_kpa),
         "place_mm": list(measured.place_mm),
-        "measured": _bumps(measured, measured.lump, measured.tactile_map),
+        "measured": {name: finite(value) for name, value in measured.figures.items()},
         "models": [
-            {
-                "fidelity": one.fidelity,
-                **{name: finite(getattr(one, name)) for name in (*_ROWS, "rms_kpa")},
-                **_bumps(measured, one.lump, one.tactile_map),
-                **dict(zip(_SLOPE, residual_slope(measured, one), strict=True)),
-            }
-            for one in found
+            {"fidelity": one.fidelity, **{name: finite(value) for name, value in one.figures.items()}} for one in found
         ],
         "research_use": RESEARCH_USE,
     }
-
-
-def _shape(lump: BumpFit | None) -> tuple[float, float, float]:
-    if lump is None:
-        return (float("nan"),) * 3
-    sigma_x, sigma_y, _ = lump.widths()
-    return float(lump.theta[0]), sigma_x, sigma_y
-
-
-def _bumps(measured: MeasuredScan, lump: BumpFit | None, tactile_map: TactileMap) -> dict[str, float | None]:
-    """Eq 7 of a map, null without, and Eq 5 of its centre line."""
-    amplitude, sigma_x, sigma_y = map(finite, _shape(lump))
-    line = dict(zip(("line_amplitude", "line_sigma_mm"), line_bump(measured, tactile_map), strict=True))
-    return {"amplitude": amplitude, "sigma_x_mm": sigma_x, "sigma_y_mm": sigma_y, **line}
 
 
 # --- A scan against forward models, as Fig 6 of the paper: frames, the map's centre line, both maps and the residual.
@@ -367,7 +344,7 @@ def comparison_figure(
         for axes, values, name in ((seen, ours, "(d) measured"), (model, theirs, f"(e) {found[0].fidelity}")):
             mesh = _draw_map(axes, measured, values, name, ends, "viridis")
         figure.colorbar(mesh, ax=model, shrink=0.7, label="pressure / mean of its frame")
-        residual = residual_map(measured, found[0])
+        residual = ours - theirs
         most = float(np.nanmax(np.abs(residual)))
         mesh = _draw_map(left, measured, residual, "(f) measured less modelled", (-most, most), "RdBu_r")
         figure.colorbar(mesh, ax=left, shrink=0.7, label="difference")
@@ -398,7 +375,13 @@ def _draw_line(axes: Axes, measured: MeasuredScan, found: Sequence[ModelComparis
     for one, colour, style in zip(found, COLOURS, _LINES, strict=False):
         x, mean = centre_row(measured, one.tactile_map)
         near = np.abs(x) <= NEAR_MM
-        axes.plot(x[near], mean[near], style, color=colour, label=f"{one.fidelity} (MSD {100 * one.map_centre:.2f} %)")
+        axes.plot(
+            x[near],
+            mean[near],
+            style,
+            color=colour,
+            label=f"{one.fidelity} (MSD {100 * one.figures['map_centre']:.2f} %)",
+        )
     across, up = "distance from the lump (mm)", "pressure / mean of its frame"
     finish(axes, "(c) the map across the lump", across, up, headroom=0.35)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -261,25 +261,19 @@ class MeasuredScan(Record, eq=False):
     place_mm: tuple[float, float]  #: The lump on the map: where the scene's first lump is put.
     lump: BumpFit | None  #: The bump of Eq 7 there; None where none was fitted.
 
+    @property
+    def figures(self) -> dict[str, float]:
+        """The bumps on the map, see `_bumps`."""
+        return _bumps(self, self.tactile_map, self.lump)
+
 
 class ModelComparison(Record, eq=False):
-    """How far one model is from the measured frames and map; differences as shares of the model's sum of squares."""
+    """How far one model is from the measured frames and map."""
 
     fidelity: str  #: Which of `forward.simulate.FIDELITIES`.
     pressure_kpa: FloatArray  #: (n, rows, columns) array: The model's frames.
     tactile_map: TactileMap  #: Of the model's frames, on the cells of the measured map.
-    frames_all: float
-    frames_centre: float
-    frames_near: float
-    """`frames_all`, `frames_centre`, `frames_near`: Mean over the frames of each frame's difference: of all taxels;
-    along the head's centre line; and the latter in frames whose centre lies within 12 mm of the lump."""
-    rms_kpa: float  #: Root mean square difference of a taxel.
-    map_all: float
-    map_centre: float
-    map_strict: float
-    """`map_all`, `map_centre`, `map_strict`: Of the map within 40 mm of the lump, of its centre line across the lump,
-    and of the map relative to map - 1."""
-    lump: BumpFit | None  #: The bump of Eq 7 on the model's map; None where none was fitted.
+    figures: Mapping[str, float]  #: See `compare_model`.
 
 
 def measured_frames(
@@ -319,7 +313,13 @@ def measured_frames(
 def compare_model(
     measured: MeasuredScan, scene: Scene, *, fidelity: str, head: str | None = None, progress: Progress = untold
 ) -> ModelComparison:
-    """One model of a scene, with its first lump put where the measured one is, against measured frames."""
+    """One model of a scene, with its first lump put where the measured one is, against measured frames.
+
+    Figures are differences as shares of the model's sum of squares: of frames, the mean over them of all taxels, along
+    the head's centre line, and of the latter in frames within 12 mm of the lump (``frames_...``); of the map within 40
+    mm of the lump, of its centre line across the lump, and relative to map - 1 (``map_...``). Further the root mean
+    square difference of a taxel (``rms_kpa``), the bumps on the model's map, and the residual map's slope.
+    """
     _check_array(measured.scan, scene)
     lump = scene.solid_lumps[0] if scene.solid_lumps else scene.lumps[0] if scene.lumps else None
     at = measured.place_mm if lump is None else (lump.x_mm, lump.y_mm)
@@ -336,19 +336,25 @@ def compare_model(
     cells = _map_cells(measured, made)
     ours, theirs = measured.tactile_map.mean[cells], made.mean[cells]
     row = cells & _centre_row(measured)[:, None]
-    return ModelComparison(
-        fidelity,
-        pressure,
-        made,
-        float(np.mean(_shares(seen, model))),
-        float(np.mean(frames)),
-        float(np.mean(frames[near])) if near.any() else float("nan"),
-        float(np.sqrt(np.nanmean((seen - model) ** 2))),
-        mean_squared_difference(ours, theirs),
-        mean_squared_difference(measured.tactile_map.mean[row], made.mean[row]),
-        float(np.sum((ours - theirs) ** 2) / np.sum((theirs - 1.0) ** 2)),
-        _bump(made, measured.place_mm),
-    )
+    figures = {
+        "frames_all": np.mean(_shares(seen, model)),
+        "frames_centre": np.mean(frames),
+        "frames_near": np.mean(frames[near]) if near.any() else np.nan,
+        "map_all": mean_squared_difference(ours, theirs),
+        "map_centre": mean_squared_difference(measured.tactile_map.mean[row], made.mean[row]),
+        "map_strict": np.sum((ours - theirs) ** 2) / np.sum((theirs - 1.0) ** 2),
+        "rms_kpa": np.sqrt(np.nanmean((seen - model) ** 2)),
+        **_bumps(measured, made, _bump(made, measured.place_mm)),
+        **residual_slope(measured, made),
+    }
+    return ModelComparison(fidelity, pressure, made, {name: float(value) for name, value in figures.items()})
+
+
+def _bumps(measured: MeasuredScan, tactile_map: TactileMap, lump: BumpFit | None) -> dict[str, float]:
+    """Eq 7 of a map, NaN where no bump was fitted, and Eq 5 of its centre line."""
+    theta, widths = ((np.nan,), (np.nan,) * 3) if lump is None else (lump.theta, lump.widths())
+    found = dict(zip(("amplitude", "sigma_x_mm", "sigma_y_mm"), (float(theta[0]), *widths[:2]), strict=True))
+    return found | dict(zip(("line_amplitude", "line_sigma_mm"), line_bump(measured, tactile_map), strict=True))
 
 
 def centre_row(measured: MeasuredScan, tactile_map: TactileMap) -> tuple[FloatArray, FloatArray]:
@@ -371,23 +377,18 @@ def line_bump(measured: MeasuredScan, tactile_map: TactileMap) -> tuple[float, f
     return found.height, float(np.exp(found.parameter))
 
 
-def residual_map(measured: MeasuredScan, comparison: ModelComparison) -> FloatArray:
-    """(ny, nx) measured less modelled map; NaN where either has no readings."""
-    return np.asarray(measured.tactile_map.mean - comparison.tactile_map.mean)
-
-
-def residual_slope(measured: MeasuredScan, comparison: ModelComparison) -> tuple[float, float, float]:
-    """Slope of the residual map along x and y, per 10 mm, and the root mean square that it leaves.
+def residual_slope(measured: MeasuredScan, made: TactileMap) -> dict[str, float]:
+    """Slope of what a model's map leaves of the measured one along x and y, and the root mean square beside it.
 
     A slope is a tilt of the real head against the modelled one: the map's plane is not quite that of the skin.
     """
-    made = measured.tactile_map
-    cells = _map_cells(measured, comparison.tactile_map)
+    cells = _map_cells(measured, made)
     y, x = np.nonzero(cells)
     design = np.stack([np.ones(len(x)), made.x_mm[x] / 10.0, made.y_mm[y] / 10.0], axis=1)
-    residual = residual_map(measured, comparison)[cells]
+    residual = (measured.tactile_map.mean - made.mean)[cells]
     found = np.linalg.lstsq(design, residual, rcond=None)[0]
-    return float(found[1]), float(found[2]), float(np.sqrt(np.mean((residual - design @ found) ** 2)))
+    beside = float(np.sqrt(np.mean((residual - design @ found) ** 2)))
+    return {"slope_x_per_10mm": float(found[1]), "slope_y_per_10mm": float(found[2]), "rms_beside_slope": beside}
 
 
 def _model_map(measured: MeasuredScan, pressure_kpa: FloatArray) -> TactileMap:
