@@ -239,7 +239,7 @@ def _table(title: str, name: str, heads: Sequence[Rows]) -> list[str]:
     return [*lines, f"mean {' / '.join(f'{_mean(rows, name):.1f}' for rows in heads)}{print_mean}", ""]
 
 
-def tables_document(found: ByHead, phantoms: ByHead, *, seat: float) -> dict[str, object]:
+def tables_document(found: ByHead, phantoms: ByHead, *, seat: float) -> dict[str, Any]:
     """The same as plain data, shares instead of percent; the head that was asked for first."""
     first = next(iter(found))
     return {
@@ -252,8 +252,8 @@ def tables_document(found: ByHead, phantoms: ByHead, *, seat: float) -> dict[str
             "frames": {f"{h:g}": list(row) for h, row in model_comparison.PRINTED_FRAMES.items()},
             "maps": {f"{h:g}": list(row) for h, row in model_comparison.PRINTED_MAPS.items()},
         },
-        "cases": [as_dict(one) for one in found[first]],
-        "phantoms": [as_dict(one) for one in phantoms[first]],
+        "cases": list(map(_figures, found[first])),
+        "phantoms": list(map(_figures, phantoms[first])),
         "heads": [
             {
                 **as_dict(head),
@@ -265,3 +265,13 @@ def tables_document(found: ByHead, phantoms: ByHead, *, seat: float) -> dict[str
             for head, rows in found.items()
         ],
     }
+
+
+def _figures(one: model_comparison.Agreement) -> dict[str, Any]:
+    """A lump's figures; a line's fit has one width."""
+    fits = {"elastic": one.elastic, "empirical": one.empirical}
+    told = {
+        name: {"amplitude": fit.amplitude, "sigma_mm": fit.widths_mm[0], "rms": fit.rms, "resolved": fit.resolved}
+        for name, fit in fits.items()
+    }
+    return as_dict(one) | told

@@ -12,7 +12,7 @@ import pytest
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_BAD_DATA
 from tactile_bayes.forward.contact import Head
-from tactile_bayes.report.laboratory import heads_text, tables_text
+from tactile_bayes.report.laboratory import heads_text, tables_document, tables_text
 from tactile_bayes.studies.model_comparison import (
     NEAREST_HEADS,
     OTHER_DEFINITIONS,
@@ -53,6 +53,13 @@ def test_the_tables_stand_beside_the_printed_ones_and_say_what_they_mean() -> No
     beside = tables_text(lumps, phantoms, head=Head(), nearest=TRIED_HEADS[0], beside=lumps)
     assert "5.0/5.0 (4.1)" in beside
     assert "the head nearest to the print: R 13 mm, shoulders-inside of 3 mm" in beside
+
+
+def test_the_document_names_the_width_of_each_fit() -> None:
+    rows = [agreement(scene) for scene in table_scenes(0.0)]
+    (first, *_) = tables_document({Head(): rows}, {Head(): rows}, seat=0.0)["cases"]
+    assert first["elastic"] == {"amplitude": 0.3, "sigma_mm": 3.0, "rms": 0.01, "resolved": True}
+    assert (first["empirical"]["sigma_mm"], first["map_strict"]) == (3.5, 0.4)
 
 
 def test_the_distance_from_the_printed_tables_is_0_for_them_and_is_what_ranks_the_heads() -> None:
