@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Annotated, Any, Generic, TypeVar
 
 import numpy as np
@@ -252,23 +253,23 @@ def priced(one: Choice[How], run: Run[How], reference: Reference, *, runs: int) 
     return Priced(one.axis, one.label, one.default, one.usable, len(answers), least, *off, answers[0], False)
 
 
-def default_run(how: How, run: Run[How]) -> tuple[float, SizeAnswer]:
-    """CPU seconds and answer of the default, which is run twice: imports and first calls cost nothing afterwards."""
-    run(how, 0)
-    seconds, answer = run(how, 0)
-    return sum(seconds.values()), answer
-
-
 def climbed(
     choices: Sequence[Choice[How]],
     run: Run[How],
     reference: Callable[[], Reference],
-    *,
-    default_s: float,
     work: Work,
+    *,
+    worth: Callable[[SizeAnswer], Sequence[Choice[How]]] | None = None,
 ) -> Ladder:
-    """Say how long it takes, by the CPU seconds of the default, make the reference and price every setting."""
-    work.announce(default_s * (4.0 + work.runs * sum(one.weight for one in choices)))
+    """Say how long it takes, make the reference and price every setting.
+
+    `worth` says which settings can make a difference where the default gives an answer; without it all are tried.
+    """
+    default = next(one.how for one in choices if one.default)
+    run(default, 0)  # twice: imports and first calls cost nothing afterwards
+    seconds, answer = run(default, 0)
+    choices = choices if worth is None else worth(answer)
+    work.announce(sum(seconds.values()) * (4.0 + work.runs * sum(one.weight for one in choices)))
     made, rows = reference(), []
     for number, one in enumerate(choices, start=1):
         rows.append(priced(one, run, made, runs=work.runs))
@@ -403,6 +404,7 @@ def measure(
 ) -> Ladder:
     """Run every setting on one map, from the calibration and options that `estimate` takes by itself for it."""
     estimator = Estimator(tactile_map, calibration, work)
-    seconds, answer = default_run(options, estimator.run)
-    settings = worth_trying(settings_of(options, level_known=tactile_map.background is not None), answer)
-    return climbed(settings, estimator.run, lambda: estimator.reference(options), default_s=seconds, work=work)
+    settings = settings_of(options, level_known=tactile_map.background is not None)
+    return climbed(
+        settings, estimator.run, lambda: estimator.reference(options), work, worth=partial(worth_trying, settings)
+    )

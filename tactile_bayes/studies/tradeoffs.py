@@ -34,7 +34,6 @@ from tactile_bayes.studies.estimate_tradeoff import (
     SizeAnswer,
     Work,
     climbed,
-    default_run,
     no_number,
     reference_of,
 )
@@ -154,17 +153,20 @@ def measure_forward(case: LumpCase, model: str, rule: SizeRule, *, share: float,
         return seconds, _exact_answer(found, _element_mm(case.body, how.settings), rule)
 
     choices, finest = forward_settings(case, model)
-    default_s, _ = default_run(Computed(case.of(model)), run)
-    seconds, answer = run(finest.how, 0)
-    made = reference_of(f"{model}, {finest.label}", answer, sum(seconds.values()))
+
+    def reference() -> Reference:
+        seconds, answer = run(finest.how, 0)
+        return reference_of(f"{model}, {finest.label}", answer, sum(seconds.values()))
+
+    ladder = climbed(choices, run, reference, work)
+    answer = ladder.reference.answer
+    assert answer is not None
     assert answer.reported is not None  # a width at least
-    limit = float(f"{share * answer.reported.median:.3g}")
-    ladder = climbed(choices, run, lambda: made, default_s=default_s, work=replace(work, tolerance_mm=limit))
     left = f"leaves {100 * rule.scatter:.0f} % (SD of ln d): that is the interval, for these maps have no errors"
     notes = [f"Sizes by {rule.source}, which itself {left}."]
     if outside := rule.outside(*numbers_of(answer)):
         notes.append(f"The map is none of the calibration's: {', '.join(outside)}.")
-    return replace(ladder, notes=tuple(notes))
+    return replace(ladder, tolerance_mm=float(f"{share * answer.reported.median:.3g}"), notes=tuple(notes))
 
 
 def _element_mm(body: Body, settings: paper.StudySettings | SolidSettings) -> float:
@@ -364,5 +366,4 @@ def measure_map(scan: Scan, *, inputs: Inputs, work: Work) -> Ladder:
         words = found.words.replace("the default's posterior", ours)
         return replace(found, words=words, cpu_s=clock() - begun)
 
-    seconds, _ = default_run(settings[0].how, run)
-    return climbed(settings, run, reference, default_s=seconds, work=work)
+    return climbed(settings, run, reference, work)
