@@ -191,7 +191,6 @@ def run_study(
 
 
 def _rows(outcomes: Iterable[Outcome[list[paper.StudyRow]]]) -> list[paper.StudyRow]:
-    """Rows of the finished geometries."""
     return [row for outcome in outcomes for row in outcome.value or []]
 
 

@@ -171,7 +171,6 @@ def _told(tactile_map: TactileMap) -> dict[str, Any]:
 
 
 def _notes(tactile_map: TactileMap) -> Iterator[str]:
-    """Notes for the reader of the map, one line each."""
     quality = tactile_map.quality
     if tactile_map.masked_taxels:
         shown = "; ".join(tactile_map.masked_taxels[:_LISTED_TAXELS])
@@ -296,7 +295,6 @@ def draw_panel(axes: Axes, values: Any, tactile_map: TactileMap, *, label: str, 
 
 
 def _draw_values(axes: Axes, tactile_map: TactileMap, view: Orientation, report: EstimateReport | None) -> None:
-    """Draw the heat map."""
     well = tactile_map.covered & (~tactile_map.few)  # one noisy edge cell would hide the lump
     values = tactile_map.mean[well if well.any() else tactile_map.covered]
     level = float(np.median(values))
@@ -312,7 +310,6 @@ def _draw_values(axes: Axes, tactile_map: TactileMap, view: Orientation, report:
 
 
 def _draw_coverage(axes: Axes, tactile_map: TactileMap, view: Orientation) -> None:
-    """Draw the number of readings per cell."""
     counts = np.ma.masked_equal(tactile_map.count, 0)
     image = _draw_map(axes, counts, tactile_map, view, cmap="cividis", vmin=0)
     known = tactile_map.counts_known
@@ -461,7 +458,6 @@ def _draw_places(axes: Axes, places: Sequence[PassedOver], view: Orientation) ->
 
 
 def _draw_scale_bar(axes: Axes) -> None:
-    """Draw a scale bar of 10 mm."""
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     sign = 1.0 if right > left else -1.0
     start = left + 0.05 * (right - left)

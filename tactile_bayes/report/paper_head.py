@@ -368,7 +368,6 @@ def _draw_frames(
 
 
 def _draw_line(axes: Axes, measured: MeasuredScan, found: Sequence[ModelComparison]) -> None:
-    """The map across the lump."""
     x, mean = centre_row(measured, measured.tactile_map)
     near = np.abs(x) <= NEAR_MM
     axes.plot(x[near], mean[near], "x", color="0.45", markersize=4, label="measured")
