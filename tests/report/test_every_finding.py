@@ -280,7 +280,7 @@ PRINTERS = {
     "actions/calibrate", "actions/devices", "api/diagnosing", "api/repeatability", "api/trials",
     "campaigns/campaign", "actions/bring_in", "actions/exam",
     "actions/simulation", "actions/study",
-    "actions/tradeoff", "files/size_json", "presets", "report/calibration",
+    "files/size_json", "presets", "report/calibration",
     "report/figure_file", "report/paper_head", "report/laboratory",
     "report/study", "report/tradeoff", "report/trial_html", "trial/summary",
 }  # fmt: skip
