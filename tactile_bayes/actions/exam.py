@@ -154,7 +154,6 @@ def _apart(default: StatedSize | None, paper: StatedSize | None) -> str:
 
 
 def _summary(truth_mm: float, results: dict[str, StatedSize | None]) -> str:
-    """True size and estimates, one per line."""
     lines = [
         f"{'Largest size of the lump':28}{'mm':>9}   95 % interval for exams of simulated bodies",
         f"{'true':28}{truth_mm:>9.1f}",

@@ -10,7 +10,7 @@ import numpy as np
 
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, Failure, SizeEstimate, size_priors
-from tactile_bayes.declarations import Record, names_of, replace
+from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import NO_LUMP, BadDataError, TactileBayesError, in_file
 from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.npz import CheckpointFile
@@ -36,16 +36,11 @@ _UNRECORDED = (*PRIORS, "max_steps", "checkpoint")
 """Settings that the provenance leaves out: the priors stand in the report, the others change how long it takes."""
 NO_CALIBRATION_ON_PAPER = "a size needs a calibration that fits this map"
 Notice = Callable[[str], None]
+WhyNone = tuple[str, str]
+"""Reason for widths without a size where no calibration was named, and a remedy."""
 
 
-class NoSize(Record):
-    """Reason for widths without a size where no calibration was named, and a remedy."""
-
-    reason: str
-    advice: str = ""
-
-
-_LEAST_SQUARES = NoSize(
+_LEAST_SQUARES: WhyNone = (
     "optimise is the paper's least squares, and the shipped calibrations were learned with correlated errors (its "
     "widths are up to 30 % wider, docs/decisions/0093); widths only",
     "--method laplace --size-calibration eq6 gives a size by Eq 6 as quickly; for least squares throughout, learn Eq 6 "
@@ -135,7 +130,8 @@ def estimate_one(
     estimate = with_masses(tactile_map, estimated(tactile_map, options), options, estimated)
     estimate = _with_place(estimate, tactile_map, scans, probability=settings.interval)
     if why_none is not None and estimate.status == "estimate":
-        estimate = replace(estimate, reason=why_none.reason, advice=why_none.advice, on_paper=NO_CALIBRATION_ON_PAPER)
+        reason, advice = why_none
+        estimate = replace(estimate, reason=reason, advice=advice, on_paper=NO_CALIBRATION_ON_PAPER)
     if estimate.code in NO_LUMP and tactile_map.covered.any():
         fat_mm = None if calibration is None else calibration.fat_mm
         estimate = replace(estimate, smallest=smallest_lumps(tactile_map, fat_mm=fat_mm))
@@ -190,7 +186,7 @@ def named_calibration(settings: Settings, normalise: str) -> tuple[Path | None, 
 
 def choose_calibration(
     settings: Settings, tactile_map: TactileMap
-) -> tuple[Path | None, Calibration | None, NoSize | None]:
+) -> tuple[Path | None, Calibration | None, WhyNone | None]:
     """The calibration that was named, or the shipped one if none was and it fits map and options, with its path.
 
     None where there is none; then with why the shipped one was not used, unless the user decided.
@@ -199,10 +195,10 @@ def choose_calibration(
     if calibration is None:
         return None, None, None
     if tactile_map.background is None and calibration.recipe.normalise != tactile_map.recipe.normalise:
-        why_none = _level_unknown(tactile_map, _options(settings, None, tactile_map))
+        reason, advice = _level_unknown(tactile_map, _options(settings, None, tactile_map))
         if settings.size_calibration is None:
-            return None, None, replace(why_none, reason=f"{why_none.reason}; widths only")
-        raise BadDataError(f"{settings.calibration_name} does not fit: {why_none.reason}", way_out=why_none.advice)
+            return None, None, (f"{reason}; widths only", advice)
+        raise BadDataError(f"{settings.calibration_name} does not fit: {reason}", way_out=advice)
     if settings.size_calibration is not None:
         return path, calibration, None
     fit = _options(settings, calibration, tactile_map)
@@ -211,11 +207,11 @@ def choose_calibration(
         return None, None, _LEAST_SQUARES
     if differs:
         advice = OTHER_HEAD if calibration.recipe.head_differences(tactile_map.head) else ""
-        return None, None, NoSize(f"the shipped calibration does not fit: {'; '.join(differs)}; widths only", advice)
+        return None, None, (f"the shipped calibration does not fit: {'; '.join(differs)}; widths only", advice)
     return path, calibration, None
 
 
-def _level_unknown(tactile_map: TactileMap, fit: SamplerSettings) -> NoSize:
+def _level_unknown(tactile_map: TactileMap, fit: SamplerSettings) -> WhyNone:
     """Reason for widths only where a map's level is unknown, with the commands that lead to a size."""
     made = f"--normalise {tactile_map.recipe.normalise} --background {fit.background} --noise {fit.noise}"
     learn = (
@@ -225,10 +221,10 @@ def _level_unknown(tactile_map: TactileMap, fit: SamplerSettings) -> NoSize:
     )
     if tactile_map.recipe.source == "scan":
         reason = "the map is in kPa, and the shipped calibrations are for maps of normalised frames"
-        return NoSize(reason, f"map the scan again without --normalise none; or {learn}")
+        return reason, f"map the scan again without --normalise none; or {learn}"
     reason = "the grid's level is not known, and the shipped calibrations need the amplitude relative to it"
     declare = "if its values were divided by their level already, import it again with --normalise gain"
-    return NoSize(reason, f"{declare} (frames divided by their means: mean); otherwise {learn}")
+    return reason, f"{declare} (frames divided by their means: mean); otherwise {learn}"
 
 
 def _options(settings: Settings, calibration: Calibration | None, tactile_map: TactileMap) -> SamplerSettings:

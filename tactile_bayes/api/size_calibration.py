@@ -325,7 +325,6 @@ def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Pr
 
 
 def _bump(rows: Table, i: int, row: Mapping[str, Any]) -> ShapeDraws:
-    """The bump of a row with its amplitude and widths."""
     if row["sigma_y_mm"] is None:
         raise rows.error(i, "sigma_y_mm", "is blank", way_out="give both widths of the map")
     a, x, y = (np.array([row[one]], dtype=np.float64) for one in ("amplitude", "sigma_x_mm", "sigma_y_mm"))

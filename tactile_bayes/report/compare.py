@@ -279,7 +279,6 @@ def growth_rates(growth: Sequence[float], probability: float) -> tuple[Rate, Dou
 
 
 def _trend(joint: JointSizes, days: Sequence[float], probability: float) -> TrendReport:
-    """Straight line of ln d over all visits."""
     line = straight_line(*joint.moments, days)
     half = float(ndtri(0.5 + probability / 2)) * line.sd
     rates = growth_rates([VOLUME * (line.per_day + one) for one in (0.0, -half, half)], probability)
@@ -406,13 +405,11 @@ def _verdict_line(change: ChangeReport) -> str:
 
 
 def _rate_lines(change: ChangeReport) -> list[str]:
-    """Growth rate between two visits."""
     rate = change.growth_rate
     return [] if rate is None else [f"Growth rate over {rate.days:g} days: {_rate_words(rate)}."]
 
 
 def _trend_lines(trend: TrendReport) -> list[str]:
-    """Growth rate by the straight line through all visits."""
     lines = [f"Trend over {trend.visits} visits in {trend.days:g} days: {_rate_words(trend)}."]
     if (p := trend.straight_line_probability) is not None and p < 0.05:
         lines.append(f"The sizes do not follow one steady growth (probability {chance_text(p, 3)}): see the changes.")

@@ -373,7 +373,6 @@ def _name_axes(axes: Axes, origin_mm: FloatArray, view: Orientation) -> None:
 
 
 def _draw_change(axes: Axes, compared: Compared) -> None:
-    """Draw the posterior of the change from the first visit to the last."""
     axes.set_yticks([])
     joint = compared.joint
     if joint is None:

@@ -79,7 +79,7 @@ def _environment() -> Environment:
 
 # --- Growth of masses between visits, as `compare` told it: rows of a table and a section of a page.
 
-_VERDICTS: Final = {"grown": "grown", "shrunk": "shrunk", "no_change_shown": "no change shown"}
+_OUTCOMES: Final = ("grown", "shrunk", "no change shown", "not compared")
 
 
 class Growth(Record, eq=False):
@@ -104,8 +104,8 @@ class Growth(Record, eq=False):
     @property
     def outcome(self) -> str:
         """What became of the mass, or why nothing is known of it."""
-        told = _VERDICTS.get(self.verdict)
-        return ", ".join(filter(None, (told, self.reason))) if told else f"not compared: {self.reason}"
+        told = ", ".join(filter(None, (self.verdict.replace("_", " "), self.reason)))
+        return told if self.verdict else f"not compared: {self.reason}"
 
     @property
     def words(self) -> str:
@@ -118,8 +118,8 @@ def growth_line(rows: Sequence[Growth], table: str) -> str:
     if not rows:
         return ""
     last = {(row.patient, row.mass): row.verdict for row in rows}
-    counts = Counter(_VERDICTS.get(found, "not compared") for found in last.values())
-    told = ", ".join(f"{counts[words]} {words}" for words in (*_VERDICTS.values(), "not compared") if counts[words])
+    counts = Counter(found.replace("_", " ") or "not compared" for found in last.values())
+    told = ", ".join(f"{counts[words]} {words}" for words in _OUTCOMES if counts[words])
     return f"growth of {len(last)} mass{'es' * (len(last) > 1)} with several visits: {told} ({table})"
 
 

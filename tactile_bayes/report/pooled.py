@@ -266,5 +266,4 @@ def pooled_text(report: PooledReport) -> str:
 
 
 def _sizes(report: PooledReport) -> list[Quantity]:
-    """The largest and the smallest size."""
     return [one for one in (report.max_size_mm, report.min_size_mm) if one is not None]
