@@ -13,7 +13,7 @@ import msgspec
 from record_schema import schema_of
 
 from tactile_bayes.api.settings import SettingsFile
-from tactile_bayes.declarations import Record
+from tactile_bayes.declarations import Record, meaning_of
 from tactile_bayes.files.arrays_layout import ArrayMap
 from tactile_bayes.files.column_map import ColumnMap
 from tactile_bayes.files.documents import OF_A_PERSON, Fact, FactName, Protocol, Session
@@ -76,6 +76,7 @@ def meanings(kind: Any) -> dict[str, dict[str, str]]:
         if isinstance(one, type) and issubclass(one, Record) and one.__name__ not in found:
             fields = msgspec.structs.fields(one)
             told = {name: text for part in reversed(one.__mro__) for name, text in _said(part).items()}
+            told |= {part.name: text for part in fields if (text := meaning_of(part.type))}
             found[one.__name__] = {part.encode_name: told[part.name] for part in fields if part.name in told}
             for part in fields:
                 look(part.type)

@@ -8,7 +8,8 @@ A declaration gives a field its type, range and meaning::
         rows: Annotated[int, Meta(ge=1)]  #: Taxels across the head.
         radius_mm: Annotated[float, Meta(gt=0)] | None = None  #: Of the arc across the head.
 
-Schemas take the meaning from there; `says` says that of an option, which a command's help has, and of a kind of value.
+Schemas take the meaning from there. That of an option, which a command's help has, is a text among its rules:
+``every: Annotated[int, Meta(ge=1), "Use one frame of every N."] = 1``; `says` says that of a kind of value.
 `from_plain` makes one of what JSON or TOML held, `to_plain` the reverse; docs/record_schema.py makes the schemas in
 data_schema/. Files go through `files.documents.read_record`, which first refuses doubled keys, huge numbers and depth.
 Arrays are nested lists in files; `geometry.Vector` and `geometry.Matrix` declare them. A range belongs to its own
@@ -120,8 +121,9 @@ def range_of(kind: Any) -> tuple[Any, Any, tuple[str, ...]]:
 
 
 def meaning_of(kind: Any) -> str:
-    """What a field's declaration says that it means."""
-    return str(_rules(kind).get("description", ""))
+    """What a declaration says that it means, in a text or by `says`."""
+    texts = [one for one in getattr(kind, "__metadata__", ()) if isinstance(one, str)]
+    return texts[0] if texts else str(_rules(kind).get("description", ""))
 
 
 def extra_of(kind: Any) -> Mapping[str, Any]:

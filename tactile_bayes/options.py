@@ -1,4 +1,4 @@
-"""Options declared once: type, range, default and meaning stand at a field, and the rest comes from there.
+"""Options declared once: type, range, meaning and default stand at a field, and the rest comes from there.
 
 Click options (`commands.options.takes`), keywords and checks of Python, the settings file with its schema, and the
 settings of a provenance are made of these records.
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from tactile_bayes import presets
-from tactile_bayes.declarations import Meta, Options, says
+from tactile_bayes.declarations import Meta, Options
 from tactile_bayes.errors import UsageError
 from tactile_bayes.presets import Background, Method, Noise, Normalise, Rotation, SceneAsked, TrackerProtocol
 
@@ -19,20 +19,19 @@ class BumpPrior(Options):
     """Proper, weak priors, all of them printed with the estimate."""
 
     amplitude_sd: Annotated[
-        float, says("Normal about 0, in units of the map's scale (1 for a normalised map)", gt=0, le=1000)
+        float, Meta(gt=0, le=1000), "Normal about 0, in units of the map's scale (1 for a normalised map)"
     ] = 2.0
     width_median_mm: Annotated[
-        float, says("Median of the geometric mean of the two widths, log-normal", gt=0, le=100)
+        float, Meta(gt=0, le=100), "Median of the geometric mean of the two widths, log-normal"
     ] = 5.0
-    log_width_sd: Annotated[float, says("SD of its natural log", gt=0, le=10)] = 1.0
+    log_width_sd: Annotated[float, Meta(gt=0, le=10), "SD of its natural log"] = 1.0
     log_ratio_sd: Annotated[
-        float, says("SD of half the log of the axis ratio, along and across the diagonal", gt=0, le=5)
+        float, Meta(gt=0, le=5), "SD of half the log of the axis ratio, along and across the diagonal"
     ] = 0.5
     tilt_sd: Annotated[
         float,
-        says(
-            "SD of the level's slope over half a window, in units of the map's scale; for its odds only", gt=0, le=1000
-        ),
+        Meta(gt=0, le=1000),
+        "SD of the level's slope over half a window, in units of the map's scale; for its odds only",
     ] = 0.1
 
 
@@ -40,17 +39,16 @@ PRIORS: Final = BumpPrior.__struct_fields__
 
 MOST_PATIENTS: Final = 10_000  #: Of a plan.
 MOST_ITEMS: Final = 1_000_000  #: Of a batch: memory holds a name and an outcome for each.
-IN_FILE: Final = {"file": True}  #: Of a setting that stands in the file of `--settings`, not on the command line.
+IN_FILE: Final = Meta(extra={"file": True})  #: Of a setting in the file of `--settings`, not on the command line.
 
 
-def named(metavar: str, meaning: str, *, option: str = "", also: str = "", path: bool = False, **rules: Any) -> Meta:
-    """Meaning and rules of an option whose value has a name in the help.
+def named(metavar: str, *, option: str = "", also: str = "", **rules: Any) -> Meta:
+    """Rules of an option whose value has a name in the help.
 
-    `option` and `also` name it on the command line, if not by its field, and a second time; a `path` is checked against
-    the call's other files.
+    `option` and `also` name it on the command line, if not by its field, and a second time.
     """
-    held = {"metavar": metavar, "option": option, "also": also, "path": path}
-    return Meta(description=meaning, extra={name: value for name, value in held.items() if value}, **rules)
+    held = {"metavar": metavar, "option": option, "also": also}
+    return Meta(extra={name: value for name, value in held.items() if value}, **rules)
 
 
 Above0 = Annotated[float, Meta(gt=0)]
@@ -63,67 +61,54 @@ class FitSettings(BumpPrior, kw_only=True):
 
     method: Annotated[
         Method,
-        says(
-            "importance: weighted draws; ensemble: MCMC; laplace: mode, curvature; optimise: the paper's least squares."
-        ),
+        "importance: weighted draws; ensemble: MCMC; laplace: mode, curvature; optimise: the paper's least squares.",
     ] = "importance"
     background: Annotated[
         Background | None,
-        says(
-            "Level about the lump: fixed at 1, or fitted. Default: as for the calibration's maps; free "
-            "where the level is not known (normalise none)",
-            extra=IN_FILE,
-        ),
+        IN_FILE,
+        "Level about the lump: fixed at 1, or fitted. Default: as for the calibration's maps; free where the level is "
+        "not known (normalise none)",
     ] = None
     fit_radius_mm: Annotated[
-        Above0 | None, says("Radius of the fitted window. Default: the calibration's, else 20", extra=IN_FILE)
+        Above0 | None, IN_FILE, "Radius of the fitted window. Default: the calibration's, else 20"
     ] = None
     rotation: Annotated[
         Rotation,
-        says(
-            "Rotated ellipse: used where the map favours it, always, or never. Correlated noise: `--scene` decides",
-            extra=IN_FILE,
-        ),
+        IN_FILE,
+        "Rotated ellipse: used where the map favours it, always, or never. Correlated noise: `--scene` decides",
     ] = "auto"
     centre_mm: Annotated[
         tuple[float, float] | None,
-        named("X Y", "Place on the map to measure. Default: the highest bump that can be a lump."),
+        named("X Y"),
+        "Place on the map to measure. Default: the highest bump that can be a lump.",
     ] = None
     noise: Annotated[
         Noise | None,
-        says(
-            "independent: white noise, the likelihood divided by the inflation of correlated errors; "
-            "field: correlated noise in the model. Default: the calibration's",
-            extra=IN_FILE,
-        ),
+        IN_FILE,
+        "independent: white noise, the likelihood divided by the inflation of correlated errors; field: correlated "
+        "noise in the model. Default: the calibration's",
     ] = None
     field_cosines: Annotated[
         FieldCosines,
-        says(
-            "Basis functions of the correlated noise along each axis: more are slower and resolve shorter "
-            "correlation; `tradeoff estimate` measures the difference. auto: 18, up to 30 for a narrow lump",
-            extra=IN_FILE,
-        ),
+        IN_FILE,
+        "Basis functions of the correlated noise along each axis: more are slower and resolve shorter correlation; "
+        "`tradeoff estimate` measures the difference. auto: 18, up to 30 for a narrow lump",
     ] = "auto"
     accuracy_sd: Annotated[
         Annotated[float, Meta(ge=0.001, le=0.5)] | None,
-        says(
-            "Monte-Carlo error to reach in the interval ends of sizes and map widths, in posterior SDs. "
-            "Default: 0.02 for importance, 0.1 for ensemble."
-        ),
+        "Monte-Carlo error to reach in the interval ends of sizes and map widths, in posterior SDs. Default: 0.02 for "
+        "importance, 0.1 for ensemble.",
     ] = None
     accuracy_mm: Annotated[
         Annotated[float, Meta(ge=0.0001, le=10)] | None,
-        says(
-            "Wanted Monte-Carlo error of interval ends, in mm; the finer of this and --accuracy-sd holds", extra=IN_FILE
-        ),
+        IN_FILE,
+        "Wanted Monte-Carlo error of interval ends, in mm; the finer of this and --accuracy-sd holds",
     ] = None
-    scene: Annotated[
-        SceneAsked, says("Structures in the fit window; auto: the simplest scene that the map supports.")
-    ] = "auto"
+    scene: Annotated[SceneAsked, "Structures in the fit window; auto: the simplest scene that the map supports."] = (
+        "auto"
+    )
     max_steps: Annotated[
-        Annotated[int, Meta(ge=150)] | None,
-        says("Longest MCMC chain (method ensemble) before it gives up", extra=IN_FILE),
+        Annotated[int, Meta(ge=150)] | None, IN_FILE, "Longest MCMC chain (method ensemble) before it gives up"
     ] = None
 
     @property
@@ -140,38 +125,32 @@ class FitSettings(BumpPrior, kw_only=True):
 class MapOptions(Options):
     """How a map is built of scans."""
 
-    cell_mm: Annotated[float, says("Side of the square cells, mm.", ge=0.01, le=50)] = presets.CELL_MM
+    cell_mm: Annotated[float, Meta(ge=0.01, le=50), "Side of the square cells, mm."] = presets.CELL_MM
     pressure_window_kpa: Annotated[
-        tuple[Least0, Least0], named("LOW HIGH", "Leave out frames whose mean pressure lies outside.")
+        tuple[Least0, Least0], named("LOW HIGH"), "Leave out frames whose mean pressure lies outside."
     ] = presets.PRESSURE_WINDOW_KPA
     normalise: Annotated[
-        Normalise,
-        says("gain: estimate one gain per frame; mean: divide each frame by its mean (the paper); none: keep kPa."),
+        Normalise, "gain: estimate one gain per frame; mean: divide each frame by its mean (the paper); none: keep kPa."
     ] = presets.DEFAULT_NORMALISE
     latency_ms: Annotated[
         Annotated[float, Meta(ge=-10_000, le=10_000)] | Literal["auto"],
-        named("MS|auto", "Delay of the tracker's time stamps; auto: estimate it from the scan, or refuse."),
+        named("MS|auto"),
+        "Delay of the tracker's time stamps; auto: estimate it from the scan, or refuse.",
     ] = 0.0
     plane_radius_mm: Annotated[
         Above0 | Literal["auto", "all"],
-        named(
-            "MM|auto|all",
-            "Fit the plane to frames within this distance of the mass; auto: those whose array can reach it.",
-        ),
+        named("MM|auto|all"),
+        "Fit the plane to frames within this distance of the mass; auto: those whose array can reach it.",
     ] = "all"
-    flat_field: Annotated[bool, says("Remove the head's own response, measured on frames without a lump.")] = False
-    register_strokes: Annotated[
-        bool, says("Align the strokes with each other, for a lump that moves with the head.")
-    ] = False
+    flat_field: Annotated[bool, "Remove the head's own response, measured on frames without a lump."] = False
+    register_strokes: Annotated[bool, "Align the strokes with each other, for a lump that moves with the head."] = False
     as_stated: Annotated[
         bool,
-        says(
-            "Take array, lever arm and quaternions as stated, with a caution where frames contradict them; "
-            "else such a scan is refused."
-        ),
+        "Take array, lever arm and quaternions as stated, with a caution where frames contradict them; else such a "
+        "scan is refused.",
     ] = False
     every: Annotated[
-        int, named("N", "Use one frame of every N: quicker, and noisier; `tradeoff map` measures both.", ge=1)
+        int, named("N", ge=1), "Use one frame of every N: quicker, and noisier; `tradeoff map` measures both."
     ] = 1
 
     def __post_init__(self) -> None:
@@ -195,17 +174,16 @@ class Comparing(Options):
     """How visits are compared."""
 
     days: Annotated[
-        tuple[float, ...] | None, says("Time of each visit in days, the first at 0; None where it is not known.")
+        tuple[float, ...] | None, "Time of each visit in days, the first at 0; None where it is not known."
     ] = None
     grown_by: Annotated[
-        tuple[Annotated[float, Meta(gt=-1, lt=10)], ...],
-        says("Shares of the diameter by which it may have grown or more."),
+        tuple[Annotated[float, Meta(gt=-1, lt=10)], ...], "Shares of the diameter by which it may have grown or more."
     ] = GROWN_BY
     same_mass: Annotated[
-        bool, says("Say that the visits are of one mass where landmarks are missing, or place it too far apart.")
+        bool, "Say that the visits are of one mass where landmarks are missing, or place it too far apart."
     ] = False
     registration_mm: Annotated[
-        float, says("SD each way of one mass's place between visits, by posture and landmarks.", gt=0)
+        float, Meta(gt=0), "SD each way of one mass's place between visits, by posture and landmarks."
     ] = presets.REGISTRATION_MM
 
     def check_visits(self, visits: int) -> None:
@@ -221,8 +199,8 @@ class Comparing(Options):
 
 
 IntervalMethod = Literal["corrected", "jackknife", "bca"]
-Seed = Annotated[int, says("Random seed.", ge=0)]
-Workers = Annotated[int, says("Number of worker processes.", ge=0)]
+Seed = Annotated[int, Meta(ge=0), "Random seed."]
+Workers = Annotated[int, Meta(ge=0), "Number of worker processes."]
 
 
 class TrialSettings(Options):
@@ -230,19 +208,17 @@ class TrialSettings(Options):
 
     intervals: Annotated[
         IntervalMethod,
-        says(
-            "Interval method, resampling patients. corrected: jackknife with Student's t, corrected for "
-            "rare misses and few influential patients; jackknife: uncorrected; bca: bootstrap."
-        ),
+        "Interval method, resampling patients. corrected: jackknife with Student's t, corrected for rare misses and "
+        "few influential patients; jackknife: uncorrected; bca: bootstrap.",
     ] = "corrected"
-    resamples: Annotated[int, says("Number of bootstrap resamples.", ge=200, le=100_000)] = 2000
+    resamples: Annotated[int, Meta(ge=200, le=100_000), "Number of bootstrap resamples."] = 2000
     seed: Seed = 1999
     error_ratio: Annotated[
-        float, says("Ratio of the ex-vivo error's variance to the modality's, for Deming lines.", ge=1e-6, le=1e6)
+        float,
+        Meta(ge=1e-6, le=1e6),
+        "Ratio of the ex-vivo error's variance to the modality's, for Deming lines.",
     ] = 1.0
-    bayes: Annotated[bool, says("Predict the error of the next mass, by an errors-in-variables model and MCMC.")] = (
-        False
-    )
+    bayes: Annotated[bool, "Predict the error of the next mass, by an errors-in-variables model and MCMC."] = False
 
 
 Aim = Literal["power", "precision"]
@@ -251,38 +227,36 @@ Aim = Literal["power", "precision"]
 class PlanErrors(Options):
     """Errors of ln size that a plan assumes; an SD of 0.15 is about 15 %."""
 
-    tactile_bias: Annotated[float, says("Mean of ln(size / ex vivo).", ge=-3, le=3)] = 0.02
-    mass_sd: Annotated[float, says("SD of ln size shared by a mass's maps.", ge=0, le=3)] = 0.18
-    map_sd: Annotated[float, says("SD of ln size of single maps.", ge=0, le=3)] = 0.15
-    other_bias: Annotated[float, says("Mean of ln(size / ex vivo) of the modality compared with.", ge=-3, le=3)] = -0.08
-    other_sd: Annotated[float, says("SD of ln size of the modality compared with.", ge=0, le=3)] = 0.40
-    other_miss: Annotated[float, says("Share of masses that the modality compared with misses.", ge=0, le=1)] = 0.04
+    tactile_bias: Annotated[float, Meta(ge=-3, le=3), "Mean of ln(size / ex vivo)."] = 0.02
+    mass_sd: Annotated[float, Meta(ge=0, le=3), "SD of ln size shared by a mass's maps."] = 0.18
+    map_sd: Annotated[float, Meta(ge=0, le=3), "SD of ln size of single maps."] = 0.15
+    other_bias: Annotated[float, Meta(ge=-3, le=3), "Mean of ln(size / ex vivo) of the modality compared with."] = -0.08
+    other_sd: Annotated[float, Meta(ge=0, le=3), "SD of ln size of the modality compared with."] = 0.40
+    other_miss: Annotated[float, Meta(ge=0, le=1), "Share of masses that the modality compared with misses."] = 0.04
 
 
 class PlanOptions(Options, kw_only=True):
     """Designs of a trial that are simulated, or what the number of patients is to reach instead of being given."""
 
     patients: Annotated[
-        tuple[Annotated[int, Meta(ge=8, le=MOST_PATIENTS)], ...], says("Number of patients, one mass each.")
+        tuple[Annotated[int, Meta(ge=8, le=MOST_PATIENTS)], ...], "Number of patients, one mass each."
     ] = (16, 24, 32, 48)
     maps: Annotated[
         tuple[Annotated[int, Meta(ge=1, le=1000)], ...],
-        says("Number of tactile maps per mass; 3 with --power or --precision."),
+        "Number of tactile maps per mass; 3 with --power or --precision.",
     ] = (1, 3, 5)
     power: Annotated[
         Annotated[float, Meta(ge=0.5, le=0.99)] | None,
-        named("SHARE", "Find the number of patients that reaches this power, such as 0.9."),
+        named("SHARE"),
+        "Find the number of patients that reaches this power, such as 0.9.",
     ] = None
     precision: Annotated[
         Annotated[float, Meta(ge=1.05, le=10)] | None,
-        named(
-            "FACTOR",
-            "Find the number of patients whose interval of the tactile error spans this factor from end to "
-            "end, such as 2.",
-        ),
+        named("FACTOR"),
+        "Find the number of patients whose interval of the tactile error spans this factor from end to end, such as 2.",
     ] = None
-    against: Annotated[str, says("Modality of the pilot to compare with.")] = "ultrasound"
-    trials: Annotated[int, says("Number of simulated trials per design.", ge=50, le=MOST_ITEMS)] = 1000
+    against: Annotated[str, "Modality of the pilot to compare with."] = "ultrasound"
+    trials: Annotated[int, Meta(ge=50, le=MOST_ITEMS), "Number of simulated trials per design."] = 1000
     seed: Seed = 1999
     workers: Workers = 1
 
@@ -296,27 +270,26 @@ class PlanOptions(Options, kw_only=True):
 class CampaignOptions(Options, kw_only=True):
     """How the exams of a table are mapped and matched, and what is done with them."""
 
-    excision: Annotated[
-        Path | None, named("EX.csv", "Sizes measured after excision: adds the trial's report.", path=True)
-    ] = None
+    excision: Annotated[Path | None, named("EX.csv"), "Sizes measured after excision: adds the trial's report."] = None
     columns: Annotated[
-        Path | None, named("MAP.toml", "Layout of a wide EX.csv: which column holds what, in which unit.", path=True)
+        Path | None, named("MAP.toml"), "Layout of a wide EX.csv: which column holds what, in which unit."
     ] = None
-    protocol: Annotated[
-        Path | None, named("FILE.toml", "Pre-specified analysis of the trial, as for `validate`.", path=True)
-    ] = None
-    normalise: Annotated[Normalise, says("As `map`.")] = presets.DEFAULT_NORMALISE
+    protocol: Annotated[Path | None, named("FILE.toml"), "Pre-specified analysis of the trial, as for `validate`."] = (
+        None
+    )
+    normalise: Annotated[Normalise, "As `map`."] = presets.DEFAULT_NORMALISE
     match_mm: Annotated[
         float,
-        named("MM", "Distance within which a mass is the one that another exam of the breast names by place.", gt=0),
+        named("MM", gt=0),
+        "Distance within which a mass is the one that another exam of the breast names by place.",
     ] = presets.MATCH_MM
-    figures: Annotated[bool, says("Draw map and size posterior of each exam.")] = False
-    dry_run: Annotated[bool, says("Print what would be done, and do nothing.")] = False
+    figures: Annotated[bool, "Draw map and size posterior of each exam."] = False
+    dry_run: Annotated[bool, "Print what would be done, and do nothing."] = False
     copy_to: Annotated[
-        str | None, named("s3://BUCKET/FOLDER", "Copy every file into this folder of an object store, step by step.")
+        str | None, named("s3://BUCKET/FOLDER"), "Copy every file into this folder of an object store, step by step."
     ] = None
     workers: Workers = 1
-    scheduler: Annotated[str | None, named("ADDRESS", "Send the exams to a dask scheduler (extra [cluster]).")] = None
+    scheduler: Annotated[str | None, named("ADDRESS"), "Send the exams to a dask scheduler (extra [cluster])."] = None
 
 
 class IdentityOptions(Options):
@@ -327,28 +300,28 @@ class IdentityOptions(Options):
     """
 
     patient_id: Annotated[
-        str, named("ID", "Patient ID; in csv files the beginning of the record ID.", max_length=64)
+        str, named("ID", max_length=64), "Patient ID; in csv files the beginning of the record ID."
     ] = ""
     patient_name: Annotated[
-        str, named("FAMILY^GIVEN", "Patient's name: FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX.", max_length=194)
+        str, named("FAMILY^GIVEN", max_length=194), "Patient's name: FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX."
     ] = ""
-    birth_date: Annotated[str, named("YYYY-MM-DD", "Patient's date of birth: YYYY-MM-DD.", max_length=10)] = ""
-    sex: Annotated[Literal["F", "M", "O", ""], named("F|M|O", "Patient's sex: F, M or O.")] = ""
-    issuer: Annotated[str, named("NAME", "Who issued the patient ID.", max_length=64)] = ""
-    accession: Annotated[str, named("NUMBER", "Accession number.", max_length=16)] = ""
+    birth_date: Annotated[str, named("YYYY-MM-DD", max_length=10), "Patient's date of birth: YYYY-MM-DD."] = ""
+    sex: Annotated[Literal["F", "M", "O", ""], named("F|M|O"), "Patient's sex: F, M or O."] = ""
+    issuer: Annotated[str, named("NAME", max_length=64), "Who issued the patient ID."] = ""
+    accession: Annotated[str, named("NUMBER", max_length=16), "Accession number."] = ""
     referring_physician: Annotated[
-        str, named("FAMILY^GIVEN", "Referring physician's name, likewise.", max_length=194)
+        str, named("FAMILY^GIVEN", max_length=194), "Referring physician's name, likewise."
     ] = ""
-    study_id: Annotated[str, named("ID", "Study ID.", max_length=16)] = ""
-    study_description: Annotated[str, named("TEXT", "Study description.", max_length=64)] = ""
+    study_id: Annotated[str, named("ID", max_length=16), "Study ID."] = ""
+    study_description: Annotated[str, named("TEXT", max_length=64), "Study description."] = ""
     study_uid: Annotated[
-        str, named("UID", "Study Instance UID. Default: one that follows from the content of the maps.", max_length=64)
+        str, named("UID", max_length=64), "Study Instance UID. Default: one that follows from the content of the maps."
     ] = ""
     study_date: Annotated[
-        str, named("DATE", "Date of the exam: YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the zone.", max_length=25)
+        str, named("DATE", max_length=25), "Date of the exam: YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the zone."
     ] = ""
     content_date: Annotated[
-        str, named("DATE", "Date at which the content was made. Default: the exam's.", max_length=25)
+        str, named("DATE", max_length=25), "Date at which the content was made. Default: the exam's."
     ] = ""
 
 
@@ -361,66 +334,56 @@ class RecordOptions(Options, kw_only=True):
     output: Path
     head_url: str
     tracker_url: Annotated[
-        str | None, named("URL", "Port of the tracker; without, there are no poses.", option="tracker")
+        str | None, named("URL", option="tracker"), "Port of the tracker; without, there are no poses."
     ] = None
-    tracker_protocol: Annotated[TrackerProtocol, says("Protocol of the tracker; a PATRIOT speaks liberty.")] = "fastrak"
-    head_baud: Annotated[int, says("Baud rate of the head's port.", ge=300)] = 2_000_000
+    tracker_protocol: Annotated[TrackerProtocol, "Protocol of the tracker; a PATRIOT speaks liberty."] = "fastrak"
+    head_baud: Annotated[int, Meta(ge=300), "Baud rate of the head's port."] = 2_000_000
     tracker_baud: Annotated[
-        Annotated[int, Meta(ge=300)] | None, says("Baud rate of the tracker's port. Default: the protocol's.")
+        Annotated[int, Meta(ge=300)] | None, "Baud rate of the tracker's port. Default: the protocol's."
     ] = None
-    tracker_rom: Annotated[
-        tuple[Path, ...], named("ROM", "ndi: a wireless tool's description, one for each.", path=True)
-    ] = ()
+    tracker_rom: Annotated[tuple[Path, ...], named("ROM"), "ndi: a wireless tool's description, one for each."] = ()
     tool: Annotated[
-        str | None, named("NAME", "Tool or station on the head, needed where the tracker has several.", also="station")
+        str | None, named("NAME", also="station"), "Tool or station on the head, needed where the tracker has several."
     ] = None
     reference: Annotated[
-        str | None, named("NAME", "Tool or station fixed to the body; poses relative to it are free of breathing.")
+        str | None, named("NAME"), "Tool or station fixed to the body; poses relative to it are free of breathing."
     ] = None
-    every: Annotated[int, says("Record every n-th frame only.", ge=1, le=255)] = 1
-    duration_s: Annotated[Above0 | None, named("S", "Stop after this time, s.", option="duration")] = None
-    at_once: Annotated[bool, says("Start at once, without waiting for space. Default: only with --duration.")] = False
+    every: Annotated[int, Meta(ge=1, le=255), "Record every n-th frame only."] = 1
+    duration_s: Annotated[Above0 | None, named("S", option="duration"), "Stop after this time, s."] = None
+    at_once: Annotated[bool, "Start at once, without waiting for space. Default: only with --duration."] = False
     clock: Annotated[
-        Literal["arrival", "shared"], says("Time the poses by their arrival, or trust one clock of both devices.")
+        Literal["arrival", "shared"], "Time the poses by their arrival, or trust one clock of both devices."
     ] = "arrival"
-    invert_rotation: Annotated[bool, says("The tracker gives the inverse rotation.")] = False
-    like: Annotated[Path | None, named("SCAN.mcap", "Take geometry and calibration from this scan.", path=True)] = None
+    invert_rotation: Annotated[bool, "The tracker gives the inverse rotation."] = False
+    like: Annotated[Path | None, named("SCAN.mcap"), "Take geometry and calibration from this scan."] = None
     head_geometry: Annotated[
-        Path | None, named("HEAD.json", "Positions of the taxels and of the tracker's sensor.", path=True)
+        Path | None, named("HEAD.json"), "Positions of the taxels and of the tracker's sensor."
     ] = None
-    array_calibration: Annotated[
-        Path | None, named("ARRAY.json", "Array calibration, made by `calibrate array`.", path=True)
-    ] = None
-    uncalibrated: Annotated[bool, says("Record with the nominal gain: for bladder steps.")] = False
-    accept_calibration: Annotated[bool, says("Accept an array calibration that is stale or of another head.")] = False
-    calibration_days: Annotated[float, says("Age from which an array calibration is stale, days.", ge=0)] = 1.0
-    landmarks: Annotated[Path | None, named("FILE", "Take landmarks from a JSON file or a scan.", path=True)] = None
-    side: Annotated[Literal["left", "right", "phantom"] | None, says("Breast that is scanned.")] = None
-    posture: Annotated[Literal["supine", "oblique", "sitting", "phantom"] | None, says("Posture during the scan.")] = (
+    array_calibration: Annotated[Path | None, named("ARRAY.json"), "Array calibration, made by `calibrate array`."] = (
         None
     )
-    lubricant: Annotated[str | None, named("TEXT", "Lubricant on the skin.")] = None
-    examiner: Annotated[str | None, named("CODE", "A code, not a name.")] = None
-    subject: Annotated[str | None, named("CODE", "A code, not a name.")] = None
+    uncalibrated: Annotated[bool, "Record with the nominal gain: for bladder steps."] = False
+    accept_calibration: Annotated[bool, "Accept an array calibration that is stale or of another head."] = False
+    calibration_days: Annotated[float, Meta(ge=0), "Age from which an array calibration is stale, days."] = 1.0
+    landmarks: Annotated[Path | None, named("FILE"), "Take landmarks from a JSON file or a scan."] = None
+    side: Annotated[Literal["left", "right", "phantom"] | None, "Breast that is scanned."] = None
+    posture: Annotated[Literal["supine", "oblique", "sitting", "phantom"] | None, "Posture during the scan."] = None
+    lubricant: Annotated[str | None, named("TEXT"), "Lubricant on the skin."] = None
+    examiner: Annotated[str | None, named("CODE"), "A code, not a name."] = None
+    subject: Annotated[str | None, named("CODE"), "A code, not a name."] = None
     session_file: Annotated[
         Path | None,
-        named(
-            "SESSION.toml",
-            "Read these five, and other facts in plain text, from a file; an option overrides it.",
-            path=True,
-            option="session",
-        ),
+        named("SESSION.toml", option="session"),
+        "Read these five, and other facts in plain text, from a file; an option overrides it.",
     ] = None
-    live: Annotated[bool, says("Draw the map on the terminal while it grows.")] = False
+    live: Annotated[bool, "Draw the map on the terminal while it grows."] = False
     serve: Annotated[
-        str | None, named("HOST:PORT", "Show the map in a browser on this computer, with a tone for the pressure.")
+        str | None, named("HOST:PORT"), "Show the map in a browser on this computer, with a tone for the pressure."
     ] = None
     size_calibration: Annotated[
         str,
-        named(
-            "solid-mean|plane-strain|none|SIZE.json",
-            "Size calibration of the live view, whose frames are divided by their means.",
-        ),
+        named("solid-mean|plane-strain|none|SIZE.json"),
+        "Size calibration of the live view, whose frames are divided by their means.",
     ] = "solid-mean"
     force: bool = False
 
@@ -432,45 +395,38 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 class FaultOptions(Options):
     """Faults of an emulated device, at times of the scan."""
 
-    drop: Annotated[Share, says("Share of the records that are not sent.")] = 0.0
-    corrupt: Annotated[Share, says("Share of the records with one bit changed.")] = 0.0
-    stall: Annotated[Span | None, named("AT FOR", "Send nothing for FOR s from AT s on; those records are lost.")] = (
+    drop: Annotated[Share, "Share of the records that are not sent."] = 0.0
+    corrupt: Annotated[Share, "Share of the records with one bit changed."] = 0.0
+    stall: Annotated[Span | None, named("AT FOR"), "Send nothing for FOR s from AT s on; those records are lost."] = (
         None
     )
-    disconnect_s: Annotated[Least0 | None, named("AT", "Disconnect at AT s.", option="disconnect")] = None
-    hold: Annotated[int, says("Tracker: measure only every n-th pose.", ge=1)] = 1
-    hide: Annotated[Span | None, named("AT FOR", "Tracker: its tool is out of sight for FOR s from AT s on.")] = None
+    disconnect_s: Annotated[Least0 | None, named("AT", option="disconnect"), "Disconnect at AT s."] = None
+    hold: Annotated[int, Meta(ge=1), "Tracker: measure only every n-th pose."] = 1
+    hide: Annotated[Span | None, named("AT FOR"), "Tracker: its tool is out of sight for FOR s from AT s on."] = None
     breathe_mm: Annotated[
         float,
-        named(
-            "MM",
-            "Tracker: a second tool, Reference (or station 2), fixed to a body that breathes by MM; the "
-            "first is Probe (or 1).",
-            option="breathe",
-            ge=0,
-            le=100,
-        ),
+        named("MM", option="breathe", ge=0, le=100),
+        "Tracker: a second tool, Reference (or station 2), fixed to a body that breathes by MM; the first is Probe (or "
+        "1).",
     ] = 0.0
 
 
 class SectionOptions(Options, kw_only=True):
     """Cross-section of a simulated head."""
 
-    head_radius_mm: Annotated[float, says("Radius of the head's arc, mm.", gt=0, le=1e6)] = presets.HEAD_RADIUS_MM
-    shoulder_mm: Annotated[float, says("Radius of the head's shoulders, mm.", ge=0)] = presets.SHOULDER_MM
+    head_radius_mm: Annotated[float, Meta(gt=0, le=1e6), "Radius of the head's arc, mm."] = presets.HEAD_RADIUS_MM
+    shoulder_mm: Annotated[float, Meta(ge=0), "Radius of the head's shoulders, mm."] = presets.SHOULDER_MM
 
 
 class CaseOptions(Options, kw_only=True):
     """Pressure, tissue and mesh of a forward study."""
 
-    mean_kpa: Annotated[float, says("Mean pressure on the head.", gt=0)] = presets.MEAN_KPA
-    fat_kpa: Annotated[float, says("Young's modulus of fat.", gt=0)] = presets.FAT_KPA
-    poisson: Annotated[float, says("Poisson's ratio of the tissues.")] = presets.POISSON
-    gland_ratio: Annotated[float, says("Modulus of gland over fat.", gt=0)] = presets.GLAND_RATIO
-    thickness_mm: Annotated[
-        Above0 | None, says("Depth of the chest wall, mm. Default: 70, or deeper for deep lumps.")
-    ] = None
-    fineness: Annotated[int, says("Mesh fineness; doubling it halves the elements.", ge=1, le=8)] = 2
+    mean_kpa: Annotated[float, Meta(gt=0), "Mean pressure on the head."] = presets.MEAN_KPA
+    fat_kpa: Annotated[float, Meta(gt=0), "Young's modulus of fat."] = presets.FAT_KPA
+    poisson: Annotated[float, "Poisson's ratio of the tissues."] = presets.POISSON
+    gland_ratio: Annotated[float, Meta(gt=0), "Modulus of gland over fat."] = presets.GLAND_RATIO
+    thickness_mm: Annotated[Above0 | None, "Depth of the chest wall, mm. Default: 70, or deeper for deep lumps."] = None
+    fineness: Annotated[int, Meta(ge=1, le=8), "Mesh fineness; doubling it halves the elements."] = 2
 
 
 class StudyOptions(CaseOptions, kw_only=True):
@@ -478,19 +434,19 @@ class StudyOptions(CaseOptions, kw_only=True):
 
     model: Annotated[
         Literal["plane-strain", "solid"],
-        says("The paper's two-dimensional body, or balls under the whole head in three dimensions."),
+        "The paper's two-dimensional body, or balls under the whole head in three dimensions.",
     ] = "plane-strain"
-    grid: Annotated[str, named("paper|FILE", "The paper's 150 cases, or a table of cases.")] = "paper"
+    grid: Annotated[str, named("paper|FILE"), "The paper's 150 cases, or a table of cases."] = "paper"
     seat: Annotated[
-        str, named("centred|resting|0..2", "How far the lump stands out of the gland, if a grid does not state it.")
+        str, named("centred|resting|0..2"), "How far the lump stands out of the gland, if a grid does not state it."
     ] = "centred"
     head: Literal["shoulders-inside", "shoulders-outside"] | None = None
     background: Annotated[
         Background | None,
-        says("Background of Eq 7, solid only: free (default) is fitted, fixed is 1. In two dimensions it is 1."),
+        "Background of Eq 7, solid only: free (default) is fitted, fixed is 1. In two dimensions it is 1.",
     ] = None
     flat_field: Annotated[
-        bool | None, says("Remove what the head reads of the same body without the lump, solid only. Default: on.")
+        bool | None, "Remove what the head reads of the same body without the lump, solid only. Default: on."
     ] = None
 
 
@@ -500,37 +456,36 @@ KpaRange = tuple[Above0, Above0]
 class TissueOptions(Options, kw_only=True):
     """Homogeneous tissue under a head, the pressures on it, and how unevenly the head may press."""
 
-    modulus_kpa: Annotated[KpaRange, named("LOW HIGH", "Young's moduli of the tissue (paper: 15 to 25).")] = (
+    modulus_kpa: Annotated[KpaRange, named("LOW HIGH"), "Young's moduli of the tissue (paper: 15 to 25)."] = (
         15.0,
         25.0,
     )
-    pressure_kpa: Annotated[KpaRange, named("LOW HIGH", "Mean pressures under the head (paper: 5 to 14).")] = (
+    pressure_kpa: Annotated[KpaRange, named("LOW HIGH"), "Mean pressures under the head (paper: 5 to 14)."] = (
         presets.PRESSURE_WINDOW_KPA
     )
     thickness_mm: Annotated[
-        float, says("Thickness of the tissue on its rigid base, mm. The paper gives none.", gt=0)
+        float, Meta(gt=0), "Thickness of the tissue on its rigid base, mm. The paper gives none."
     ] = presets.THICKNESS_MM
-    poisson: Annotated[float, says("Poisson's ratio of the tissue.", ge=0, lt=0.5)] = presets.POISSON
+    poisson: Annotated[float, Meta(ge=0, lt=0.5), "Poisson's ratio of the tissue."] = presets.POISSON
     limit_percent: Annotated[
-        float, says("Largest allowed departure of a taxel from the frame's mean, % of it (paper: 7.5).", gt=0)
+        float, Meta(gt=0), "Largest allowed departure of a taxel from the frame's mean, % of it (paper: 7.5)."
     ] = 7.5
 
 
 class PopulationOptions(Options, kw_only=True):
     """How many bodies are simulated, and how their maps are made."""
 
-    masses: Annotated[int, says("Number of bodies, one lump each.", ge=1, le=MOST_ITEMS)] = 400
+    masses: Annotated[int, Meta(ge=1, le=MOST_ITEMS), "Number of bodies, one lump each."] = 400
     centred: Annotated[
         int,
-        says("Further bodies whose lump is centred on the gland's surface, as the paper has it.", ge=0, le=MOST_ITEMS),
+        Meta(ge=0, le=MOST_ITEMS),
+        "Further bodies whose lump is centred on the gland's surface, as the paper has it.",
     ] = 0
-    scans: Annotated[int, says("Number of exams per body.", ge=1, le=1000)] = 2
+    scans: Annotated[int, Meta(ge=1, le=1000), "Number of exams per body."] = 2
     normalise: Annotated[
         tuple[Literal["gain", "mean"], ...],
-        says(
-            "Normalisation of the maps, as in `map`; the calibration is for maps made the same way. Give "
-            "it twice for a row by each from one scan."
-        ),
+        "Normalisation of the maps, as in `map`; the calibration is for maps made the same way. Give it twice for a "
+        "row by each from one scan.",
     ] = ("gain",)
     seed: Seed = 7
 
@@ -538,13 +493,13 @@ class PopulationOptions(Options, kw_only=True):
 class SbcOptions(Options, kw_only=True):
     """How simulation-based calibration is run."""
 
-    maps: Annotated[int, says("Maps to simulate.", ge=1, le=MOST_ITEMS)] = 200
+    maps: Annotated[int, Meta(ge=1, le=MOST_ITEMS), "Maps to simulate."] = 200
     method: Annotated[
         Literal["laplace", "importance", "ensemble"],
-        says("Method of the posterior draws, as in `estimate`; ensemble takes about 20 times as long."),
+        "Method of the posterior draws, as in `estimate`; ensemble takes about 20 times as long.",
     ] = "importance"
     field_cosines: Annotated[
-        FieldCosines, named("N|auto", "Basis functions of the noise field, as field_cosines of `estimate`.")
+        FieldCosines, named("N|auto"), "Basis functions of the noise field, as field_cosines of `estimate`."
     ] = "auto"
     seed: Seed = 1
 
@@ -554,44 +509,33 @@ class LearnOptions(Options, kw_only=True):
 
     form: Annotated[
         Literal["eq6", "eq6-residual"],
-        says(
-            "eq6: as printed, from a table of lumps, or of bodies made by `population`; eq6-residual: with "
-            "what Eq 6 leaves of the sizes, of bodies only."
-        ),
+        "eq6: as printed, from a table of lumps, or of bodies made by `population`; eq6-residual: with what Eq 6 "
+        "leaves of the sizes, of bodies only.",
     ] = "eq6"
     fit: Annotated[
         Literal["joint", "two-stage"],
-        says("eq6: joint posterior of m, b, e, f from all rows, or the paper's two stages (needs depth_ratio)."),
+        "eq6: joint posterior of m, b, e, f from all rows, or the paper's two stages (needs depth_ratio).",
     ] = "joint"
     normalise: Annotated[
         Normalise | None,
-        says(
-            "Normalisation of the table's maps, if the table does not state it; of a table of `population` "
-            "with rows by several, which to learn from. Default: mean."
-        ),
+        "Normalisation of the table's maps, if the table does not state it; of a table of `population` with rows by "
+        "several, which to learn from. Default: mean.",
     ] = None
     background: Annotated[
         Background | None,
-        says(
-            "Background in the table's fits, if the table does not state it. Default: fixed, or free with "
-            "--normalise none."
-        ),
+        "Background in the table's fits, if the table does not state it. Default: fixed, or free with --normalise "
+        "none.",
     ] = None
     fit_radius_mm: Annotated[
         Above0 | None,
-        says(
-            "Radius of the table's fit windows, mm, if the table does not state it. Default: "
-            f"{presets.FIT_RADIUS_MM:g}."
-        ),
+        f"Radius of the table's fit windows, mm, if the table does not state it. Default: {presets.FIT_RADIUS_MM:g}.",
     ] = None
     noise: Annotated[
         Noise | None,
-        says(
-            "Noise model of the table's fits, if the table does not state it; least squares is "
-            "independent. Default: independent."
-        ),
+        "Noise model of the table's fits, if the table does not state it; least squares is independent. Default: "
+        "independent.",
     ] = None
     least_stiffness_ratio: Annotated[
-        float, says("Leave out lumps softer than this: above 8 the paper's widths change by less than 5 %.", ge=0)
+        float, Meta(ge=0), "Leave out lumps softer than this: above 8 the paper's widths change by less than 5 %."
     ] = 0.0
     seed: Seed = 1

@@ -7,7 +7,7 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from tactile_bayes.declarations import Meta, extra_of, kinds, part_of, says
+from tactile_bayes.declarations import Meta, extra_of, kinds, part_of
 from tactile_bayes.errors import UsageError
 from tactile_bayes.options import IN_FILE, PRIORS, FitSettings, named
 from tactile_bayes.presets import INTERVAL
@@ -29,54 +29,39 @@ class Settings(FitSettings, kw_only=True):
 
     size_calibration: Annotated[
         str | Calibration | None,
-        named(
-            "solid|eq6|solid-mean|plane-strain|none|SIZE.json",
-            "Calibration from widths to sizes: a shipped one, your own file, or none (widths only). "
-            "Default: solid, or solid-mean for maps of frames divided by their means; eq6 is the paper's Eq 6 over "
-            "such bodies.",
-        ),
+        named("solid|eq6|solid-mean|plane-strain|none|SIZE.json"),
+        "Calibration from widths to sizes: a shipped one, your own file, or none (widths only). Default: solid, or "
+        "solid-mean for maps of frames divided by their means; eq6 is the paper's Eq 6 over such bodies.",
     ] = None
-    seed: Annotated[int, says("Random seed.", ge=0)] = 1
-    interval: Annotated[float, says("Probability of the intervals.", gt=0, lt=1)] = INTERVAL
+    seed: Annotated[int, Meta(ge=0), "Random seed."] = 1
+    interval: Annotated[float, Meta(gt=0, lt=1), "Probability of the intervals."] = INTERVAL
     between_map_sd: Annotated[
         Annotated[float, Meta(ge=0, le=2)] | None,
-        says(
-            "SD of ln size between maps of one mass, taken as known. Default: one interval for exams as "
-            "the calibration's (0.05 if solid), one as the paper's (0.15)",
-            extra=IN_FILE,
-        ),
+        IN_FILE,
+        "SD of ln size between maps of one mass, taken as known. Default: one interval for exams as the calibration's "
+        "(0.05 if solid), one as the paper's (0.15)",
     ] = None
     repeatability: Annotated[
         Repeatability | None,
-        says(
-            "Spread between exams of one mass at this site, from `calibrate repeatability`: sizes then "
-            "have one interval, for any exam there. Default: two, for exams as the paper's and as simulated ones.",
-            extra=_SITE,
-        ),
+        named("SITE.json"),
+        "Spread between exams of one mass at this site, from `calibrate repeatability`: sizes then have one interval, "
+        "for any exam there. Default: two, for exams as the paper's and as simulated ones.",
     ] = None
     known: Annotated[
         tuple[tuple[str, float], ...],
-        named(
-            "NAME VALUE",
-            "Known property of the body: seat (0 centred on the gland's edge, 1.2 clear of it), depth_mm, "
-            "stiffness_ratio, fat_kpa, gland_ratio or thickness_mm.",
-        ),
+        named("NAME VALUE"),
+        "Known property of the body: seat (0 centred on the gland's edge, 1.2 clear of it), depth_mm, stiffness_ratio, "
+        "fat_kpa, gland_ratio or thickness_mm.",
     ] = ()
     checkpoint: Annotated[
         Path | None,
-        says(
-            "File that MCMC (method ensemble) saves its state in and resumes from; relative to the settings file",
-            extra=IN_FILE,
-        ),
+        IN_FILE,
+        "File that MCMC (method ensemble) saves its state in and resumes from; relative to the settings file",
     ] = None
     settings_file: Annotated[
         Path | None,
-        named(
-            "FILE.toml",
-            "Priors and rarely used options: background, fit_radius_mm, noise, max_steps... (settings.schema.json).",
-            path=True,
-            option="settings",
-        ),
+        named("FILE.toml", option="settings"),
+        "Priors and rarely used options: background, fit_radius_mm, noise, max_steps... (settings.schema.json).",
     ] = None
 
     def __post_init__(self) -> None:

@@ -9,7 +9,6 @@ import click
 
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.commands import options
-from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import UsageError
 from tactile_bayes.options import GROWN_BY, Comparing, MapOptions
 
@@ -23,7 +22,7 @@ _FILE = options.FilePath()
     "netCDF",
     "Where to write the map. Default: beside the first scan; map.nc for scan.mcap, s01.nc for s01.mcap.",
 )
-@options.takes(MapOptions, *names_of(MapOptions))
+@options.takes(MapOptions)
 @options.figure("Draw the map and its coverage.")
 @options.FORCE
 @click.option("-v", "--verbose", is_flag=True, help="Print all figures of the map; times on stderr.")

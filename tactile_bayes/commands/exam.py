@@ -10,7 +10,6 @@ import click
 
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.commands.options import FORCE, JSON, SESSION, FilePath, command, figure, output, path_option, takes
-from tactile_bayes.declarations import names_of
 from tactile_bayes.files.arrays_layout import GridOptions, Stated, layout_lines
 from tactile_bayes.options import IdentityOptions, MapOptions, RecordOptions
 from tactile_bayes.presets import CORRECTIONS, METHODS
@@ -39,7 +38,7 @@ def demo_command() -> None:
     type=click.Choice(["scan", "map"]),
     help="What SRC holds. Default: as the output's suffix says; a table or image without a scan's options is a map.",
 )
-@takes(GridOptions, *names_of(GridOptions))
+@takes(GridOptions)
 @click.option(
     "--correct",
     "corrections",
@@ -53,7 +52,7 @@ def demo_command() -> None:
 @path_option("--columns", "MAP.toml", "Scan: what SRC calls its arrays.")
 @path_option("--poses", "FILE", "Scan: the tracker's poses, in a table of their own.")
 @takes(RecordOptions, "head_geometry", "array_calibration", "landmarks")
-@takes(Stated, *names_of(Stated))
+@takes(Stated)
 @SESSION
 @FORCE
 def import_command() -> None:
@@ -128,7 +127,7 @@ _FORMATS: Final = ("dicom", "fhir", "nrrd", "csv")
     "Patient and study from a modality worklist item (.dcm or DICOM JSON), or from JSON of plain keys.",
 )
 @click.option("--patient-id-from-scan", is_flag=True, help="Use the scan's subject code as the patient ID.")
-@takes(IdentityOptions, *names_of(IdentityOptions))
+@takes(IdentityOptions)
 @path_option("--dictionary", "DICT.csv", "With csv: write the data dictionary of the REDCap form.")
 @FORCE
 def export_command() -> None:

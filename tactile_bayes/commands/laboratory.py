@@ -189,7 +189,7 @@ def population_command() -> None:
 
 
 @options.command("sbc", "study.sbc_action")
-@options.takes(SbcOptions, *names_of(SbcOptions))
+@options.takes(SbcOptions)
 @options.WORKERS
 @options.scheduler_option("the maps")
 @options.output("TABLE.csv", "CSV", "Write truths and ranks; an interrupted run resumes from it.")
@@ -230,7 +230,7 @@ def sbc_command() -> None:
     metavar="D H/D",
     help="Lump of figure 6: diameter in mm, and depth over diameter. Default: 12.5 0.825, the paper's.",
 )
-@options.takes(SectionOptions, *names_of(SectionOptions))
+@options.takes(SectionOptions)
 @options.head_option("Default: shoulders-inside for plane-strain, shoulders-outside for solid.")
 @options.takes(StudyOptions, *names_of(CaseOptions), "background", "flat_field")
 @options.WORKERS
@@ -256,7 +256,7 @@ def study_command() -> None:
 
 @options.command("tables", "study.tables_action")
 @options.takes(StudyOptions, "seat", help="How far the lump stands out of the gland.")
-@options.takes(SectionOptions, *names_of(SectionOptions))
+@options.takes(SectionOptions)
 @options.head_option("Default: shoulders-inside.")
 @click.option("--heads", "search", is_flag=True, help="Compute the tables for many heads, and name the nearest one.")
 @options.WORKERS
@@ -279,9 +279,9 @@ def head_command() -> None:
 
 
 @options.command("uniformity", "study.head_uniformity_action", within=head_command)
-@options.takes(SectionOptions, *names_of(SectionOptions))
+@options.takes(SectionOptions)
 @options.head_option("Default: shoulders-inside.")
-@options.takes(TissueOptions, *names_of(TissueOptions))
+@options.takes(TissueOptions)
 @options.JSON
 def head_uniformity_command() -> None:
     """Compute how evenly one head presses on homogeneous tissue.
@@ -295,7 +295,7 @@ def head_uniformity_command() -> None:
 
 @options.command("design", "study.head_design_action", within=head_command)
 @options.head_option("Default: both are searched.")
-@options.takes(TissueOptions, *names_of(TissueOptions))
+@options.takes(TissueOptions)
 @options.figure("Draw the non-uniformity over radius and shoulder.")
 @options.JSON
 @options.FORCE

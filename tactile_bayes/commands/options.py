@@ -199,13 +199,13 @@ class NumberOr(_ParamType):
 
 
 def takes(record: type[Record], *names: str, **attributes: Any) -> Decorator:
-    """The options of a command for some fields of a record, in this order.
+    """The options of a command for some fields of a record, in this order; for all where none is named.
 
     Type, range, default and help come from the field's declaration, `metavar` and the name from its ``extra``;
     `attributes` of `click.option` stand in place of them.
     """
 
-    return _several(*(_option(record, name, attributes) for name in names))
+    return _several(*(_option(record, name, attributes) for name in names or record.__struct_fields__))
 
 
 def _several(*options: Decorator) -> Decorator:
@@ -233,7 +233,7 @@ def _option(record: type[Record], name: str, attributes: Mapping[str, Any]) -> D
         bare = value_kind(kind)
         pairs = get_origin(bare) is tuple and get_args(bare)[1:] == (...,)
         shown = default not in (None, (), "")
-        of_field |= {"type": FilePath() if extra.get("path") else _click_type(get_args(bare)[0] if pairs else kind)}
+        of_field |= {"type": _click_type(get_args(bare)[0] if pairs else kind)}
         of_field |= {"multiple": True} if pairs else {}
         of_field |= {"default": default, "show_default": True} if shown else {}
         if isinstance(of_field["type"], NumberOr) and default is not None:
@@ -258,6 +258,8 @@ def _click_type(kind: Any) -> Any:
         return click.Choice([one for one in get_args(bare) if one])
     if get_origin(bare) is tuple:
         return tuple(map(_click_type, get_args(bare)))
+    if bare in (Path, Any):  # an object of Python's is in a file
+        return FilePath()
     if bare not in (int, float):
         return str
     least, most, open_ends = range_of(kind)

@@ -6,7 +6,6 @@ import click
 
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.commands import options
-from tactile_bayes.declarations import names_of
 from tactile_bayes.options import CampaignOptions, PlanErrors, PlanOptions, TrialSettings
 
 _FILE = options.FilePath()
@@ -44,7 +43,7 @@ def validate_command() -> None:
 
 @options.command("plan", "trial.plan_action")
 @options.takes(PlanOptions, "patients", "maps", "power", "precision")
-@options.takes(PlanErrors, *names_of(PlanErrors))
+@options.takes(PlanErrors)
 @options.path_option("--pilot", "TRIAL.csv", "Take the errors that no option gives from this trial; needs --excision.")
 @options.path_option("--excision", "EX.csv", "Sizes measured after excision in the pilot.")
 @options.takes(PlanOptions, "against", "trials", "seed", "workers")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
-from tactile_bayes.declarations import Meta, Options, field, names_of, says
+from tactile_bayes.declarations import Meta, Options, field, names_of
 from tactile_bayes.errors import UsageError
 from tactile_bayes.options import Above0, named
 from tactile_bayes.presets import Normalise
@@ -68,57 +68,51 @@ class Stated(Options, kw_only=True):
 
     unit: Annotated[
         Unit | None,
-        says("Scan: unit of the frames; counts are raw, others need no calibration. Default: the file's, else counts."),
+        "Scan: unit of the frames; counts are raw, others need no calibration. Default: the file's, else counts.",
     ] = None
     saturation: Annotated[
-        Above0 | None, says("Scan: reading from which on a taxel carries no pressure, in the frames' unit.")
+        Above0 | None, "Scan: reading from which on a taxel carries no pressure, in the frames' unit."
     ] = None
     frame_shape: Annotated[
         tuple[Annotated[int, Meta(ge=1)], Annotated[int, Meta(ge=1)]] | None,
-        named(
-            "ROWS COLUMNS",
-            "Scan: rows (across the head) and columns of frames that are one row of numbers. Default: the head's.",
-        ),
+        named("ROWS COLUMNS"),
+        "Scan: rows (across the head) and columns of frames that are one row of numbers. Default: the head's.",
     ] = None
     frame_order: Annotated[
         Literal["rows", "columns"] | None,
-        says("Scan: whether such a row runs along the array's rows or columns. Default: rows."),
+        "Scan: whether such a row runs along the array's rows or columns. Default: rows.",
     ] = None
     skip_columns: Annotated[
         Annotated[int, Meta(ge=0)] | None,
-        says("Scan: columns of a table of frames before its readings. Default: told by the header."),
+        "Scan: columns of a table of frames before its readings. Default: told by the header.",
     ] = None
     decimal: Annotated[
         Literal["point", "comma"] | None,
-        says("Scan: decimal sign of tables. Default: told by their numbers, where these can tell."),
+        "Scan: decimal sign of tables. Default: told by their numbers, where these can tell.",
     ] = None
-    rate_hz: Annotated[Rate | None, named("HZ", "Scan: frames a second, where they have no times.")] = None
-    time_unit: Annotated[TimeUnit | None, says("Scan: unit of the frames' times. Default: the file's, else s.")] = None
+    rate_hz: Annotated[Rate | None, named("HZ"), "Scan: frames a second, where they have no times."] = None
+    time_unit: Annotated[TimeUnit | None, "Scan: unit of the frames' times. Default: the file's, else s."] = None
     pose_layout: Annotated[
         PoseLayout | None,
-        says(
-            "Scan: rotations of the poses: quaternions with the scalar first or last, azimuth, elevation "
-            "and roll, or rows of a 4 x 4 matrix. Default: by the names of the columns, else wxyz."
-        ),
+        "Scan: rotations of the poses: quaternions with the scalar first or last, azimuth, elevation and roll, or rows "
+        "of a 4 x 4 matrix. Default: by the names of the columns, else wxyz.",
     ] = None
     length_unit: Annotated[
-        Literal["mm", "cm", "m", "inch"] | None,
-        says("Scan: unit of the poses' positions. Default: the file's, else mm."),
+        Literal["mm", "cm", "m", "inch"] | None, "Scan: unit of the poses' positions. Default: the file's, else mm."
     ] = None
-    pose_time_unit: Annotated[TimeUnit | None, says("Scan: unit of the poses' times. Default: the file's, else s.")] = (
-        None
-    )
+    pose_time_unit: Annotated[TimeUnit | None, "Scan: unit of the poses' times. Default: the file's, else s."] = None
     pose_rate_hz: Annotated[
-        Rate | None, named("HZ", "Scan: poses a second, where they have frame numbers or no times.")
+        Rate | None, named("HZ"), "Scan: poses a second, where they have frame numbers or no times."
     ] = None
     pose_offset_s: Annotated[
         Annotated[float, Meta(ge=-1e10, le=1e10)] | None,
-        named("S", "Scan: added to the poses' times, for the frames' clock. Default: 0."),
+        named("S"),
+        "Scan: added to the poses' times, for the frames' clock. Default: 0.",
     ] = None
     pose_good: Annotated[
-        str | None, says("Scan: value of the poses' status where the tool is seen. Default: OK, Enabled and the like.")
+        str | None, "Scan: value of the poses' status where the tool is seen. Default: OK, Enabled and the like."
     ] = None
-    tool: Annotated[str | None, named("NAME", "Scan: which tool or station of the poses' file.")] = None
+    tool: Annotated[str | None, named("NAME"), "Scan: which tool or station of the poses' file."] = None
 
     @property
     def given(self) -> dict[str, Any]:
@@ -129,10 +123,8 @@ class Stated(Options, kw_only=True):
 class ArrayMap(Stated, kw_only=True):
     """What a file calls the arrays of a scan, and what is stated of them: the TOML of `import --columns`."""
 
-    arrays: Annotated[dict[str, str], says('Name in the file by the name here: counts = "P".')] = field(
-        default_factory=dict
-    )
-    values: Annotated[dict[str, Any], says("Arrays that the file lacks, such as pitch_mm = 1.5.")] = field(
+    arrays: Annotated[dict[str, str], 'Name in the file by the name here: counts = "P".'] = field(default_factory=dict)
+    values: Annotated[dict[str, Any], "Arrays that the file lacks, such as pitch_mm = 1.5."] = field(
         default_factory=dict
     )
 
@@ -145,27 +137,27 @@ _LONGEST_UNITS: Final = 20
 class GridOptions(Options, kw_only=True):
     """What is stated of a grid of values that becomes a map."""
 
-    spacing_mm: Annotated[float | None, named("H", "Map: side of the square cells, in mm.")] = None
+    spacing_mm: Annotated[float | None, named("H"), "Map: side of the square cells, in mm."] = None
     cell_mm: Annotated[
         Above0 | None,
-        named("H", "Map: average finer cells into cells of up to this side. Default: 1 where they are finer than 0.5."),
+        named("H"),
+        "Map: average finer cells into cells of up to this side. Default: 1 where they are finer than 0.5.",
     ] = None
-    normalise: Annotated[Normalise, says("Map: how the values are already normalised.")] = "none"
+    normalise: Annotated[Normalise, "Map: how the values are already normalised."] = "none"
     level: Annotated[
         Above0 | Literal["fit"] | None,
-        named(
-            "L|fit",
-            "Map: divide values such as kPa by their level beside the lump: a number, or fit, to take it from the map.",
-        ),
+        named("L|fit"),
+        "Map: divide values such as kPa by their level beside the lump: a number, or fit, to take it from the map.",
     ] = None
     units: Annotated[
-        str | None, named("TEXT", "Map: unit of values that are not normalised, such as kPa. Default: unknown.")
+        str | None, named("TEXT"), "Map: unit of values that are not normalised, such as kPa. Default: unknown."
     ] = None
     no_value: Annotated[
         tuple[str, ...],
-        named("V", "Map: a number or text that stands for no value, such as -9999; none: every number is a value."),
+        named("V"),
+        "Map: a number or text that stands for no value, such as -9999; none: every number is a value.",
     ] = ()
-    array: Annotated[str | None, named("NAME", "Map: which array of SRC, where it holds several.")] = None
+    array: Annotated[str | None, named("NAME"), "Map: which array of SRC, where it holds several."] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
