@@ -23,15 +23,12 @@ class WholeWords(click.HelpFormatter):
     """Help whose lines do not break at hyphens."""
 
     def write(self, string: str) -> None:
-        """Write with hyphens."""
         super().write(string.replace(_HYPHEN, "-"))
 
     def write_text(self, text: str) -> None:
-        """Write paragraphs."""
         super().write_text(_joined(text))
 
     def write_dl(self, rows: Iterable[tuple[str, str]], col_max: int = 30, col_spacing: int = 2) -> None:
-        """Write words beside what is said of them."""
         super().write_dl([(_joined(word), _joined(told)) for word, told in rows], col_max, col_spacing)
 
 

@@ -150,7 +150,6 @@ class PrintableStream:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        """Write the text, made printable."""
         shown = printable(text)
         if columns := columns_of(self._stream):
             shown = dressed(shown, columns=columns, styles=has_styles())

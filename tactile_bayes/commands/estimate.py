@@ -79,7 +79,6 @@ class VisitsCommand(click.Command):
     """
 
     def make_parser(self, ctx: click.Context) -> Any:
-        """Make the parser of the command line."""
         parser = super().make_parser(ctx)
         parse = parser.parse_args
         parser.parse_args = lambda args: parse(numbered(args, strict=not ctx.resilient_parsing))  # type: ignore[method-assign]

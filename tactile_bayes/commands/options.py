@@ -17,6 +17,7 @@ from tactile_bayes.api.settings import Settings, read_settings
 from tactile_bayes.declarations import Record, default_of, extra_of, kinds, meaning_of, range_of, value_kind
 from tactile_bayes.errors import BY_OPTIONS, number_words
 from tactile_bayes.files.atomic import Format, check_suffix, refuse_existing, refuse_same
+from tactile_bayes.options import RecordOptions
 from tactile_bayes.presets import HEADS
 from tactile_bayes.report import figure_file
 
@@ -113,7 +114,6 @@ class CommandGroup(click.Group):
     """A group whose help has the first sentence of each of its commands, whole."""
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """List the commands."""
         commands = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
         whole = [(name, found.get_short_help_str(limit=1000)) for name, found in commands.items() if found is not None]
         with formatter.section("Commands"):
@@ -162,7 +162,6 @@ class FiniteRange(click.FloatRange):
     """A finite number in a range; nan and infinity are refused."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Convert to the number."""
         with contextlib.suppress(click.BadParameter):
             number = super().convert(value, param, ctx)
             if math.isfinite(number):
@@ -307,11 +306,9 @@ def page_options(metavar: str, title: str) -> Decorator:
 
 
 PRINTED: Final = "Also print it to PDF, by an installed Chromium or WeasyPrint."
-SESSION = click.option(
-    "--session",
+SESSION = takes(
+    RecordOptions,
     "session_file",
-    type=FilePath(),
-    metavar="SESSION.toml",
     help="Facts of the exam for the scan: subject, side, posture, examiner, visit and more, in plain text.",
 )
 JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")

@@ -6,7 +6,7 @@ import io
 import struct
 import zlib
 from array import array
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Final
@@ -26,43 +26,31 @@ from tactile_bayes.files.reading import MCAP_MAGIC, check_limit, not_a, open_inp
 _MOST_WINDOW: Final = 2**27
 
 
-class Unpacker:
-    """Unpacks chunks and counts the bytes that come out, against a limit that grows with the size of the file."""
+def unpacked(chunk: Any, *, count: Callable[[int], None]) -> bytes:
+    """The records of a chunk, never more than it declares and one byte, which are counted before.
 
-    def __init__(self, file_bytes: int) -> None:
-        self._most = unpacked_limit(file_bytes)
-        self._unpacked = 0
+    A damaged one raises exceptions of many kinds, which `damage` says in words.
+    """
+    packing, data, most = chunk.compression, bytes(chunk.data), chunk.uncompressed_size
+    if packing == "zstd":
+        declared = zstandard.frame_content_size(data)  # -1 where the frame does not say
+        if declared not in (-1, most):
+            raise ValueError(f"its frame unpacks to {declared} bytes and it declares {most}")
+        count(most)
+        decompressor = zstandard.ZstdDecompressor(max_window_size=_MOST_WINDOW)
+        data = decompressor.decompress(data, max_output_size=most) if most else b""
+    elif packing == "lz4":
+        import lz4.frame
 
-    def count(self, number: int) -> None:
-        """Add to the number of unpacked bytes."""
-        self._unpacked += number
-        check_limit(self._unpacked, self._most, what="it unpacks to {} bytes or more")
-
-    def unpack(self, chunk: Any) -> bytes:
-        """The records of a chunk, never more than it declares and one byte.
-
-        A damaged one raises exceptions of many kinds, which `damage` says in words.
-        """
-        packing, data, most = chunk.compression, bytes(chunk.data), chunk.uncompressed_size
-        if packing == "zstd":
-            declared = zstandard.frame_content_size(data)  # -1 where the frame does not say
-            if declared not in (-1, most):
-                raise ValueError(f"its frame unpacks to {declared} bytes and it declares {most}")
-            self.count(most)
-            decompressor = zstandard.ZstdDecompressor(max_window_size=_MOST_WINDOW)
-            data = decompressor.decompress(data, max_output_size=most) if most else b""
-        elif packing == "lz4":
-            import lz4.frame
-
-            self.count(most)
-            data = bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most + 1))
-        elif packing != "":
-            raise ValueError(f"it is compressed by {packing[:20]!r}, which this program does not know")
-        if len(data) != most:
-            raise ValueError(f"it holds {len(data)} bytes and declares {most}")
-        if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
-            raise ValueError("its checksum does not match")
-        return data
+        count(most)
+        data = bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=most + 1))
+    elif packing != "":
+        raise ValueError(f"it is compressed by {packing[:20]!r}, which this program does not know")
+    if len(data) != most:
+        raise ValueError(f"it holds {len(data)} bytes and declares {most}")
+    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        raise ValueError("its checksum does not match")
+    return data
 
 
 def damage(error: Exception) -> str:
@@ -111,7 +99,6 @@ class Messages:
             self._ends.append(len(self._data))
 
     def extend(self, other: Messages) -> None:
-        """Add all messages of another channel."""
         start = len(self._data)
         self._times += other._times
         self.logged += other.logged
@@ -142,6 +129,8 @@ class McapRecords:
     """Content of a file, as far as it could be read."""
 
     keep: Collection[str]  #: Topics whose messages are kept; of others only the times are.
+    most_bytes: int  #: Limit of what its chunks unpack to.
+    unpacked_bytes: int = 0
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
     schemas: dict[int, str] = field(default_factory=dict)
@@ -174,8 +163,12 @@ class McapRecords:
                 found.extend(held)
         return found
 
+    def count(self, unpacked_bytes: int) -> None:
+        """Refuse what unpacks to more than the limit in all."""
+        self.unpacked_bytes += unpacked_bytes
+        check_limit(self.unpacked_bytes, self.most_bytes, what="it unpacks to {} bytes or more")
+
     def lose(self, what: str, *, damaged: bool = True) -> None:
-        """Note a loss."""
         self.lost.append(what)
         self.damaged |= damaged
 
@@ -200,10 +193,10 @@ class McapRecords:
 
 def read_records(path: Path, *, keep: Collection[str]) -> McapRecords:
     """Read a file from front to back, with or without its index; of topics not in `keep` only the times."""
-    records = McapRecords(keep=keep)
     with open_input(path) as stream, in_file(path), readable(path):
         _check_magic(stream, path)
         size = stream.seek(0, io.SEEK_END)
+        records = McapRecords(keep, unpacked_limit(size))
         stream.seek(len(MCAP_MAGIC))
         _collect(records, stream, size=size)
     return records
@@ -222,7 +215,6 @@ def _check_magic(stream: IO[bytes], path: Path) -> None:
 
 def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:
     """Fill `records` up to the end of the file or the first unreadable record."""
-    unpacker = Unpacker(size)
     checksum = zlib.crc32(MCAP_MAGIC)
     while True:
         start = stream.tell()
@@ -256,7 +248,7 @@ def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:
             continue
         if isinstance(record, Chunk):
             records.chunks += 1
-            _take_chunk(records, record, unpacker)
+            _take_chunk(records, record)
         elif record is not None:
             if opcode == Opcode.MESSAGE:  # in no chunk, as writers leave it that do not index their files
                 records.last_ns = max(records.last_ns, record[2])
@@ -282,11 +274,11 @@ def _parsed(opcode: int, data: bytes, start: int = 0, end: int | None = None) ->
     return _KINDS[Opcode(opcode)].read(ReadDataStream(io.BytesIO(data[start:end]))) if opcode in _KINDS else None
 
 
-def _take_chunk(records: McapRecords, chunk: Any, unpacker: Unpacker) -> None:
+def _take_chunk(records: McapRecords, chunk: Any) -> None:
     """Keep all messages of a chunk; none when it is damaged."""
     try:
-        data = unpacker.unpack(chunk)
-        held = list(_split(data, unpacker))
+        data = unpacked(chunk, count=records.count)
+        held = list(_split(data, records))
     except BadDataError:  # over a limit
         raise
     except Exception as error:  # each decompressor has an error class of its own, and so have records
@@ -298,7 +290,7 @@ def _take_chunk(records: McapRecords, chunk: Any, unpacker: Unpacker) -> None:
         records.take(record, memoryview(data))
 
 
-def _split(data: bytes, unpacker: Unpacker) -> Iterator[Any]:
+def _split(data: bytes, records: McapRecords) -> Iterator[Any]:
     """Schemas, channels and messages of a chunk, see `_parsed`."""
     offset = 0
     while offset < len(data):
@@ -308,6 +300,6 @@ def _split(data: bytes, unpacker: Unpacker) -> Iterator[Any]:
         if offset > len(data):
             raise ValueError("a record ends beyond it")
         if opcode in _DESCRIPTIONS:
-            unpacker.count(_DESCRIPTION_BYTES)
+            records.count(_DESCRIPTION_BYTES)
         if opcode == Opcode.MESSAGE or opcode in _DESCRIPTIONS:
             yield _parsed(opcode, data, start, offset)

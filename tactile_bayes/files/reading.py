@@ -266,8 +266,8 @@ def check_address(address: str) -> str:
 
 def version_of(address: str) -> str:
     """Size, time and tag that the store gives of a file's content without reading it."""
-    with _of_store(address):
-        known = _store(address).info(address)
+    with _of_store(address) as store:
+        known = store.info(address)
     named = {key.lower(): known[key] for key in known}
     tag = named.get("etag") or named.get("md5hash") or named.get("content_md5")
     return f"{known.get('size')} {tag} {named.get('lastmodified') or named.get('updated')}"
@@ -275,7 +275,7 @@ def version_of(address: str) -> str:
 
 def sha256_of(address: str) -> str:
     """Hex digest of a file's bytes, read as a stream; see `version_of` for the errors."""
-    with _of_store(address), _store(address).open(address, "rb") as file:
+    with _of_store(address) as store, store.open(address, "rb") as file:
         return str(hashlib.file_digest(file, "sha256").hexdigest())
 
 
@@ -284,8 +284,8 @@ def fetched(address: str) -> Iterator[Path]:
     """Copy of a file of a store on this computer, for as long as the block lasts; see `version_of` for the errors."""
     with tempfile.TemporaryDirectory(prefix="tactile-bayes-") as folder:
         path = Path(folder) / PurePosixPath(address).name
-        with _of_store(address):
-            _store(address).get_file(address, str(path))
+        with _of_store(address) as store:
+            store.get_file(address, str(path))
         yield path
 
 
@@ -300,8 +300,8 @@ def put(path: Path, address: str) -> None:
 def files_below(address: str, *endings: str) -> Iterator[str]:
     """Addresses of all files below a folder that end in one of some ways, sorted; see `version_of` for the errors."""
     scheme = address.split("://", 1)[0]
-    with _of_store(address):
-        names = sorted(_store(address).find(address))
+    with _of_store(address) as store:
+        names = sorted(store.find(address))
     for name in names:
         if name.lower().endswith(endings):
             yield f"{scheme}://{name.split('://')[-1]}"
@@ -323,10 +323,11 @@ def _store(address: str) -> Any:
 
 
 @contextlib.contextmanager
-def _of_store(address: str) -> Iterator[None]:
-    """Faults of reading: a file's own where it is missing or closed; otherwise the store's, which spares the exam."""
+def _of_store(address: str) -> Iterator[Any]:
+    """The store of an address, and faults of reading: a file's own where it is missing or closed; otherwise the
+    store's, which spares the exam."""
     try:
-        yield
+        yield _store(address)
     except UsageError:
         raise
     except (FileNotFoundError, PermissionError, IsADirectoryError) as error:
