@@ -217,12 +217,8 @@ def rounded(value: T, digits: int = 9, *, lists: bool = False) -> T:
 
 def schema_name(kind: Any) -> str | None:
     """The value that the key ``schema`` of a record's files has; None where they have none."""
-    for one in _members(kind):
-        if _is_record(one):
-            for part in _fields(one):
-                if part.encode_name == "schema" and get_origin(_bare(part.type)) is Literal:
-                    return str(get_args(_bare(part.type))[0])
-    return None
+    declared = _bare(kinds(kind).get("schema")) if _is_record(kind) else None
+    return str(get_args(declared)[0]) if get_origin(declared) is Literal else None
 
 
 def _short(value: Any) -> str:

@@ -292,6 +292,10 @@ class CampaignOptions(Options, kw_only=True):
     scheduler: Annotated[str | None, named("ADDRESS"), "Send the exams to a dask scheduler (extra [cluster])."] = None
 
 
+PersonName = Annotated[str, named("FAMILY^GIVEN", max_length=194)]
+DayText = Annotated[str, named("DATE", max_length=25)]
+
+
 class IdentityOptions(Options):
     """Patient and study of an export.
 
@@ -302,30 +306,25 @@ class IdentityOptions(Options):
     patient_id: Annotated[
         str, named("ID", max_length=64), "Patient ID; in csv files the beginning of the record ID."
     ] = ""
-    patient_name: Annotated[
-        str, named("FAMILY^GIVEN", max_length=194), "Patient's name: FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX."
-    ] = ""
+    patient_name: Annotated[PersonName, "Patient's name: FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX."] = ""
     birth_date: Annotated[str, named("YYYY-MM-DD", max_length=10), "Patient's date of birth: YYYY-MM-DD."] = ""
     sex: Annotated[Literal["F", "M", "O", ""], named("F|M|O"), "Patient's sex: F, M or O."] = ""
     issuer: Annotated[str, named("NAME", max_length=64), "Who issued the patient ID."] = ""
     accession: Annotated[str, named("NUMBER", max_length=16), "Accession number."] = ""
-    referring_physician: Annotated[
-        str, named("FAMILY^GIVEN", max_length=194), "Referring physician's name, likewise."
-    ] = ""
+    referring_physician: Annotated[PersonName, "Referring physician's name, likewise."] = ""
     study_id: Annotated[str, named("ID", max_length=16), "Study ID."] = ""
     study_description: Annotated[str, named("TEXT", max_length=64), "Study description."] = ""
     study_uid: Annotated[
         str, named("UID", max_length=64), "Study Instance UID. Default: one that follows from the content of the maps."
     ] = ""
-    study_date: Annotated[
-        str, named("DATE", max_length=25), "Date of the exam: YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the zone."
-    ] = ""
-    content_date: Annotated[
-        str, named("DATE", max_length=25), "Date at which the content was made. Default: the exam's."
-    ] = ""
+    study_date: Annotated[DayText, "Date of the exam: YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the zone."] = ""
+    content_date: Annotated[DayText, "Date at which the content was made. Default: the exam's."] = ""
 
 
 # --- Options of the commands on devices and in the laboratory.
+
+
+Baud = Annotated[int, Meta(ge=300)]
 
 
 class RecordOptions(Options, kw_only=True):
@@ -337,10 +336,8 @@ class RecordOptions(Options, kw_only=True):
         str | None, named("URL", option="tracker"), "Port of the tracker; without, there are no poses."
     ] = None
     tracker_protocol: Annotated[TrackerProtocol, "Protocol of the tracker; a PATRIOT speaks liberty."] = "fastrak"
-    head_baud: Annotated[int, Meta(ge=300), "Baud rate of the head's port."] = 2_000_000
-    tracker_baud: Annotated[
-        Annotated[int, Meta(ge=300)] | None, "Baud rate of the tracker's port. Default: the protocol's."
-    ] = None
+    head_baud: Annotated[Baud, "Baud rate of the head's port."] = 2_000_000
+    tracker_baud: Annotated[Baud | None, "Baud rate of the tracker's port. Default: the protocol's."] = None
     tracker_rom: Annotated[tuple[Path, ...], named("ROM"), "ndi: a wireless tool's description, one for each."] = ()
     tool: Annotated[
         str | None, named("NAME", also="station"), "Tool or station on the head, needed where the tracker has several."

@@ -59,8 +59,7 @@ class HeadFile(Record, kw_only=True):
     pitch_mm: scenes.Pitch
     surface_mm: Annotated[list[TaxelRow], Meta(min_length=1, max_length=256)] | None = None
     """(rows, columns, 3) centres of the taxels in `scanhead`: origin at the apex, x across the head, y along it, z into
-    the tissue. Or give rows, columns and radius_mm.
-    """
+    the tissue. Or give rows, columns and radius_mm."""
     rows: scenes.Rows | None = None
     columns: scenes.Columns | None = None
     radius_mm: Radius | None = None
@@ -68,8 +67,7 @@ class HeadFile(Record, kw_only=True):
     shoulder_mm: Rounding = 0.0  #: Radius of rounded edges cut into the array across the head, mm.
     rim_mm: Rounding | None = None
     """Radius of the rounded edge around the taxels, which presses but senses nothing, mm; for `population`. Default: 3,
-    or 0 with shoulder_mm.
-    """
+    or 0 with shoulder_mm."""
     checked_on: date | None = None  #: When `check` found it right on a scan.
     scanhead_from_tracker: tuple[Row, Row, Row, Row] | None = None
     """(4, 4) transform from the tracker's sensor to the head; `record` needs it."""

@@ -225,12 +225,10 @@ class RepeatabilityFile(Record, kw_only=True, omit_defaults=True):
     research_use: str
     between_map_sd: Annotated[float, Meta(gt=0, le=2)]
     """SD of ln d between exams of one mass beyond the maps' own errors: root mean square of its posterior, which adds
-    to the variance of one map's size
-    """
+    to the variance of one map's size"""
     log_sd: Annotated[float, Meta(ge=0, le=3)]
     """SD of the natural log of that spread: the log-normal with this and between_map_sd as its root mean square is the
-    prior that `estimate --repeatability` uses
-    """
+    prior that `estimate --repeatability` uses"""
     median: Annotated[float, Meta(gt=0)]  #: Median of the spread's posterior
     low: Annotated[float, Meta(gt=0)]  #: Lower end of its equal-tailed interval
     high: Annotated[float, Meta(gt=0)]  #: Upper end
@@ -242,8 +240,7 @@ class RepeatabilityFile(Record, kw_only=True, omit_defaults=True):
     repeats: Annotated[list[RepeatedMass], Meta(min_length=3)]  #: Masses at a visit with repeated exams
     outlying: tuple[str, ...]
     """Masses whose exams lie further apart than the other masses lead one to expect (false alarm at one site in 20);
-    they took part
-    """
+    they took part"""
     left_out: list[str]  #: Exams of masses with repeats that took no part, and why
     provenance: dict[str, Any]
     """inputs: the size calibration, and the draws of each exam (shape.npz), in the order of repeats"""
