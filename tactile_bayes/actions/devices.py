@@ -57,31 +57,32 @@ def emulate_action(
         )
     held = stage if kind == "both" else None
     devices = [_device(role, data, protocol, faults, path=scan, held=held) for role in roles]
-    links = [_link(tcp, after=number) for number in range(len(roles))]
-    for role, link in zip(roles, links, strict=True):
-        click.echo(f"{role} {link.url}" if kind == "both" else link.url)
-    ask_for_priority()  # a real device does not wait for this computer's other programs
     emulators = [
-        Emulator(device, link, faults=faults, rng=np.random.default_rng(seed + number), stage=stage, leads=number == 0)
-        for number, (device, link) in enumerate(zip(devices, links, strict=True))
+        Emulator(
+            device,
+            _link(tcp, after=number),
+            faults=faults,
+            rng=np.random.default_rng(seed + number),
+            stage=stage,
+            leads=number == 0,
+        )
+        for number, device in enumerate(devices)
     ]
+    for role, emulator in zip(roles, emulators, strict=True):
+        click.echo(f"{role} {emulator.link.url}" if kind == "both" else emulator.link.url)
+    ask_for_priority()  # a real device does not wait for this computer's other programs
+    others = [Thread(target=one.run, kwargs={"once": once}, daemon=True) for one in emulators[1:]]
     try:
-        _serve(emulators, once=once)
+        with contextlib.suppress(KeyboardInterrupt):  # which the other signals are, too
+            for other in others:
+                other.start()
+            emulators[0].run(once=once)
+            for other in others:
+                other.join()
     finally:
         for role, emulator in zip(roles, emulators, strict=True):
             words = f"{emulator.sent} records sent, {emulator.dropped} dropped, {emulator.faulty} spoilt on request"
             click.echo(f"{role}: {words}" if kind == "both" else words, err=True)
-
-
-def _serve(emulators: list[Emulator], *, once: bool) -> None:
-    """Run the first emulator here and the others in threads, until all have ended or a signal comes."""
-    others = [Thread(target=one.run, kwargs={"once": once}, daemon=True) for one in emulators[1:]]
-    with contextlib.suppress(KeyboardInterrupt):  # which the other signals are, too
-        for other in others:
-            other.start()
-        emulators[0].run(once=once)
-        for other in others:
-            other.join()
 
 
 def _device(kind: str, scan: Scan, protocol: str, faults: Faults, *, path: Path, held: Stage | None) -> Device:

@@ -225,27 +225,21 @@ def run(pipe: int, setup: dict[str, Any]) -> None:
         if setup["terminal"]:
             showing.append(stack.enter_context(terminal_view(keys=setup["keys"])))
         began = time.monotonic()
-        drawings = _look(pipe, live, estimator, showing)
+        drawn, drawings, newest = 0.0, 0, None
+        for seen in fed(pipe, TAKEN_EVERY_S):
+            live.take(seen)
+            estimator.look(newest)
+            now = time.monotonic()
+            if now - drawn < 1 / DRAWINGS_PER_S:
+                continue
+            drawn, drawings = now, drawings + 1
+            state = live.state(size=estimator.answer.text, lump_base_mm=estimator.answer.lump_base_mm)
+            newest = state.tactile_map
+            for show in showing:
+                show(state)
         if not sys.stderr.isatty():
             seconds = time.monotonic() - began
             print(f"live view: {drawings} drawings and {estimator.done} estimates in {seconds:.1f} s", file=sys.stderr)
-
-
-def _look(pipe: int, live: LiveMap, estimator: Estimator, showing: list[Callable[[LiveState], None]]) -> int:
-    """Draw until the recording ends; returns the number of drawings."""
-    drawn, drawings, newest = 0.0, 0, None
-    for seen in fed(pipe, TAKEN_EVERY_S):
-        live.take(seen)
-        estimator.look(newest)
-        now = time.monotonic()
-        if now - drawn < 1 / DRAWINGS_PER_S:
-            continue
-        drawn, drawings = now, drawings + 1
-        state = live.state(size=estimator.answer.text, lump_base_mm=estimator.answer.lump_base_mm)
-        newest = state.tactile_map
-        for show in showing:
-            show(state)
-    return drawings
 
 
 @contextlib.contextmanager

@@ -100,25 +100,20 @@ def fed(pipe: int, every_s: float) -> Iterator[list[Seen]]:
     ended = False
     while not ended:
         time.sleep(every_s)
-        data = b""
+        data, seen, place = b"", list[Seen](), 0
         with suppress(BlockingIOError):
             while piece := os.read(pipe, PIPE_BYTES):
                 data += piece
             ended = True
-        yield list(_messages(data))
-
-
-def _messages(data: bytes) -> Iterator[Seen]:
-    """A whole number of messages, as each went in at once."""
-    place = 0
-    while place < len(data):
-        text, size = _SIZES.unpack_from(data, place)
-        start = place + _SIZES.size + text
-        place = start + size
-        told = json.loads(data[start - text : start])
-        if told[0] == "frame":
-            told[-1] = np.frombuffer(data[start:place], dtype="<u2").reshape(told[-1])
-        yield tuple(told)
+        while place < len(data):  # a whole number of messages, as each went in at once
+            text, size = _SIZES.unpack_from(data, place)
+            start = place + _SIZES.size + text
+            place = start + size
+            told = json.loads(data[start - text : start])
+            if told[0] == "frame":
+                told[-1] = np.frombuffer(data[start:place], dtype="<u2").reshape(told[-1])
+            seen.append(tuple(told))
+        yield seen
 
 
 # --- The growing map and the pressure during a recording, for a live view.
