@@ -35,12 +35,12 @@ from scipy.sparse.linalg import splu
 
 from benchmarks.measure import environment
 from tactile_bayes.forward.contact import ContactStiffness, Head, solve_contact
-from tactile_bayes.forward.mesh import Elements, Mesh, body_mesh
+from tactile_bayes.forward.mesh import Mesh, body_mesh
 from tactile_bayes.forward.plane import (
     build_line,
     condense,
-    element_stiffness,
     head_positions,
+    plane_part,
     press,
     skin_average,
 )
@@ -148,10 +148,7 @@ def joined(meshes: Sequence[Mesh], *, scale_mm: float) -> Mesh:
 
 def assemble(mesh: Mesh, *, young_kpa: FloatArray, poisson: float) -> csc_array:
     """Stiffness of a whole mesh in kPa, its unknowns ``x0, z0, x1, z1, ...``, none of them held."""
-    stiffness = element_stiffness(mesh.nodes[mesh.elements], poisson=poisson)
-    number = np.arange(2 * len(mesh.nodes)).reshape(-1, 2)
-    elements = Elements(mesh, stiffness, number, np.ones(number.shape), np.zeros(number.size, dtype=bool))
-    return elements.matrix(young_kpa, np.ones(len(mesh.elements), dtype=bool))[0]
+    return plane_part(mesh, young_kpa, np.ones(len(mesh.elements), dtype=bool), poisson=poisson).matrix
 
 
 class PlainBody:

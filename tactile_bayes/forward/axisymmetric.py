@@ -13,10 +13,10 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.mesh import (
     CondensedHole,
-    Elements,
     LumpGeometry,
     Mesh,
     MeshSize,
+    Part,
     lagrange_points,
     lump_mesh,
     quadrature,
@@ -212,7 +212,8 @@ def condense_lump(geometry: LumpGeometry, *, size: MeshSize | None = None, order
     mesh, layers = lump_mesh(geometry, size), geometry.layers
     stiffness = element_stiffness(mesh, nu=layers.poisson)
     modulus = np.where(mesh.gland, layers.fat_kpa * layers.gland_ratio, layers.fat_kpa)
-    within = modulus[mesh.lump]
+    lump = mesh.lump
+    one_tissue = (modulus[lump] == modulus[lump][0]).all()
     # off the rim, which does not move, and off the axis: the ring that a node there stands for has no length, and its
     # displacement is off by several per cent where its neighbours' are off by a few in a thousand
     skin = mesh.skin[1:-1]
@@ -220,13 +221,13 @@ def condense_lump(geometry: LumpGeometry, *, size: MeshSize | None = None, order
     for order in range(orders_needed(geometry) if orders is None else orders):
         k = stiffness[0] + order * stiffness[1] + order**2 * stiffness[2]
         number, sign = order_unknowns(mesh, order)
-        elements = Elements(mesh, k, number, sign, np.zeros(number.size, dtype=bool))
-        rim = np.unique(number[mesh.rim])
-        rim = rim[rim >= 0]
-        flexibility, lowered = elements.around(modulus, rim, number[skin, 2])
-        lump = elements.within(np.ones_like(modulus), rim)
-        original = within[0] * lump if (within == within[0]).all() else elements.within(modulus, rim)
-        modes.append(CondensedHole(flexibility, lowered, lump, original))
+        rim, own = np.unique(number[mesh.rim]), k * modulus[:, None, None]
+        flexibility, sunk = Part.of(mesh.elements[~lump], own[~lump], number, sign).around(rim, number[skin, 2])
+        unit = Part.of(mesh.elements[lump], k[lump], number, sign).within(rim)
+        filling = (
+            modulus[lump][0] * unit if one_tissue else Part.of(mesh.elements[lump], own[lump], number, sign).within(rim)
+        )
+        modes.append(CondensedHole(flexibility, sunk, unit, filling))
     return CondensedLump(mesh.nodes[skin, 0], tuple(modes))
 
 

@@ -379,46 +379,52 @@ def stiffness_factor(
     return np.concatenate([scaled, np.sqrt(bulk) * (root @ volume)], axis=-2)
 
 
-class Elements(Record, eq=False):
-    """The finite elements of a mesh with the unknowns of one symmetry."""
+class Part(Record, eq=False):
+    """Stiffness of a part of a mesh."""
 
-    mesh: Mesh
-    stiffness: FloatArray  #: (e, k, k) array: Of each element for a modulus of 1 kPa.
-    number: IndexArray  #: (n, c) int array: Which unknown each of a node's displacements is; -1 for none.
-    sign: FloatArray  #: (n, c) array: -1 where it is the unknown turned over.
-    held: BoolArray  #: (u,) bool array: Unknowns that stay 0.
+    matrix: csc_array  #: Symmetric, sparse.
+    unknowns: IndexArray  #: Which unknown each row is, rising.
 
-    def matrix(self, modulus_kpa: FloatArray, chosen: BoolArray) -> tuple[csc_array, IndexArray]:
-        """Sparse stiffness of the chosen elements, and which unknowns are in it."""
-        element = self.mesh.elements[chosen]
-        unknown = self.number[element].reshape(len(element), -1)
-        signs = self.sign[element].reshape(len(element), -1)
-        data = self.stiffness[chosen] * (modulus_kpa[chosen, None, None] * signs[:, :, None] * signs[:, None, :])
+    @classmethod
+    def of(
+        cls, elements: IndexArray, stiffness: FloatArray, number: IndexArray, sign: FloatArray | None = None
+    ) -> Part:
+        """Assemble (e, k, k) stiffnesses of elements; each of a node's displacements is the unknown of the (n, c)
+        `number`, -1 for none, with its `sign`."""
+        unknown = number[elements].reshape(len(elements), -1)
+        if sign is not None:
+            signs = sign[elements].reshape(len(elements), -1)
+            stiffness = stiffness * (signs[:, :, None] * signs[:, None, :])
         used = np.unique(unknown[unknown >= 0])
         place = np.where(unknown >= 0, np.searchsorted(used, unknown), -1)
         row, column = np.broadcast_arrays(place[:, :, None], place[:, None, :])
         kept = (row >= 0) & (column >= 0)
-        free = ~self.held[used]
-        matrix = coo_array((data[kept], (row[kept], column[kept])), shape=(len(used), len(used))).tocsc()
-        return matrix[free][:, free], used[free]
+        return cls(coo_array((stiffness[kept], (row[kept], column[kept])), shape=2 * (len(used),)).tocsc(), used)
 
-    def around(self, modulus_kpa: FloatArray, rim: IndexArray, skin: IndexArray) -> tuple[FloatArray, FloatArray]:
+    def without(self, held: IndexArray) -> Part:
+        """The same with some unknowns held at 0."""
+        free = ~np.isin(self.unknowns, held)
+        return Part(self.matrix[free][:, free], self.unknowns[free])
+
+    def around(self, rim: IndexArray, skin: IndexArray) -> tuple[FloatArray, FloatArray]:
         """Displacements (b, b) of the lump's boundary, by its unknowns `rim`, and (s, b) of the skin, for unit forces
-        on that boundary with nothing inside."""
-        matrix, used = self.matrix(modulus_kpa, ~self.mesh.lump)
-        on = np.searchsorted(used, rim)
-        force = np.zeros((len(used), len(on)))
+        on that boundary with nothing inside; those that are not in the part are 0 and take no force."""
+        on = np.searchsorted(self.unknowns, rim[np.isin(rim, self.unknowns)])
+        force = np.zeros((len(self.unknowns), len(on)))
         force[on, np.arange(len(on))] = 1.0
-        found = _solved(matrix, force)
+        found = _solved(self.matrix, force)
         found[on] = 0.5 * (found[on] + found[on].T)
-        return found[on], np.where(self.held[skin, None], 0.0, found[np.searchsorted(used, skin)])
+        sunk = np.zeros((len(skin), len(on)))
+        moves = np.isin(skin, self.unknowns)
+        sunk[moves] = found[np.searchsorted(self.unknowns, skin[moves])]
+        return found[on], sunk
 
-    def within(self, modulus_kpa: FloatArray, rim: IndexArray) -> FloatArray:
+    def within(self, rim: IndexArray) -> FloatArray:
         """(b, b) stiffness of the lump condensed onto its boundary (Guyan 1965: exact in statics)."""
-        matrix, used = self.matrix(modulus_kpa, self.mesh.lump)
-        on, inner = np.searchsorted(used, rim), np.flatnonzero(~np.isin(used, rim))
-        coupling = matrix[inner][:, on].toarray()
-        kept = matrix[on][:, on].toarray() - coupling.T @ _solved(matrix[inner][:, inner], coupling)
+        on = np.searchsorted(self.unknowns, rim[np.isin(rim, self.unknowns)])
+        inner = np.flatnonzero(~np.isin(self.unknowns, rim))
+        coupling = self.matrix[inner][:, on].toarray()
+        kept = self.matrix[on][:, on].toarray() - coupling.T @ _solved(self.matrix[inner][:, inner], coupling)
         return np.asarray(0.5 * (kept + kept.T))
 
 

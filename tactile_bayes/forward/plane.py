@@ -13,9 +13,9 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.axisymmetric import surface_flexibility
 from tactile_bayes.forward.contact import ContactStiffness, Head, solve_contact
-from tactile_bayes.forward.mesh import CondensedHole, Elements, Mesh, body_mesh, quadrature, stiffness_factor
+from tactile_bayes.forward.mesh import CondensedHole, Mesh, Part, body_mesh, quadrature, stiffness_factor
 from tactile_bayes.forward.tissue import Body, Layers
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 from tactile_bayes.presets import MEAN_KPA
 
 # --- Nearly incompressible plane strain: the elements and their unknowns.
@@ -23,27 +23,23 @@ from tactile_bayes.presets import MEAN_KPA
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
-def plane_elements(mesh: Mesh, *, poisson: float, even: bool) -> Elements:
-    """Elements with the unknowns (x, z) of each node for loads symmetric in x, or antisymmetric.
-
-    The chest wall does not move, the body's end not along x; symmetry fixes u_x on the axis when even, u_z when odd.
-    """
-    axis, end, base = mesh.edges
-    held = np.repeat(base[:, None], 2, axis=1)
-    held[end, 0] = True
-    held[axis, 0 if even else 1] = True
-    stiffness = element_stiffness(mesh.nodes[mesh.elements], poisson=poisson)
-    return Elements(mesh, stiffness, np.arange(held.size).reshape(-1, 2), np.ones(held.shape), held.ravel())
-
-
-def element_stiffness(corners: FloatArray, *, poisson: float) -> FloatArray:
-    """(m, 18, 18) stiffness of elements with Young's modulus 1 from the (m, 9, 2) places of their nodes."""
-    gradient, place, weight = quadrature(corners)
+def plane_part(mesh: Mesh, young_kpa: FloatArray, chosen: BoolArray, *, poisson: float) -> Part:
+    """Stiffness of a mesh's chosen elements, by their Young's moduli; unknowns are ``x0, z0, x1, z1, ...``."""
+    elements = mesh.elements[chosen]
+    gradient, place, weight = quadrature(mesh.nodes[elements])
     strain = np.zeros((*weight.shape, 3, 9, 2))  # xx, zz, xz
     strain[..., 0, :, 0], strain[..., 1, :, 1] = gradient[..., 0], gradient[..., 1]
     strain[..., 2, :, 0], strain[..., 2, :, 1] = gradient[..., 1], gradient[..., 0]
     factor = stiffness_factor(strain.reshape(*weight.shape, 3, 18), place, weight, normal=2, poisson=poisson)
-    return np.asarray(factor.transpose(0, 2, 1) @ factor)
+    stiffness = factor.transpose(0, 2, 1) @ factor * young_kpa[chosen, None, None]
+    return Part.of(elements, stiffness, np.arange(2 * len(mesh.nodes)).reshape(-1, 2))
+
+
+def _held(mesh: Mesh, *, even: bool) -> IndexArray:
+    """Unknowns that do not move: at the chest wall, along x at the body's end, and by symmetry on the axis u_x for
+    loads symmetric in x, u_z for antisymmetric ones."""
+    axis, end, base = mesh.edges
+    return np.flatnonzero(np.stack([end | base | (axis & even), base | (axis & (not even))], axis=1))
 
 
 def skin_average(x_mm: FloatArray, *, edges_mm: FloatArray, even: bool) -> FloatArray:
@@ -162,23 +158,18 @@ def condense(
     cut = body.seat < 1.0 and body.gland_ratio != 1.0  # the lump, by the fat-gland boundary
     mesh = body_mesh(body, fineness=fineness, layered=cut)
     plain = body_mesh(body, fineness=fineness, layered=False) if cut else mesh
-    even, odd = (_hole(mesh, plain, body, edges_mm=half, even=even) for even in (True, False))
-    return SurfaceCompliance(body, np.concatenate([-half[:0:-1], half]), row, even, odd)
-
-
-def _hole(mesh: Mesh, plain: Mesh, body: Body, *, edges_mm: FloatArray, even: bool) -> CondensedHole:
-    """Condense half a body; in the `plain` mesh the lump is meshed without the fat-gland boundary."""
-    own, lump = (plane_elements(one, poisson=body.poisson, even=even) for one in (mesh, plain))
-    rim, lump_rim = (one.number[one.mesh.rim].ravel() for one in (own, lump))
-    rim, lump_rim = rim[~own.held[rim]], lump_rim[~lump.held[lump_rim]]
     modulus = np.where(mesh.gland, body.gland_ratio, 1.0) * body.fat_kpa
-    flexibility, lowered = own.around(modulus, rim, own.number[mesh.skin, 1])
-    return CondensedHole(
-        flexibility,
-        skin_average(mesh.nodes[mesh.skin, 0], edges_mm=edges_mm, even=even) @ lowered,
-        lump.within(np.ones(len(plain.elements)), lump_rim),
-        own.within(modulus, rim),
-    )
+    around, within = (plane_part(mesh, modulus, one, poisson=body.poisson) for one in (~mesh.lump, mesh.lump))
+    unit = plane_part(plain, np.ones(len(plain.elements)), plain.lump, poisson=body.poisson)
+    skin, holes = mesh.skin, []
+    rim, plain_rim = ((2 * one.rim[:, None] + np.arange(2)).ravel() for one in (mesh, plain))
+    for even in (True, False):
+        held = _held(mesh, even=even)
+        flexibility, sunk = around.without(held).around(rim, 2 * skin + 1)
+        average = skin_average(mesh.nodes[skin, 0], edges_mm=half, even=even)
+        lump = unit.without(_held(plain, even=even)).within(plain_rim)
+        holes.append(CondensedHole(flexibility, average @ sunk, lump, within.without(held).within(rim)))
+    return SurfaceCompliance(body, np.concatenate([-half[:0:-1], half]), row, *holes)
 
 
 # --- Frames of a head that slides over the lump in two dimensions, and the map they average to.

@@ -20,7 +20,7 @@ from tactile_bayes.forward.axisymmetric import (
     orders_needed,
     skin_spline,
 )
-from tactile_bayes.forward.mesh import Elements, LumpGeometry, Mesh, MeshSize, lump_mesh
+from tactile_bayes.forward.mesh import LumpGeometry, Mesh, MeshSize, Part, lump_mesh
 from tactile_bayes.forward.tissue import Layers
 
 CENTRED = LumpGeometry(7.5, 7.5, 15.0, Layers(15.0))
@@ -173,16 +173,14 @@ def test_without_a_lump_the_elements_sink_as_the_exact_layers() -> None:
     mesh = lump_mesh(CENTRED, fine)
     number, sign = order_unknowns(mesh, 0)
     k = element_stiffness(mesh, nu=0.495)[0]
-    everywhere = np.ones(len(mesh.elements), dtype=bool)
-    elements = Elements(mesh, k, number, sign, np.zeros(number.size, dtype=bool))
     sinkings = []
     for gland in (50.0, 5.0):
         modulus = np.where(mesh.gland, gland, 5.0)
-        matrix, used = elements.matrix(modulus, everywhere)
-        skin = np.searchsorted(used, number[mesh.skin[:-1], 2])
-        force = np.zeros(len(used))
+        part = Part.of(mesh.elements, k * modulus[:, None, None], number, sign)
+        skin = np.searchsorted(part.unknowns, number[mesh.skin[:-1], 2])
+        force = np.zeros(len(part.unknowns))
         force[skin[0]] = 1 / (2 * np.pi)
-        sinkings.append(splu(matrix).solve(force)[skin])
+        sinkings.append(splu(part.matrix).solve(force)[skin])
     r = np.array([0.0, 5.0, 15.0, 40.0])
     by_elements = CubicSpline(mesh.nodes[mesh.skin[:-1], 0], sinkings[0] - sinkings[1])(r)
     stiff, even = (Layers(15.0, gland_ratio=ratio) for ratio in (10.0, 1.0))
