@@ -14,7 +14,6 @@ from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.presets import DEFAULT_NORMALISE, HEAD_PROFILE
@@ -250,28 +249,25 @@ def measure_exam(scene: Scene, scan: Scan, *, body: int, exam: int, normalise: s
         quality = tactile_map.quality
         profile: dict[str, Any] = {name: quality.get(name) for name in HEAD_PROFILE}
         row = replace(row, mean_kpa=quality["mean_pressure_kpa"], **profile)
-        return replace(row, **_measured(tactile_map))
+        options, rng = measuring_options(), np.random.default_rng(_DRAWS_SEED)
+        found = estimate_map(tactile_map, calibration=None, options=options, rng=rng)
     except TactileBayesError:
         return row
-
-
-def _measured(tactile_map: TactileMap) -> dict[str, Any]:
-    rng = np.random.default_rng(_DRAWS_SEED)
-    found = estimate_map(tactile_map, calibration=None, options=measuring_options(), rng=rng)
     if found.status != "estimate" or found.map_posterior is None:
-        return {}
+        return row
     draws = ShapeDraws.of(found.map_posterior)
     shape = np.stack([draws.log_amplitude, draws.log_width, draws.q])
     shape = shape[:, np.isfinite(shape).all(axis=0)]
     mean, covariance = shape.mean(axis=1), np.cov(shape)
     upper = covariance[np.triu_indices(3)]
-    return {
-        "detected": True,
-        "amplitude": float(np.exp(mean[0])),
-        "sigma_x_mm": float(np.exp(mean[1] + mean[2])),
-        "sigma_y_mm": float(np.exp(mean[1] - mean[2])),
+    return replace(
+        row,
+        detected=True,
+        amplitude=float(np.exp(mean[0])),
+        sigma_x_mm=float(np.exp(mean[1] + mean[2])),
+        sigma_y_mm=float(np.exp(mean[1] - mean[2])),
         **{name: float(value) for name, value in zip(SHAPE_COVARIANCE, upper, strict=True)},
-    }
+    )
 
 
 def head_columns(head: Head) -> dict[str, Any]:
