@@ -254,39 +254,25 @@ class TrackerDriver(Record):
         No record that fits the protocol, or none of a tool that is asked for, is a `DeviceError`; several tools of
         which none was chosen are a `UsageError`.
         """
-        before = self._prepare(port, several=bool(tool or reference))
-        answer, came = self._listen(port, tool, reference)
-        if not answer.came or (answer.tools and set(answer.tools.values()) == {NO_ROTATION}):
-            raise DeviceError(f"{port.name}: {self._unfit(answer.read, before, came, rate=port.has_line_rate)}")
-        answer.tool, answer.reference = _chosen(answer.tools, tool, reference, port)
-        return answer
-
-    def _prepare(self, port: Port, *, several: bool) -> bytes:
-        """Set the tracker up; returns what came before it was asked for records."""
-        came = b""
+        before = b""
         if self.stop:
             port.write(self.stop)
-            came = port.drain()
-        for command in (*self.configure, *(self.several if several else ())):
+            before = port.drain()
+        for command in (*self.configure, *(self.several if tool or reference else ())):
             port.write(command)
             time.sleep(_BETWEEN_COMMANDS_S)
-        return came + port.drain() if self.configure else came
-
-    def _listen(self, port: Port, *wanted: str | None) -> tuple[Answer, bytes]:
-        """Ask for records and read them in the form that fits best, for a while after the first of the tools wanted."""
+        if self.configure:
+            before += port.drain()
         port.write(self.single)
+        # records in the form that fits best, for a while after the first of the tools wanted
         tries = [Answer(parser) for parser in (self.parser, self.other_parser) if parser is not None]
-        came, heard, begun = b"", 0.0, time.monotonic()
-        late = self.late
+        came, heard, late, begun = b"", 0.0, self.late, time.monotonic()
         while (now := time.monotonic()) < begun + ANSWER_S:
             if late and not heard and now > begun + ANSWER_S / 3:
                 port.write(late)
                 late = b""
-            if (
-                heard
-                and now - heard > _LISTEN_S
-                and all(name is None or _called(tries[0].tools, name) for name in wanted)
-            ):
+            seen = all(name is None or _called(tries[0].tools, name) for name in (tool, reference))
+            if heard and now - heard > _LISTEN_S and seen:
                 break
             data = port.read_some(_LISTEN_S / 2)
             came += data[: _MOST_KEPT - len(came)]
@@ -294,7 +280,11 @@ class TrackerDriver(Record):
                 one.feed(data)
             tries.sort(key=lambda one: (not one.came, one.read.garbage_bytes))
             heard = heard or (time.monotonic() if tries[0].came else 0.0)
-        return tries[0], came
+        answer = tries[0]
+        if not answer.came or (answer.tools and set(answer.tools.values()) == {NO_ROTATION}):
+            raise DeviceError(f"{port.name}: {self._unfit(answer.read, before, came, rate=port.has_line_rate)}")
+        answer.tool, answer.reference = _chosen(answer.tools, tool, reference, port)
+        return answer
 
     def _unfit(self, parser: Parser, before: bytes, came: bytes, *, rate: bool) -> str:
         """What came in place of a record."""
