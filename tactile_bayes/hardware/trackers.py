@@ -324,41 +324,45 @@ class NdiTracker:
     """
 
     def __init__(self, api: Any, url: str, *, roms: Sequence[Path] = ()) -> None:
-        self._api, self._url = api, url
-        self._wired = not url.startswith("socket://")
-        self._line = "cable" if self._wired else "address"
-        self._device = self._open()
-        self._begin()
-        self.name = self._command("VER:4").splitlines()[0].strip()[:48] or "NDI tracker"
-        for handle in self._handles(1):  # of an earlier session
-            self._command("PHF:%02X", handle)
-        described = {self._describe(rom): rom.stem for rom in roms}
-        self.tools = {handle: described.get(handle) or self._tool_name(handle) for handle in self._enable()}
-        self._command("TSTART:")
-        self._frame: int | None = None
-        self._failures = 0
-
-    def _open(self) -> Any:
-        if self._wired:
-            device = self._api.ndiOpen(self._url)
+        self._api, wired = api, not url.startswith("socket://")
+        self._line = "cable" if wired else "address"
+        if wired:
+            self._device = api.ndiOpen(url)
         else:
-            host, _, port = self._url.removeprefix("socket://").rpartition(":")
-            device = self._api.ndiOpenNetwork(host or port, int(port) if host else NETWORK_PORT)
-        if device is None:
+            host, _, port = url.removeprefix("socket://").rpartition(":")
+            self._device = api.ndiOpenNetwork(host or port, int(port) if host else NETWORK_PORT)
+        if self._device is None:
             raise DeviceError(f"cannot be opened; check its {self._line}, or whether another program has it")
-        return device
-
-    def _begin(self) -> None:
-        """Send INIT, after a reset where the tracker still has an earlier session's line rate."""
         try:
             self._command("INIT:")
         except DeviceError:
-            if not self._wired:
+            if not wired:
                 raise
-            self._api.ndiRESET(self._device)
+            api.ndiRESET(self._device)  # it still has an earlier session's line rate
             self._command("INIT:")
-        if self._wired:
-            self._command("COMM:%d%03d%d", self._api.NDI_115200, self._api.NDI_8N1, self._api.NDI_NOHANDSHAKE)
+        if wired:
+            self._command("COMM:%d%03d%d", api.NDI_115200, api.NDI_8N1, api.NDI_NOHANDSHAKE)
+        self.name = self._command("VER:4").splitlines()[0].strip()[:48] or "NDI tracker"
+        for handle in self._handles(1):  # of an earlier session
+            self._command("PHF:%02X", handle)
+        described = {}
+        for rom in roms:
+            self._command(_WIRELESS)
+            handle = api.ndiGetPHRQHandle(self._device)
+            if api.ndiPVWRFromFile(self._device, handle, str(rom)) != 0:
+                what = f"the tool's description {rom} was refused by the tracker"
+                raise DeviceError(f"{what}; check that it is the tool's .rom file")
+            described[handle] = rom.stem
+        for handle in self._handles(2):
+            self._command("PINIT:%02X", handle)
+        for handle in self._handles(3):
+            self._command("PENA:%02X%s", handle, "D")
+        self.tools = {handle: described.get(handle) or self._tool_name(handle) for handle in self._handles(4)}
+        if not self.tools:
+            raise DeviceError("it has no tool; plug one in, or give --tracker-rom TOOL.rom for a wireless one")
+        self._command("TSTART:")
+        self._frame: int | None = None
+        self._failures = 0
 
     def _command(self, text: str, *values: object) -> str:
         name = text.partition(":")[0]
@@ -377,26 +381,6 @@ class NdiTracker:
         self._command(f"PHSR:{kind:02X}")
         number = self._api.ndiGetPHSRNumberOfHandles(self._device)
         return [self._api.ndiGetPHSRHandle(self._device, one) for one in range(number)]
-
-    def _describe(self, rom: Path) -> int:
-        """Send the description of a wireless tool; return its handle."""
-        self._command(_WIRELESS)
-        handle: int = self._api.ndiGetPHRQHandle(self._device)
-        if self._api.ndiPVWRFromFile(self._device, handle, str(rom)) != 0:
-            what = f"the tool's description {rom} was refused by the tracker"
-            raise DeviceError(f"{what}; check that it is the tool's .rom file")
-        return handle
-
-    def _enable(self) -> list[int]:
-        """Initialise and enable the tools; return their handles."""
-        for handle in self._handles(2):
-            self._command("PINIT:%02X", handle)
-        for handle in self._handles(3):
-            self._command("PENA:%02X%s", handle, "D")
-        enabled = self._handles(4)
-        if not enabled:
-            raise DeviceError("it has no tool; plug one in, or give --tracker-rom TOOL.rom for a wireless one")
-        return enabled
 
     def _tool_name(self, handle: int) -> str:
         part = ""
