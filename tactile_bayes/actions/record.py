@@ -11,6 +11,7 @@ import termios
 import tty
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
+from dataclasses import KW_ONLY, dataclass
 from datetime import date
 from pathlib import Path
 from types import TracebackType
@@ -149,20 +150,22 @@ def noted_signals() -> Iterator[list[str]]:
             signal.signal(number, handler)
 
 
+@dataclass
 class Keys:
     """Keys of a terminal for landmarks, start and stop; without a terminal there are none.
 
     Nothing is printed where a `drawn` live view says it: it would draw over the words.
     """
 
-    def __init__(self, recorder: Recorder, scanhead_from_tracker: FloatArray, *, wait: bool, drawn: bool) -> None:
-        self._recorder = recorder
-        self._lever = scanhead_from_tracker
+    recorder: Recorder
+    scanhead_from_tracker: FloatArray
+    _: KW_ONLY
+    wait: bool
+    drawn: bool
+
+    def __post_init__(self) -> None:
         self._terminal = sys.stdin.isatty()
-        self.waiting = wait and self._terminal
-        self._drawn = drawn
-        self._settings: list[Any] = []
-        self._told = 0
+        self.waiting, self._told = self.wait and self._terminal, 0
 
     def __enter__(self) -> Keys:
         if self._terminal:
@@ -170,7 +173,7 @@ class Keys:
             tty.setcbreak(sys.stdin)
         if self.waiting:
             self._say(RECORDING_KEYS)
-            self._recorder.listen()
+            self.recorder.listen()
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -180,7 +183,7 @@ class Keys:
 
     def look(self) -> None:
         """Act on the keys pressed since the last call, and report landmarks."""
-        for text in self._recorder.report.landmarks[self._told :]:
+        for text in self.recorder.report.landmarks[self._told :]:
             self._say(text)
             self._told += 1
         if not self._terminal or not select.select([sys.stdin], [], [], 0)[0]:
@@ -189,24 +192,24 @@ class Keys:
         with contextlib.suppress(OSError):  # a closed terminal is at its end, or fails
             keys = os.read(sys.stdin.fileno(), 64)
         if not keys:
-            self._recorder.stop("a closed terminal")
+            self.recorder.stop("a closed terminal")
         for key in keys.decode("latin-1"):
             self._press(key)
 
     def _say(self, words: str) -> None:
-        if not self._drawn:
+        if not self.drawn:
             click.echo(words, err=True)
 
     def _press(self, key: str) -> None:
         names = {"n": "sternal_notch", "x": "xiphoid", "p": "nipple"}
         if key in names:
-            self._recorder.touch = LandmarkTouch(names[key], scanhead_from_tracker=self._lever)
+            self.recorder.touch = LandmarkTouch(names[key], scanhead_from_tracker=self.scanhead_from_tracker)
         elif key == " " and self.waiting:
             self.waiting = False
-            self._recorder.start()
+            self.recorder.start()
             self._say("recording")
         elif key == "q":
-            self._recorder.stop("q")
+            self.recorder.stop("q")
 
 
 def record_action(output: Path, **options: Any) -> int:

@@ -38,20 +38,12 @@ _POINTS: Final = 24
 _LEAST: Final = 1e-3
 
 
-def surface_flexibility(wave_number: FloatArray, layers: Layers) -> FloatArray:
-    r"""Sinking of the skin under a pressure that varies as J0(k r), in mm per kPa, for k in 1/mm above 0.
-
-    :math:`2(1-\nu^2)/(E k)` for a half-space.
-    """
-    return np.asarray(skin_flexibility(wave_number, layers)[:, 1, 1], dtype=np.float64)
-
-
 def skin_flexibility(wave_number: FloatArray, layers: Layers) -> FloatArray:
     r"""Displacements of the skin under shear and pressure of one wave number k (1/mm, above 0), in mm per kPa.
 
     The (n, 2, 2) array takes the factors of a radial shear traction :math:`J_1(kr)` and a pressure :math:`J_0(kr)` to
-    those of the radial displacement and the sinking. Entry (1, 0), sinking under shear, is
-    :math:`-(1-2\nu)(1+\nu)/(E k)` for a half-space.
+    those of the radial displacement and the sinking. For a half-space entry (1, 1), sinking under pressure, is
+    :math:`2(1-\nu^2)/(E k)`, and entry (1, 0), sinking under shear, :math:`-(1-2\nu)(1+\nu)/(E k)`.
 
     For one k the fields are :math:`u_r = U(z) J_1(kr)`, :math:`u_z = W(z) J_0(kr)`, which obey the equations of plane
     strain with a wave of number k. Each layer is replaced by its exact stiffness between the displacements of its two
@@ -107,7 +99,7 @@ def layering_compliance(r_mm: FloatArray, layers: Layers) -> FloatArray:
     # lower wave numbers than the layer matrices can stand take the limit: F is constant
     safe = np.maximum(k, _LEAST / layers.thickness_mm)
     top = 2.0 * (1.0 - layers.poisson**2) / layers.fat_kpa
-    bracket = surface_flexibility(safe, layers) * k - top
+    bracket = skin_flexibility(safe, layers)[:, 1, 1] * k - top
     return np.asarray(j0(np.multiply.outer(r, k)) @ (weight * bracket) / (2.0 * np.pi))
 
 

@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, require
-from tactile_bayes.forward.axisymmetric import surface_flexibility
+from tactile_bayes.forward.axisymmetric import skin_flexibility
 from tactile_bayes.forward.contact import ContactStiffness, Head, solve_contact
 from tactile_bayes.forward.mesh import CondensedHole, Mesh, Part, body_mesh, quadrature, stiffness_factor
 from tactile_bayes.forward.tissue import Body, Layers
@@ -79,7 +79,7 @@ def surface_compliance(offset_mm: FloatArray, *, cell_mm: float, layers: Layers)
     depth = layers.fat_mm
     offset = np.abs(np.asarray(offset_mm, dtype=np.float64))
     k, weight = _wave_numbers(depth, layers.thickness_mm, reach_mm=float(offset.max(initial=0.0)) + cell_mm)
-    rest = surface_flexibility(k, layers) + layers_tail * np.expm1(-k * depth) / k
+    rest = skin_flexibility(k, layers)[:, 1, 1] + layers_tail * np.expm1(-k * depth) / k
     rest *= weight * np.sinc(k * cell_mm / (2 * np.pi)) ** 2
     smooth = cell_mm / np.pi * np.cos(np.outer(offset, k)) @ rest
     # integral of (1 - e^-kb)/k cos kx over k, i.e. 0.5 ln(1 + b^2/x^2), averaged over both cells, times the width

@@ -231,11 +231,6 @@ class Scene(Timing):
         fat_mm = fat_thickness(body, self.solid_lumps)
         return Layers(fat_mm, body.thickness_mm, body.fat_kpa, body.gland_ratio, body.nu)
 
-    @property
-    def stiff_balls(self) -> tuple[SolidLump, ...]:
-        """The lumps of tissue and the balls of the ribs."""
-        return (*self.solid_lumps, *(ball for rib in self.ribs for ball in rib.balls()))
-
     def _check_head(self) -> None:
         head, half = self.head, self.head.rows * self.head.pitch_mm / 2
         require(head.radius_mm > half, "head.radius_mm", head.radius_mm, f"exceed the half width of {half:g} mm")

@@ -506,7 +506,8 @@ def frames_at_poses(
     and z in mm of its apex there, which the mean pressures decide."""
     layers, lumps = scene.layers, []
     head, count = _head(scene.head, layers), len(mean_kpa)
-    for lump in scene.stiff_balls:
+    balls = (ball for rib in scene.ribs for ball in rib.balls())
+    for lump in (*scene.solid_lumps, *balls):
         around = condensed_lump(lump, layers)
         change = skin_perturbation(around, lump.stiffness_ratio * layers.fat_kpa, square_mm=scene.head.pitch_mm)
         lumps.append(replace(change, x_mm=lump.x_mm, y_mm=lump.y_mm))

@@ -13,7 +13,6 @@ from tactile_bayes.forward.axisymmetric import (
     layering_compliance,
     skin_flexibility,
     square_compliance,
-    surface_flexibility,
     taxel_compliance,
 )
 from tactile_bayes.forward.tissue import Layers
@@ -38,7 +37,7 @@ def bonded_layer(k: np.ndarray, modulus: float, thickness: float) -> np.ndarray:
 @pytest.mark.parametrize("fat_mm", [15.0, 4000.0])
 def test_deep_layers_of_one_tissue_are_a_half_space(fat_mm: float) -> None:
     deep = Layers(fat_mm, DEEP, 5.0, 1.0, NU)
-    np.testing.assert_allclose(surface_flexibility(WAVES, deep), half_space(WAVES), rtol=1e-9)
+    np.testing.assert_allclose(skin_flexibility(WAVES, deep)[:, 1, 1], half_space(WAVES), rtol=1e-9)
     # a half-space of fat is taken off, and its own base lifts what is left by about 0.2 (mm kPa) / 10 m
     np.testing.assert_allclose(layering_compliance(np.array([0.0, 3.0, 60.0]), deep), 0.0, atol=1e-5)
 
@@ -46,7 +45,7 @@ def test_deep_layers_of_one_tissue_are_a_half_space(fat_mm: float) -> None:
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
 def test_an_incompressible_layer_is_the_closed_form_wherever_it_is_split(share: float) -> None:
     k = np.geomspace(0.01, 5.0, 30)
-    np.testing.assert_allclose(surface_flexibility(k, rubber(3.0 * share)), bonded_layer(k, 7.0, 3.0), rtol=1e-9)
+    np.testing.assert_allclose(skin_flexibility(k, rubber(3.0 * share))[:, 1, 1], bonded_layer(k, 7.0, 3.0), rtol=1e-9)
 
 
 def rubber(fat_mm: float) -> Layers:
@@ -55,7 +54,7 @@ def rubber(fat_mm: float) -> Layers:
 
 
 def test_a_slip_of_nu_from_a_half_is_a_slip_of_the_answer() -> None:
-    exact, near = (surface_flexibility(WAVES, Layers(15.0, poisson=nu)) for nu in (INCOMPRESSIBLE, 0.4999999))
+    exact, near = (skin_flexibility(WAVES, Layers(15.0, poisson=nu))[:, 1, 1] for nu in (INCOMPRESSIBLE, 0.4999999))
     np.testing.assert_allclose(near, exact, rtol=1e-4)
 
 
@@ -106,7 +105,7 @@ def layer_waves(k: np.ndarray, z_mm: float, height_mm: float, nu: float, young: 
 @pytest.mark.parametrize("nu", [0.0, 0.3, 0.495])
 def test_plane_and_axisymmetric_waves_are_one(nu: float) -> None:
     layers = Layers(12.0, 70.0, 5.0, 8.0, nu)
-    np.testing.assert_allclose(surface_flexibility(WAVES, layers), plane_transfer(WAVES, layers), rtol=1e-8)
+    np.testing.assert_allclose(skin_flexibility(WAVES, layers)[:, 1, 1], plane_transfer(WAVES, layers), rtol=1e-8)
 
 
 @pytest.mark.parametrize("r", [0.0, 1.0, 8.0, 40.0])

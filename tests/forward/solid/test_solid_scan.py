@@ -164,7 +164,8 @@ def test_the_scene_decides_the_model() -> None:
 def test_a_rib_is_a_row_of_balls_and_no_lump() -> None:
     scene = scene_from_text("[scene]\nduration_s = 0.02\n[body]\nfat_mm = 12\n[[rib]]\nhalf_length_mm = 9\n")
     assert scene.fidelity == "solid"
-    assert [(ball.x_mm, ball.y_mm, ball.depth_mm) for ball in scene.stiff_balls] == [(x, 26, 12) for x in (-8, 0, 8)]
+    (rib,) = scene.ribs
+    assert [(ball.x_mm, ball.y_mm, ball.depth_mm) for ball in rib.balls()] == [(x, 26, 12) for x in (-8, 0, 8)]
     truth = simulate(scene, rng=np.random.default_rng(0)).truth
     assert truth["lumps"] == []
     assert truth["ribs"][0]["ball_x_mm"] == [-8.0, 0.0, 8.0]
