@@ -565,20 +565,16 @@ class Emulator:
                 self.unplugged = True
                 self.link.close()
                 return
-            self._send(self.device.record(self._next), moment)
+            record = self.device.record(self._next)
+            if within(self.faults.stall, moment) or len(self._waiting) + len(record) > BUFFER_BYTES:
+                self.dropped += bool(record)
+            elif record:
+                disturbed = self.faults.disturb(record, self.rng)
+                self.faulty += disturbed != record
+                self.sent += bool(disturbed)
+                self._waiting += disturbed
             self._next += 1
             self._pass_on()  # at once: when this process was late, many are due and must not meet in the buffer
         if self._next >= len(times):
             self._waiting += self.device.end(self.sent, self.dropped)
             self._finished_at = time.monotonic()
-
-    def _send(self, record: bytes, moment_s: float) -> None:
-        if not record:
-            return
-        if within(self.faults.stall, moment_s) or len(self._waiting) + len(record) > BUFFER_BYTES:
-            self.dropped += 1
-            return
-        disturbed = self.faults.disturb(record, self.rng)
-        self.faulty += disturbed != record
-        self.sent += bool(disturbed)
-        self._waiting += disturbed

@@ -461,15 +461,12 @@ class LiveServer:
             return connection.respond(HTTPStatus.FORBIDDEN, "give the whole address that `record` printed\n")
         if request.headers.get_all("Host") != [self._authority]:
             return connection.respond(HTTPStatus.FORBIDDEN, "not under this name\n")
-        if address.path == "/":
-            return self._page(connection)
-        if address.path != "/live":
+        if address.path == "/live":
+            if request.headers.get_all("Origin") != [f"http://{self._authority}"]:
+                return connection.respond(HTTPStatus.FORBIDDEN, "not from another site\n")
+            return None
+        if address.path != "/":
             return connection.respond(HTTPStatus.NOT_FOUND, "nothing here\n")
-        if request.headers.get_all("Origin") != [f"http://{self._authority}"]:
-            return connection.respond(HTTPStatus.FORBIDDEN, "not from another site\n")
-        return None
-
-    def _page(self, connection: Any) -> Any:
         nonce = secrets.token_urlsafe(16)
         page = _PAGE.read_text(encoding="utf-8").replace("NONCE", nonce)
         response = connection.respond(HTTPStatus.OK, page)
