@@ -31,7 +31,6 @@ from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import RecordingWriter, create_exclusive, full_disk, read_scan
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware import head
-from tactile_bayes.hardware.head import HeadParser
 from tactile_bayes.hardware.ports import SILENT_S, Port, read_in_process
 from tactile_bayes.hardware.readings import Follower, HelloReading, Parser
 from tactile_bayes.hardware.recorder import LandmarkTouch, Line, Observer, Recorder, Report
@@ -322,7 +321,7 @@ def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Li
     port = Port(request.head_url, baud=request.head_baud, role="head")
     stack.callback(port.close)
     hello = check_head(port, every=request.every)
-    parser = HeadParser(hello, every=request.every)
+    parser = head.HeadParser(hello, every=request.every)
     start, stop = head.encode_command(head.START, every=request.every), head.encode_command(head.STOP)
     devices: list[tuple[Port, Parser, bytes, bytes, float]] = [(port, parser, start, stop, SILENT_S)]
     follower = Follower()

@@ -33,9 +33,8 @@ class Layers(Record):
     poisson: float = POISSON  #: Of all tissues, at least 0 and below 0.5.
 
     def __post_init__(self) -> None:
-        require(
-            0 < self.fat_mm < self.thickness_mm, "fat_mm", self.fat_mm, f"be above 0 and below {self.thickness_mm:g}"
-        )
+        rule = f"be above 0 and below {self.thickness_mm:g}"
+        require(0 < self.fat_mm < self.thickness_mm, "fat_mm", self.fat_mm, rule)
         require(self.thickness_mm < MOST_MM, "thickness_mm", self.thickness_mm, f"be below {MOST_MM:g}")
         require(self.fat_kpa > 0, "fat_kpa", self.fat_kpa, "be above 0")
         require(self.gland_ratio > 0, "gland_ratio", self.gland_ratio, "be above 0")
@@ -63,25 +62,18 @@ class Body(Record):
 
     def __post_init__(self) -> None:
         require(LEAST_MM <= self.d_mm < MOST_MM, "d_mm", self.d_mm, f"be at least {LEAST_MM:g} and below {MOST_MM:g}")
-        limit = (
-            f"be at least {LEAST_DEPTH_RATIO:g}: the skin over the lump is too thin to be resolved, or there is none"
-        )
-        require(LEAST_DEPTH_RATIO <= self.depth_ratio < 1e4, "depth_ratio", self.depth_ratio, limit)
-        require(
-            0 <= self.seat <= MOST_SEAT, "seat", self.seat, f"be between 0 (centred) and {MOST_SEAT:g}; 1 is resting"
-        )
+        rule = f"be at least {LEAST_DEPTH_RATIO:g}: the skin over the lump is too thin to be resolved, or there is none"
+        require(LEAST_DEPTH_RATIO <= self.depth_ratio < 1e4, "depth_ratio", self.depth_ratio, rule)
+        rule = f"be between 0 (centred) and {MOST_SEAT:g}; 1 is resting"
+        require(0 <= self.seat <= MOST_SEAT, "seat", self.seat, rule)
         if 1.0 - _RESTS < self.seat < 1.0 + _THINNEST_FILM:
             settle(self, seat=1.0)
         if self.thickness_mm is None:
             deep = self.centre_mm + max(0.6, 0.5 * self.seat) * self.d_mm + 2.0
             settle(self, thickness_mm=max(THICKNESS_MM, deep))
         bottom = self.centre_mm + self.radius_mm
-        require(
-            self.layers.thickness_mm > 1.0001 * bottom,
-            "thickness_mm",
-            self.layers.thickness_mm,
-            f"be above {bottom:g} mm, the depth of the lump's lowest point",
-        )
+        thickness, rule = self.layers.thickness_mm, f"be above {bottom:g} mm, the depth of the lump's lowest point"
+        require(thickness > 1.0001 * bottom, "thickness_mm", thickness, rule)
 
     @property
     def centre_mm(self) -> float:

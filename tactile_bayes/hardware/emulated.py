@@ -23,7 +23,6 @@ import numpy as np
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware import head
-from tactile_bayes.hardware.head import Packet, PacketParser
 from tactile_bayes.hardware.readings import HelloReading, MissingReading, PoseReading, ToolReading, pose_from_relative
 from tactile_bayes.hardware.serial_trackers import encoded
 from tactile_bayes.options import FaultOptions
@@ -88,7 +87,7 @@ class Device:
         """Process commands and return the answer."""
         raise NotImplementedError
 
-    def _obeyed(self, packets: Iterable[Packet]) -> Iterator[Packet]:
+    def _obeyed(self, packets: Iterable[head.Packet]) -> Iterator[head.Packet]:
         """Commands in the open framing, those to start and stop carried out."""
         for packet in packets:
             if packet.kind == head.START:
@@ -116,7 +115,7 @@ class EmulatedHead(Device):
         self.times_s = scan.frames.time_s
         self._scan = scan
         self._every = 1
-        self._commands = PacketParser()
+        self._commands = head.PacketParser()
 
     def hello(self) -> HelloReading:
         """Identity of the scan's head and array."""
@@ -170,7 +169,7 @@ class EmulatedTracker(Device):
     def __init__(self, poses: TrackerPoses, *, protocol: str, faults: Faults | None = None) -> None:
         self.times_s = poses.time_s
         self._protocol, self.open_framing = protocol, protocol == "open"
-        self._commands = PacketParser()
+        self._commands = head.PacketParser()
         self._faults = faults or Faults()
         names = ("Probe", "Reference") if protocol in ("open", "igtlink") else ("1", "2")
         self._tools = partial(played_tools, poses, self._faults, names=names)

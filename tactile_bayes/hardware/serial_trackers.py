@@ -15,7 +15,6 @@ from typing import Final
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import DeviceError, UsageError
 from tactile_bayes.hardware import head
-from tactile_bayes.hardware.head import DEFAULT_BAUD, HeadParser, encode_command
 from tactile_bayes.hardware.ports import ANSWER_S, SILENT_S, Port, shown
 from tactile_bayes.hardware.readings import (
     MM_PER_INCH,
@@ -336,8 +335,8 @@ def _chosen(tools: Mapping[str, str], tool: str | None, reference: str | None, p
 
 
 def _open_framing(title: str, baud: int) -> TrackerDriver:
-    ask, start, stop = (encode_command(one) for one in (head.ASK, head.START, head.STOP))
-    return TrackerDriver(title, baud, HeadParser, (), ask, start, stop)
+    ask, start, stop = (head.encode_command(one) for one in (head.ASK, head.START, head.STOP))
+    return TrackerDriver(title, baud, head.HeadParser, (), ask, start, stop)
 
 
 def _fastrak(words: str, form: bytes, closing: bytes, parser: Callable[[], Parser]) -> TrackerDriver:
@@ -391,11 +390,12 @@ def open_tracker(protocol: str, url: str, *, baud: int | None = None, roms: Sequ
 
 def check_head(port: Port, *, every: int = 1) -> HelloReading:
     """Ask a head for its identity, and refuse a line too slow for its frames."""
-    port.write(encode_command(head.STOP))
-    came, parser, begun = port.drain(), HeadParser(), time.monotonic()
+    port.write(head.encode_command(head.STOP))
+    came, parser, begun = port.drain(), head.HeadParser(), time.monotonic()
     heard = begun
     while parser.hello is None and time.monotonic() < min(heard + _RESTART_S, begun + _BOOT_S):
-        port.write(encode_command(head.ASK))  # again and again: one may get lost, and a board may restart meanwhile
+        # again and again: one may get lost, and a board may restart meanwhile
+        port.write(head.encode_command(head.ASK))
         data = port.read_some(_ASK_AGAIN_S)
         heard = time.monotonic() if data else heard
         came += data[: _MOST_KEPT - len(came)]
@@ -407,7 +407,7 @@ def check_head(port: Port, *, every: int = 1) -> HelloReading:
     return parser.hello
 
 
-def _no_hello(parser: HeadParser, came: bytes, port: Port) -> str:
+def _no_hello(parser: head.HeadParser, came: bytes, port: Port) -> str:
     """What came in place of a HELLO."""
     if parser.fault:
         return f"but {parser.fault}; the layout is in docs/scan-head-protocol.md"
@@ -421,7 +421,7 @@ def _no_hello(parser: HeadParser, came: bytes, port: Port) -> str:
 
 def probe(url: str) -> str:
     """Identify the device on a port by trying each protocol; this writes to the port."""
-    with closing(Port(url, baud=DEFAULT_BAUD, role="device")) as port, suppress(DeviceError):
+    with closing(Port(url, baud=head.DEFAULT_BAUD, role="device")) as port, suppress(DeviceError):
         hello = check_head(port)
         kind = f"scan head {hello.device_id!r}, {hello.rows} x {hello.columns} taxels, {hello.rate_hz:g} Hz"
         return kind if hello.rows else f"tracker {hello.device_id!r} in the open framing"

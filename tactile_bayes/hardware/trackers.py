@@ -22,7 +22,6 @@ import numpy as np
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.geometry import quaternion_from_rotation, rotation_from_quaternion
 from tactile_bayes.hardware import head
-from tactile_bayes.hardware.head import PacketParser
 from tactile_bayes.hardware.ports import Port
 from tactile_bayes.hardware.readings import (
     NO_ROTATION,
@@ -419,7 +418,7 @@ class NdiTracker:
 
 def serve(tracker: NdiTracker, line: socket.socket) -> None:
     """Serve the tracker in the open framing until the other end closes."""
-    commands, sending, number = PacketParser(), False, 0
+    commands, sending, number = head.PacketParser(), False, 0
     latest: dict[str, ToolReading] = {tool: MissingReading("not measured yet", tool) for tool in tracker.tools.values()}
     line.setblocking(False)
     while True:
