@@ -184,8 +184,7 @@ def combined(sources: Sequence[Source], given: Stated) -> tuple[Scan, list[str]]
         if name in held and held[name].size == 1 and held.get("counts", np.empty(0)).ndim == 3:
             held[name] = np.full(held["counts"].shape[1:], float(held[name].item()))  # one for all taxels
     _refuse_missing(held, [name for source in sources for name in source.others])
-    _check_shapes(held)
-    _check_counts(held)
+    _check_layout(held)
     _check_units(held, calibrated=pressure)
     facts = {"frames_unit": str(stated.unit)} if pressure else {}
     if told:
@@ -372,7 +371,7 @@ def _told_pressure(kpa: FloatArray, unit: str, *, kept: str) -> str:
 # --- Checks of arrays in the layout.
 
 
-def _check_shapes(arrays: Arrays) -> None:
+def _check_layout(arrays: Arrays) -> None:
     lengths: dict[str, tuple[int, str]] = {}  # letter -> length, and the array that set it
     for name, array in arrays.items():
         want = LAYOUT[name].shape
@@ -385,6 +384,13 @@ def _check_shapes(arrays: Arrays) -> None:
             shape = "(" + ", ".join(map(str, want)) + ("," if len(want) == 1 else "") + ")"
             way_out = f"it must be {shape}" + (f" with {', '.join(known)}" if known else "")
             raise BadDataError(f"{name} has shape {array.shape}", way_out=way_out)
+    counts = arrays["counts"]
+    if counts.dtype.kind not in "iu" and (odd := counts[counts != np.rint(counts)]).size:
+        what = f"counts holds {float(odd[0]):.6g}, which is no raw reading"
+        raise BadDataError(what, way_out="for pressures give their unit: --unit kPa")
+    low, high = int(counts.min()), int(counts.max())
+    if low < 0 or high > _MOST_COUNTS:
+        raise BadDataError(f"counts holds {low if low < 0 else high}", way_out="raw readings lie in 0 to 65535")
 
 
 def _check_numbers(arrays: Arrays) -> None:
@@ -409,18 +415,6 @@ def _check_largest(arrays: Arrays) -> None:
             unit = f"; times in ms are stated, --{_TIME_OPTIONS[name]} ms" if name in _TIME_OPTIONS else ""
             way_out = f"give mm, kPa and s; the file may be damaged{unit}"
             raise BadDataError(f"{name} holds {largest:.3g}", way_out=way_out)
-
-
-def _check_counts(arrays: Arrays) -> None:
-    counts = arrays["counts"]
-    whole = counts.dtype.kind in "iu" or bool((counts == np.rint(counts)).all())
-    if not whole:
-        odd = float(counts[counts != np.rint(counts)][0])
-        what = f"counts holds {odd:.6g}, which is no raw reading"
-        raise BadDataError(what, way_out="for pressures give their unit: --unit kPa")
-    low, high = int(counts.min()), int(counts.max())
-    if low < 0 or high > _MOST_COUNTS:
-        raise BadDataError(f"counts holds {low if low < 0 else high}", way_out="raw readings lie in 0 to 65535")
 
 
 def _check_units(arrays: Arrays, *, calibrated: bool) -> None:
