@@ -13,7 +13,7 @@ import numpy as np
 from tactile_bayes.api.arguments import PathLike, door, output_path, path_of, plain, required_path, takes
 from tactile_bayes.declarations import EXACT, Record, as_dict, replace, to_plain
 from tactile_bayes.errors import UsageError, check_number
-from tactile_bayes.files import imports
+from tactile_bayes.files import imports, scan_mcap
 from tactile_bayes.files.arrays_layout import ArrayMap, GridOptions, Stated
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.documents import with_session
@@ -132,9 +132,7 @@ def read_scan(path: PathLike) -> Scan:
     BadDataError
         When the file is no scan, or is damaged.
     """
-    from tactile_bayes.files.scan_mcap import read_scan as read
-
-    return read(required_path(path, "path"))
+    return scan_mcap.read_scan(required_path(path, "path"))
 
 
 @door

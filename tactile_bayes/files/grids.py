@@ -11,7 +11,7 @@ import numpy as np
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError, in_file
-from tactile_bayes.files import text_lines
+from tactile_bayes.files import tables
 from tactile_bayes.files.arrays_layout import GridOptions
 from tactile_bayes.files.images import read_image
 from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, AXES, Grid, read_named, turned_by_axes
@@ -41,10 +41,10 @@ _UNITS_LINE: Final = re.compile(r"^UNITS[\s,;:=]+([^\s,;]+)[\s,;]*$", re.MULTILI
 def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
     """Read a table of text, NaN where a field is empty or one of the texts of `no_value`."""
     words = [one for one in no_value if not is_number(one)]  # numbers are looked for among the values
-    texts = text_lines.read_lines(path)
-    separator = text_lines.separator_of(texts, words) or ","
-    rows = [text_lines.fields_of(one, separator) for one in texts]
-    commas = text_lines.with_comma(rows, words, way_out="write numbers without commas")
+    texts = tables.read_lines(path)
+    separator = tables.separator_of(texts, words) or ","
+    rows = [tables.fields_of(one, separator) for one in texts]
+    commas = tables.with_comma(rows, words, way_out="write numbers without commas")
     decimal = {one for one in commas if one.count(",") == 1}
     rows = [[field.replace(",", ".") if field in decimal else field for field in row] for row in rows]
     first, last = _numbers_within(rows, no_value)
@@ -53,7 +53,7 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
         what = f"its first column is called {names[0][:20]!r}, as before frames that stand one a row"
         raise BadDataError(what, way_out="import them as a scan, or give one frame as rows and columns")
     text = "\n".join(texts)
-    marks = (*words, text_lines.NO_SENSEL) if "ASCII_DATA" in text else tuple(words)
+    marks = (*words, tables.NO_SENSEL) if "ASCII_DATA" in text else tuple(words)
     before, rows, after, notes = rows[:first], rows[first:last], rows[last:], list[str]()
     for number, row in enumerate(rows, start=first):  # blank lines and titles of frames separate tables, not rows
         if (blank := len(row) <= 1 and not any(row)) or _is_title(row):
@@ -86,7 +86,7 @@ def is_number(field: str) -> bool:
 
 def _numbers_within(rows: Sequence[list[str]], no_value: Sequence[str]) -> tuple[int, int]:
     """Where lines of numbers begin and end: there every field is one, or empty, or a mark for no value."""
-    marks = {"", text_lines.NO_SENSEL, *no_value}
+    marks = {"", tables.NO_SENSEL, *no_value}
     plain = [
         i
         for i, row in enumerate(rows)
@@ -147,14 +147,14 @@ def _refuse_labels(table: FloatArray) -> None:
     both = np.isnan(table[0, 0]) and _evenly(row[1:]) and _evenly(column[1:])
     for found, line, where in (
         (both, row[1:], "row 1 and column 1"),
-        (text_lines.counts_up(row), row, "row 1"),
-        (text_lines.counts_up(column), column, "column 1"),
+        (tables.counts_up(row), row, "row 1"),
+        (tables.counts_up(column), column, "column 1"),
     ):
         if found:
             way_out = "save the grid without them (pandas: to_csv(..., header=False, index=False))"
             raise BadDataError(f"{where} count {_first_three(line)}... as labels do", way_out=way_out)
     for name, line, beside in (("column", column, table[:, 1:].T), ("row", row, table[1:])):
-        if len(line) >= text_lines.FEWEST_LABELS and _evenly(line) and not any(map(_evenly, beside)):
+        if len(line) >= tables.FEWEST_LABELS and _evenly(line) and not any(map(_evenly, beside)):
             what = f"{name} 1 runs in equal steps ({_first_three(line)}...)"
             raise BadDataError(what, way_out="leave out times or places; frames that stand one a row are a scan")
     nx, ny = (len(np.unique(line)) for line in (column, table[:, 1 % table.shape[1]]))

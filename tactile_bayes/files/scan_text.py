@@ -32,7 +32,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.named_arrays import Source
-from tactile_bayes.files.text_lines import NO_SENSEL, Line, counts_up, number, read_text_table, unit_of_time
+from tactile_bayes.files.tables import NO_SENSEL, Line, counts_up, number, read_text_table, unit_of_time
 from tactile_bayes.geometry import BoolArray, FloatArray
 
 # --- Poses: columns by their names, or numbers in a stated layout.
