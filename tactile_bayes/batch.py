@@ -38,6 +38,12 @@ if TYPE_CHECKING:
 STORE_SCHEMA: Final = "tactile-bayes.batch/2"
 _FLUSHED_EVERY_S: Final = 5.0  #: Lines reach the disk at least this often: what a loss of power may cost.
 
+_Coder = Callable[[Any], Any]
+
+
+def _same(value: Any) -> Any:
+    return value
+
 
 class BatchStore(UserDict[str, Any]):
     """Results by the names of their items, each read from the file when it is asked for; open it with `open_store`.
@@ -47,15 +53,7 @@ class BatchStore(UserDict[str, Any]):
     was killed is dropped.
     """
 
-    def __init__(
-        self,
-        descriptor: int,
-        path: Path,
-        *,
-        encode: Callable[[Any], Any],
-        decode: Callable[[Any], Any],
-        read_only: bool = False,
-    ) -> None:
+    def __init__(self, descriptor: int, path: Path, *, encode: _Coder, decode: _Coder, read_only: bool = False) -> None:
         super().__init__()
         self.path = path
         self._descriptor, self._encode, self._decode, self._read_only = descriptor, encode, decode, read_only
@@ -118,17 +116,12 @@ class BatchStore(UserDict[str, Any]):
 
 @contextlib.contextmanager
 def open_store(
-    path: Path,
-    *,
-    settings: Mapping[str, Any],
-    encode: Callable[[Any], Any] = lambda value: value,
-    decode: Callable[[Any], Any] = lambda value: value,
-    read_only: bool = False,
+    path: Path, *, settings: Mapping[str, Any], encode: _Coder = _same, decode: _Coder = _same, read_only: bool = False
 ) -> Iterator[BatchStore]:
     """Open or create a store, readable by its owner only and locked against a second run.
 
-    `settings` are all that the results depend on besides the items' keys (options, seed, digests of inputs), as plain
-    data; a store of other settings, or one in use, is a `UsageError`, another file or a damaged line in its middle a
+    `encode` and `decode` bring a result into JSON and back. `settings` are all that the results depend on besides the
+    items' keys (options, seed, digests of inputs), as plain data; a store of other settings, or one in use, is a `UsageError`, another file or a damaged line in its middle a
     `BadDataError`. JSON keeps floats exactly; tuples come back as lists. A store that is read only is left as it is: it
     may be another's, or on a disk that takes nothing.
     """

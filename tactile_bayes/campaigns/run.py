@@ -432,18 +432,12 @@ class Campaign:
 
     def _compare_task(self, name: str, visits: Visits) -> steps.Task:
         settings, key = self._of_one_mass([exam for exams in visits.values() for exam in exams])
-        found, figures = list(visit_dates(visits).values()), self.settings.figures
-        known = [day for day in found if day is not None]
-        days = tuple(float((day - known[0]).days) for day in known) if len(known) == len(found) else None
-        dates = tuple("" if day is None else day.isoformat() for day in found)
+        dates = tuple("" if day is None else day.isoformat() for day in visit_dates(visits).values())
         first = next(iter(visits.values()))[0]
         course = Course("", "", first.patient, first.side or "", first.mass, tuple(visits), dates if any(dates) else ())
-        counts = [len(exams) for exams in visits.values()]
-        key |= {"visits": counts, "days": days, "figures": figures, "course": repr(course)}
-        names = [[exam.name for exam in exams] for exams in visits.values()]
-        make = partial(
-            steps.make_growth, self.folder / EXAMS, names, settings, days=days, course=course, figures=figures
-        )
+        names, figures = [[exam.name for exam in exams] for exams in visits.values()], self.settings.figures
+        key |= {"visits": [len(exams) for exams in names], "figures": figures, "course": repr(course)}
+        make = partial(steps.make_growth, self.folder / EXAMS, names, settings, course=course, figures=figures)
         return self._task("compare", name, key, make)
 
     def _file(self, step: str, name: str, file: str) -> str | None:

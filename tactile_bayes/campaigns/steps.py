@@ -8,6 +8,7 @@ import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from datetime import date
 from pathlib import Path
 from typing import Any, Final
 
@@ -322,23 +323,19 @@ def make_pool(folder: Path, names: Sequence[str], settings: Settings) -> Made:
 
 
 def make_growth(
-    folder: Path,
-    visits: Sequence[Sequence[str]],
-    settings: Settings,
-    *,
-    days: tuple[float, ...] | None,
-    course: Course,
-    figures: bool,
+    folder: Path, visits: Sequence[Sequence[str]], settings: Settings, *, course: Course, figures: bool
 ) -> Made:
     """Compare the visits of a mass as `compare` does; the table says that they are of one where landmarks do not.
 
-    `visits` names the exams of each in order of time, with folders below `folder`; `days` are from the first, and
-    `course` is what the table says of them.
+    `visits` names the exams of each in order of time, with folders below `folder`; `course` is what the table says of
+    them.
     """
     answers = [[_answer(folder / name) for name in names] for names in visits]
     found = [one for maps in answers for one in maps if one.shape is not None]
     placed = all(one.report.centre_patient_mm is not None for one in found)
     files = [[folder / name / layout.MAP for name in names] for names in visits]
+    dates = [date.fromisoformat(day) for day in course.dates if day]
+    days = tuple(float((day - dates[0]).days) for day in dates) if len(dates) == len(visits) else None
     comparing = Comparing(days=days, same_mass=not placed)
     compared = compare_answers(answers, settings, comparing, names=visits, files=files)
     report = compared.report.checked()

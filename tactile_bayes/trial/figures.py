@@ -37,12 +37,7 @@ def need_patients(groups: int) -> None:
 
 
 def interval_from_values(
-    value: float,
-    values: Sequence[float] | npt.NDArray[np.float64],
-    *,
-    scale: Scale,
-    confidence: float,
-    freedom: float | None = None,
+    value: float, values: FloatArray, *, scale: Scale, confidence: float, freedom: float | None = None
 ) -> tuple[float, float]:
     r"""Two-sided jackknife interval of a statistic from its values with one patient left out.
 
@@ -58,10 +53,9 @@ def interval_from_values(
     """
     groups = len(values)
     need_patients(groups)
-    left_out = np.asarray(values, dtype=np.float64)
     if scale == "slope":
-        scale = "log" if value > 0 and np.all(left_out > 0) else "linear"
-    everything, others = float(on_scale(value, scale)), on_scale(left_out, scale)
+        scale = "log" if value > 0 and np.all(values > 0) else "linear"
+    everything, others = float(on_scale(value, scale)), on_scale(values, scale)
     variance = (groups - 1) / groups * float(np.sum((others - others.mean()) ** 2))
     if variance <= (1e-12 * max(1.0, abs(everything))) ** 2:
         raise UndefinedError("the figure is the same whichever patient is left out, so its error cannot be estimated")

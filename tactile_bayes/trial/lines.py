@@ -232,12 +232,7 @@ def deming(x: FloatArray, y: FloatArray, *, error_ratio: float = 1.0) -> Line:
 
 
 def weighted_deming(
-    x: FloatArray,
-    y: FloatArray,
-    *,
-    error_ratio: float = 1.0,
-    max_iterations: int = 30,
-    threshold: float = 1e-6,
+    x: FloatArray, y: FloatArray, *, error_ratio: float = 1.0, max_iterations: int = 30, threshold: float = 1e-6
 ) -> Line:
     r"""Fit a Deming line whose errors grow in proportion to size: weights 1 over the squared fitted size.
 

@@ -422,8 +422,7 @@ def modality_report(
         coverage=coverage(found, trial.ex_vivo_mm, confidence=intervals.probability),
         method_comparison=compare_methods(sizes, intervals=intervals, error_ratio=error_ratio),
         replicates=ReplicateFigures(
-            **fields_of(replicate_figures(sizes, intervals=intervals)),
-            variance_components=reader_components(found),
+            **fields_of(replicate_figures(sizes, intervals=intervals)), variance_components=reader_components(found)
         ),
         calibration=None if prediction is None else calibration(prediction, confidence=intervals.probability),
         cautions=accuracy.cautions(sizes, intervals=intervals),

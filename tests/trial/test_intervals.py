@@ -43,14 +43,14 @@ def test_clopper_pearson_refuses_what_is_no_share(k: int, n: int) -> None:
 def test_jackknife_of_a_mean_is_students_interval() -> None:
     """For a mean the jackknife standard error is s / sqrt n exactly (Efron & Tibshirani 1993, eq. 11.8)."""
     x = np.random.default_rng(2).normal(3.0, 1.0, 12)
-    left_out = [float(np.delete(x, i).mean()) for i in range(12)]
+    left_out = np.array([np.delete(x, i).mean() for i in range(12)])
     expected = stats.t.interval(NOMINAL, 11, x.mean(), x.std(ddof=1) / np.sqrt(12))
     found = interval_from_values(float(x.mean()), left_out, scale="linear", confidence=NOMINAL)
     assert found == pytest.approx(expected)
 
 
 def constant(values: list[float], *, scale: str = "log") -> tuple[float, float]:
-    return interval_from_values(1.0, values, scale=scale, confidence=NOMINAL)
+    return interval_from_values(1.0, np.array(values), scale=scale, confidence=NOMINAL)
 
 
 def test_jackknife_refuses_with_the_reason() -> None:
