@@ -121,9 +121,9 @@ def open_store(
     """Open or create a store, readable by its owner only and locked against a second run.
 
     `encode` and `decode` bring a result into JSON and back. `settings` are all that the results depend on besides the
-    items' keys (options, seed, digests of inputs), as plain data; a store of other settings, or one in use, is a `UsageError`, another file or a damaged line in its middle a
-    `BadDataError`. JSON keeps floats exactly; tuples come back as lists. A store that is read only is left as it is: it
-    may be another's, or on a disk that takes nothing.
+    items' keys (options, seed, digests of inputs), as plain data; a store of other settings, or one in use, is a
+    `UsageError`, another file or a damaged line in its middle a `BadDataError`. JSON keeps floats exactly; tuples come
+    back as lists. A store that is read only is left as it is: it may be another's, or on a disk that takes nothing.
     """
     access = os.O_RDONLY if read_only else os.O_RDWR | os.O_CREAT | os.O_APPEND
     try:

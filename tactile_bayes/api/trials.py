@@ -113,13 +113,10 @@ def analyse(
     kept = {name: value for name, value in as_dict(settings).items() if name != "seed"}
     inputs = hash_inputs(**trial.files, protocol=protocol)
     made = Provenance("validate", {"interval_probability": INTERVAL, **kept}, inputs, seed=settings.seed)
-    report = summarise(
-        trial, intervals=intervals, error_ratio=settings.error_ratio, seed=settings.seed, provenance=made.as_dict()
-    )
+    report = summarise(trial, intervals=intervals, error_ratio=settings.error_ratio, provenance=made.as_dict())
     more: dict[str, Any] = {} if title is None else {"title": title}
     if settings.bayes:
-        rng = np.random.default_rng(settings.seed)
-        more["next_mass"] = next_mass(trial, rng=rng)
+        more["next_mass"] = next_mass(trial, rng=np.random.default_rng(settings.seed))
     return TrialResult(replace(report, **more), trial)
 
 

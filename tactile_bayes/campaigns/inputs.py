@@ -21,6 +21,7 @@ from tactile_bayes.errors import BadDataError, TactileBayesError, UsageError
 from tactile_bayes.files.atomic import sha256, unwritable
 from tactile_bayes.files.manifest_csv import EXAMS, GROWTH, JOURNAL, MASSES, Exam
 from tactile_bayes.files.reading import sha256_of, version_of
+from tactile_bayes.progress import Progress
 
 # --- The output folder of a campaign: its journal, and the files that belong to its steps.
 
@@ -166,12 +167,7 @@ def _read(file: tuple[str, Path, str]) -> dict[str, Any]:
 
 
 def read_sources(
-    exams: Sequence[Exam],
-    *,
-    store: BatchStore | None,
-    keep: bool = True,
-    executor: Executor | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    exams: Sequence[Exam], *, store: BatchStore | None, keep: bool, executor: Executor | None, progress: Progress
 ) -> tuple[dict[Path, str], dict[Path, str]]:
     """SHA-256 of every exam's file by its path, from the journal where the file is as it was then, and faults of files.
 

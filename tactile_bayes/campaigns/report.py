@@ -45,6 +45,9 @@ _SIZES: Final = {
 }  # fmt: skip
 
 
+Pooled = Mapping[str, PooledReport]  #: Each pooled mass, by its name.
+
+
 class Row(Record, eq=False):
     """One exam as the tables and the index show it: of its report this alone stays in memory."""
 
@@ -93,7 +96,7 @@ def _status(report: EstimateReport | PooledReport) -> str:
     return "not_detected" if report.status == "no_estimate" and not silent else "not_done"
 
 
-def exam_rows(campaign: Campaign, pooled: Mapping[str, PooledReport]) -> list[Row]:
+def exam_rows(campaign: Campaign, pooled: Pooled) -> list[Row]:
     """Every exam of the table, in its order; `pooled` are the masses by their names."""
     together, rows = _of_pooled(pooled.values()), [_row(campaign, exam) for exam in campaign.exams]
     of_scan: dict[Path, list[Row]] = defaultdict(list)
@@ -134,7 +137,7 @@ def _row(campaign: Campaign, exam: Exam) -> Row:
     return Row.of(exam, read_record(place, EstimateReport), **facts)
 
 
-def pooled_reports(campaign: Campaign) -> dict[str, PooledReport]:
+def pooled_reports(campaign: Campaign) -> Pooled:
     """Each pooled mass, by its name."""
     folder = campaign.folder / layout.MASSES
     return {name: read_record(folder / name / layout.POOLED, PooledReport) for name in campaign.keys["pool"]}
@@ -183,7 +186,7 @@ def failure_lines(campaign: Campaign, rows: Sequence[Row]) -> list[dict[str, obj
 def trial_lines(
     campaign: Campaign,
     rows: Sequence[Row],
-    pooled: Mapping[str, PooledReport],
+    pooled: Pooled,
     masses: Collection[tuple[str, str]] | None,
 ) -> list[dict[str, object]]:
     """``trial.csv``: every exam as a reading of ``tactile``, every pooled visit as one of ``tactile-pooled``.
@@ -410,11 +413,11 @@ def _write_report(folder: Path, asked: CampaignSettings, growth: Sequence[Growth
 def _page(
     campaign: Campaign,
     rows: Sequence[Row],
-    pooled: Mapping[str, PooledReport],
+    pooled: Pooled,
     growth: Sequence[Growth],
     *,
     counts: str,
-    links: Mapping[str, str],
+    links: dict[str, str],
 ) -> str:
     """The index: a row for each mass, in the order of the table."""
     changes = {(one.patient, one.mass): one for one in growth}  # the last one of each mass: to its last visit

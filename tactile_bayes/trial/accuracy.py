@@ -22,6 +22,7 @@ from tactile_bayes.trial.figures import (
     Reasons,
     Sample,
     Scale,
+    Statistic,
     SumStatistic,
     UndefinedError,
     columns,
@@ -59,13 +60,7 @@ def cautions(sizes: ModalitySizes, *, intervals: Intervals) -> tuple[str, ...]:
 
 
 def figure_with_misses(
-    statistic: SumStatistic,
-    sizes: ModalitySizes,
-    *,
-    scale: Scale,
-    intervals: Intervals,
-    power: int,
-    missed: Callable[[ModalitySizes], float],
+    statistic: SumStatistic, sizes: ModalitySizes, *, scale: Scale, intervals: Intervals, power: int, missed: Statistic
 ) -> Figure:
     r"""Weighted mean over masses, found and missed, with an interval over patients.
 
@@ -324,13 +319,9 @@ class PairedComparison(Figures):
     reasons: Reasons
 
 
-def paired_comparisons(
-    sizes: Mapping[str, ModalitySizes], *, intervals: Intervals, seed: int = 0
-) -> list[PairedComparison]:
+def paired_comparisons(sizes: Mapping[str, ModalitySizes], *, intervals: Intervals) -> list[PairedComparison]:
     """Compare every pair of modalities on their common masses, with Holm's correction of p values."""
-    pairs = [
-        _compare(sizes[one], sizes[other], intervals=intervals, seed=seed) for one, other in combinations(sizes, 2)
-    ]
+    pairs = [_compare(sizes[one], sizes[other], intervals) for one, other in combinations(sizes, 2)]
     corrected = holm([pair.p_value for pair in pairs])
     return [replace(pair, p_holm=p) for pair, p in zip(pairs, corrected, strict=True)]
 
@@ -376,7 +367,7 @@ def sign_flip(by_patient: FloatArray, *, seed: int, flips: int = FLIPS) -> float
     return beyond / (flips + 1)
 
 
-def _compare(one: ModalitySizes, other: ModalitySizes, *, intervals: Intervals, seed: int) -> PairedComparison:
+def _compare(one: ModalitySizes, other: ModalitySizes, intervals: Intervals) -> PairedComparison:
     first, second = on_common_masses(one, other)
     difference = resampled(_pair(first, second, np.subtract), scale="linear", intervals=intervals)
     quotient = resampled(_pair(first, second, ratio), scale="log", intervals=intervals)
@@ -392,7 +383,7 @@ def _compare(one: ModalitySizes, other: ModalitySizes, *, intervals: Intervals, 
         patients=len(patients),
         first_percent=figure(mape_percent, first).value,
         second_percent=figure(mape_percent, second).value,
-        p_value=sign_flip(sums, seed=seed) if len(patients) and np.all(np.isfinite(sums)) else None,
+        p_value=sign_flip(sums, seed=intervals.seed) if len(patients) and np.all(np.isfinite(sums)) else None,
         p_holm=None,
         **fields_of({"difference_percent": difference, "ratio": quotient}),
     )

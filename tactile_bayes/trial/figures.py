@@ -183,8 +183,8 @@ _LEAST_DEFINED = 0.99  #: Of the redrawn trials, at least this share must have t
 class Intervals(Record):
     """How the intervals of figures are made: their probability and their method.
 
-    ``corrected`` is the jackknife with the corrections of record 0077; ``bca`` draws the patients `resamples` times
-    from this seed.
+    ``corrected`` is the jackknife with the corrections of record 0077; ``bca`` draws the patients `resamples` times.
+    The seed is also that of the sign flips.
     """
 
     probability: float = 0.95

@@ -358,17 +358,11 @@ class TrialReport(Record, kw_only=True):
 
 
 def summarise(
-    trial: Trial,
-    *,
-    intervals: Intervals = JACKKNIFE,
-    error_ratio: float = 1.0,
-    seed: int = 1999,
-    provenance: Mapping[str, Any] | None = None,
+    trial: Trial, *, intervals: Intervals = JACKKNIFE, error_ratio: float = 1.0, provenance: Mapping[str, Any] = {}
 ) -> TrialReport:
     """Compare each modality's sizes with excision.
 
-    `error_ratio` is the variance of the error of ex-vivo sizes over that of a modality's, for the Deming lines; `seed`
-    is of the sign flips.
+    `error_ratio` is the variance of the error of ex-vivo sizes over that of a modality's, for the Deming lines.
     """
     readings, ex_vivo_mm, sizes = trial.readings, trial.ex_vivo_mm, trial.sizes()
     return TrialReport(
@@ -389,10 +383,10 @@ def summarise(
             for name, one in sizes.items()
         },
         mape_ratio_to_tactile=accuracy.mape_ratios(sizes, intervals=intervals),
-        paired_comparisons=tuple(accuracy.paired_comparisons(sizes, intervals=intervals, seed=seed)),
+        paired_comparisons=tuple(accuracy.paired_comparisons(sizes, intervals=intervals)),
         doubts=tuple(unit_doubts(sizes, np.array(list(ex_vivo_mm.values()), dtype=np.float64))),
         conventions=CONVENTIONS,
-        provenance=dict(provenance or {}),
+        provenance=dict(provenance),
         research_use=RESEARCH_USE,
     )
 
