@@ -123,16 +123,13 @@ def limits(differences: FloatArray, *, confidence: float = 0.95) -> Limits:
     outer = percentile_factor(n, percentile=0.5 + 0.5 * SHARE, confidence=tail)
     pair = [content_factor(n, content=SHARE, confidence=c) for c in (1 - tail, tail)]
     reach = lines.student(n - 1, confidence=confidence) * math.sqrt(1 / n + z * z / (2 * (n - 1)))
-    return replace(
-        found,
-        low_interval=(bias - outer * sd, bias - inner * sd),
-        high_interval=(bias + inner * sd, bias + outer * sd),
-        pair_intervals=((bias - pair[1] * sd, bias - pair[0] * sd), (bias + pair[0] * sd, bias + pair[1] * sd)),
-        approximate_intervals=(
-            (bias - (z + reach) * sd, bias - (z - reach) * sd),
-            (bias + (z - reach) * sd, bias + (z + reach) * sd),
-        ),
-    )
+
+    def both(near: float, far: float) -> tuple[Ends, Ends]:
+        return (bias - far * sd, bias - near * sd), (bias + near * sd, bias + far * sd)
+
+    low, high = both(inner, outer)
+    pairs, approximate = both(*pair), both(z - reach, z + reach)
+    return replace(found, low_interval=low, high_interval=high, pair_intervals=pairs, approximate_intervals=approximate)
 
 
 def limits_unlinked(x: Sequence[FloatArray], y: Sequence[FloatArray], *, confidence: float = 0.95) -> Limits:
