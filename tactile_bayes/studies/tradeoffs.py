@@ -289,7 +289,8 @@ def calibrated_rule(calibration: Calibration, *, name: str) -> SizeRule:
 
         scatter = population.fit.get("left_out_sd", float(np.exp(population.spread.mean[0])))
         form = "Eq 6" if population.residual is None else "Eq 6 and its residual"
-        return SizeRule(by_bodies, float(scatter), f"{form} of {name}", population.outside)
+        source = f"{form} of {name} at an average depth of fat (`estimate` reads it from the frames)"
+        return SizeRule(by_bodies, float(scatter), source, population.outside)
     axes = calibration.x, calibration.y
 
     def by_axes(amplitude: float, across: float, along: float | None) -> float:
