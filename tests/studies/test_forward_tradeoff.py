@@ -200,7 +200,8 @@ def test_a_quadratic_gives_the_median_of_what_estimate_draws() -> None:
 
 
 def test_each_form_says_what_it_leaves_and_where_it_ends() -> None:
-    for name, words in (("solid-mean", "Eq 6 and its residual of file.json"), ("plane-strain", "Eq 6 of file.json")):
+    by_fat = "Eq 6 and its residual of file.json at an average depth of fat (`estimate` reads it from the frames)"
+    for name, words in (("solid-mean", by_fat), ("plane-strain", "Eq 6 of file.json")):
         rule = calibrated_rule(shipped(name), name="file.json")
         assert rule.source == words
         assert 0.05 < rule.scatter < 0.4
