@@ -283,11 +283,14 @@ def deming_slopes(u: FloatArray, q: FloatArray, p: FloatArray, *, error_ratio: f
 
 
 def deming_slope(u: float, q: float, p: float, error_ratio: float) -> float:
-    """One slope; undefined where it is NaN."""
-    slope = float(deming_slopes(*map(np.asarray, (u, q, p)), error_ratio=error_ratio))
-    if math.isnan(slope):
+    """One of them, in floats: weighted lines ask for hundreds. Undefined where the line is vertical."""
+    d, p = error_ratio * q - u, 0.0 if abs(p) <= EQUAL * math.sqrt(u * q) else p
+    root = math.hypot(d, 2 * math.sqrt(error_ratio) * p)
+    if d < 0:
+        return 2 * p / (root - d)
+    if p == 0:
         raise UndefinedError("the line is vertical or every direction fits equally well")
-    return slope
+    return (d + root) / (2 * error_ratio * p)
 
 
 def all_equal(values: FloatArray) -> bool:
