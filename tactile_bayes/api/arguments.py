@@ -154,6 +154,13 @@ def output_path(given: PathLike, written: Format) -> Path:
     return path
 
 
+def dataframe(data: Any, columns: list[str] | None = None) -> pandas.DataFrame:
+    """A table as pandas has it, which is loaded here only."""
+    import pandas
+
+    return pandas.DataFrame(data, columns=columns)
+
+
 def table_of(given: PathLike | pandas.DataFrame, name: str) -> Path | Sheet:
     """Return a path as it is, and a DataFrame as CSV text."""
     if hasattr(given, "to_csv"):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, door, output_path, path_of, plain, required_path, takes
+from tactile_bayes.api.arguments import PathLike, dataframe, door, output_path, path_of, plain, required_path, takes
 from tactile_bayes.declarations import EXACT, Record, as_dict, replace, to_plain
 from tactile_bayes.errors import UsageError, check_number
 from tactile_bayes.files import imports, scan_mcap
@@ -86,13 +86,11 @@ class Map(Record, eq=False):
 
     def to_dataframe(self) -> pandas.DataFrame:
         """One row for each cell with data: x_mm, y_mm, mean, variance, count."""
-        import pandas
-
         found = self.tactile_map
         rows, columns = np.nonzero(found.covered)
         places = {"x_mm": found.x_mm[columns], "y_mm": found.y_mm[rows]}
         values = {name: getattr(found, name)[rows, columns] for name in ("mean", "variance", "count")}
-        return pandas.DataFrame({**places, **values})
+        return dataframe({**places, **values})
 
     @door
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:

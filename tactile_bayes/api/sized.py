@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, door, in_keywords, output_path, path_of
+from tactile_bayes.api.arguments import PathLike, dataframe, door, in_keywords, output_path, path_of
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, UsageError
@@ -97,13 +97,11 @@ class Sized(Record, eq=False, dict=True):
 
     def to_dataframe(self) -> pandas.DataFrame:
         """One row for each draw: chain, draw and a column for each quantity; no rows without an estimate."""
-        import pandas
-
         columns = self._columns()
         shape = next(iter(columns.values())).values.shape if columns else (0, 0)
         chain, draw = (index.ravel() for index in np.indices(shape))
         values = {name: draws.values.ravel() for name, draws in columns.items()}
-        return pandas.DataFrame({"chain": chain, "draw": draw, **values})
+        return dataframe({"chain": chain, "draw": draw, **values})
 
     @door
     def to_arviz(self) -> Any:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, Told, path_of, plain, sequence_of, table_of, takes
+from tactile_bayes.api.arguments import PathLike, Told, dataframe, path_of, plain, sequence_of, table_of, takes
 from tactile_bayes.batch import open_executor, run_batch
 from tactile_bayes.declarations import EXACT, Record, as_dict, names_of, replace, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
@@ -76,8 +76,6 @@ class TrialResult(Told, eq=False):
 
     def to_dataframe(self) -> pandas.DataFrame:
         """One row for each modality and figure: value, and the ends of its interval (NaN where it has none)."""
-        import pandas
-
         rows = []
         for modality, figures in self.document["modalities"].items():
             for name, value in figures.items():
@@ -85,7 +83,7 @@ class TrialResult(Told, eq=False):
                     counted = name == "detected"  # the interval beside it is of the share
                     low, high = (None, None) if counted else figures.get(f"{name}_interval") or (None, None)
                     rows.append((modality, name, value, low, high))
-        found = pandas.DataFrame(rows, columns=["modality", "figure", "value", "low", "high"])
+        found = dataframe(rows, columns=["modality", "figure", "value", "low", "high"])
         return found.astype({"value": float, "low": float, "high": float})
 
     def __repr__(self) -> str:
