@@ -162,6 +162,8 @@ def _named(lines: Sequence[Line], header: Line, given: Stated) -> Source:
     if given.pose_layout not in (None, layout):
         raise BadDataError(f"line {header.number} names its rotations ({layout})", way_out="leave --pose-layout out")
     rows = [line for line in lines if line.number > header.number]
+    if not rows:
+        raise BadDataError(f"line {header.number} names columns, and no row stands below it", way_out="give the poses")
     columns, rows = _of_one_tool(header, kinds, rows, names, given)
     order = (3, 4, 5, 0, 6, 7, 8, 1, 9, 10, 11, 2) if turned else range(len(names))  # rows of a matrix: R, then place
     numbers = np.column_stack([_values(rows, columns[names[i]]) for i in order])

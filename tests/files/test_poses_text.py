@@ -237,6 +237,7 @@ FAULTS: dict[str, tuple[list[str], dict[str, Any], str]] = {
         "looks like metres .* or their unit, .*length_unit m",
     ),
     "no qz": (["t,x,y,z,qw,qx,qy", *with_times(QUATERNIONS)], {}, "line 1 names no qz"),
+    "no row": (["5,2,3,1,0,0,0,9", "t,x,y,z,qw,qx,qy,qz"], {}, "line 2 names columns, and no row stands below it"),
     "numbered from 1": (["t,x,y,z,q1,q2,q3,q4", *with_times(QUATERNIONS)], {}, "line 1 names no qw"),
     "both": (["t,x,y,z,qw,qx,qy,qz", *with_times(QUATERNIONS)], {"pose_layout": "xyzw"}, "leave pose_layout out"),
     "never seen": (
