@@ -156,7 +156,8 @@ def _numbered(values: np.ndarray[Any, Any], without: BoolArray, facts: _Facts, n
         values = values.astype(np.uint8).view(np.int8)
     elif facts.kind == 1 and facts.bits == 32:
         values = values.view(np.uint32)
-    raw: FloatArray = np.asarray(values, dtype=np.float64)
+    with np.errstate(invalid="ignore"):  # a NaN of 32 bits may be a signalling one
+        raw: FloatArray = np.asarray(values, dtype=np.float64)
     if facts.bits < 8:  # stretched to 0..255
         raw = raw * (top / 255)
     if facts.white_is_zero:

@@ -113,6 +113,10 @@ READ: dict[str, tuple[bytes, Any]] = {
     "signed 16 bits": (tiff({"data": (A * 10 - 50).astype("<i2").tobytes(), "bits": 16, "kind": 2}), A * 10 - 50),
     "32 bits": (tiff({"data": (A + 4 * 10**9).astype("<u4").tobytes(), "bits": 32}), A + 4 * 10**9),
     "floating point": (tiff({"data": (A / 7).astype("<f4").tobytes(), "bits": 32, "kind": 3}), (A / 7).astype("f4")),
+    "floating point with a signalling NaN": (
+        tiff({"data": A.astype("<f4").tobytes()[:-4] + b"\x01\x00\x80\x7f", "bits": 32, "kind": 3}),
+        np.where(A == 11, np.nan, A),
+    ),
     "planes of equal colours": (
         tiff({"data": [A.astype("u1").tobytes()] * 3, "photometric": 2, "samples": 3, "planar": 2}),
         A,
