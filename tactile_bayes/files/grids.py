@@ -509,7 +509,8 @@ def _map(arrays: dict[str, np.ndarray[Any, Any]], *, spacing_mm: float, normalis
 def _real(array: np.ndarray[Any, Any], *, name: str) -> FloatArray:
     if array.dtype.kind not in "iuf":
         raise BadDataError(f"{name} is {array.dtype}", way_out="give real numbers")
-    return np.asarray(array, dtype=np.float64)
+    with np.errstate(invalid="ignore"):  # a signalling NaN is one, too
+        return np.asarray(array, dtype=np.float64)
 
 
 def _numbers(arrays: Mapping[str, np.ndarray[Any, Any]], name: str) -> FloatArray:

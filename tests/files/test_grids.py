@@ -543,3 +543,11 @@ def test_an_image_of_a_million_pixels_is_sized_where_its_lump_is(tmp_path: Path)
     assert found.fit is not None
     assert found.fit.theta[1:3] == pytest.approx([3, -2], abs=0.1)
     assert found.fit.widths()[:2] == pytest.approx([5.2, 5.2], rel=0.05)
+
+
+def test_a_signalling_nan_of_32_bits_is_a_gap_like_another() -> None:
+    """numpy warns where one is converted, and a warning fails a test."""
+    values = np.ones((30, 30), dtype=np.float32)
+    values.view(np.uint32)[3, 4] = 0x7F800001
+    made = tactile_bayes.map_of(values, spacing_mm=1.0)
+    assert np.count_nonzero(~made.tactile_map.covered) == 1
