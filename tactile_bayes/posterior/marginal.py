@@ -136,13 +136,13 @@ class Scene(Record, dict=True):
         prior, middle, radius_mm = problem.prior, problem.window.middle, problem.radius_mm
         p, q, r = self.widths(theta)
         ratio = np.hypot(q, r)
-        total = log_normal_density(p, np.log(prior.width_median_mm), prior.log_width_sd)
         if self.shape == "ridge":
             inside, volume = ridge_place(self.column(theta, "across"), radius_mm)
         else:
             x, y = self.column(theta, "x") - middle[0], self.column(theta, "y") - middle[1]
             inside, volume = np.hypot(x, y) <= radius_mm, np.pi * radius_mm**2
-        inside, total = inside & (p + ratio <= np.log(problem.widest_mm)), total - np.log(volume)
+        inside = inside & (p + ratio <= np.log(problem.widest_mm))
+        total = log_normal_density(p, np.log(prior.width_median_mm), prior.log_width_sd) - np.log(volume)
         if self.shape in ("ellipse", "rotated"):
             # q is half of u - v, p half of their sum: the volume of (u, v) is twice that of (p, q)
             total = total + log_normal_density(q, 0.0, prior.log_ratio_sd) - np.log(2.0)
@@ -441,8 +441,7 @@ class CollapsedTarget:
                     yield spanned.solution(fields)
                     continue
             for j in range(0, len(points), BLOCK):
-                products = self.linear.projected(self.scene.templates(points[j : j + BLOCK], self.window))
-                yield joined((self.linear.under(*products, columns) for columns in fields), axis=1)
+                yield self.linear.under_each(self.scene.templates(points[j : j + BLOCK], self.window), fields)
 
 
 def choose(evidence: FloatArray, rng: np.random.Generator) -> IndexArray:

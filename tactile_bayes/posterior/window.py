@@ -487,8 +487,13 @@ class LinearModel:
         cross = self.window.product(*templates) if len(templates) == 2 else None
         return [self.window.project(one, self.weighted) for one in templates], cross
 
+    def under_each(self, templates: list[Templates], fields: list[FieldColumns]) -> LinearSolution:
+        """Solutions for each structure's (m,) templates under all fields."""
+        projected, cross = self.projected(templates)
+        return joined([self.under(projected, cross, columns) for columns in fields], axis=1)
+
     def under(self, projected: list[Projected], cross: FloatArray | None, columns: FieldColumns) -> LinearSolution:
-        """Solutions for each structure's (m,) templates under one length, from inner products without a field."""
+        """The same under one length, from inner products without a field."""
         inner = [Inner.of(one, columns) for one in projected]
         return self.solve(inner, None if cross is None else inner[0].product(inner[1], cross, columns), columns)
 
