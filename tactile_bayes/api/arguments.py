@@ -57,9 +57,11 @@ def door(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
         try:
             return function(*args, **keywords)
         except TactileBayesError as error:
-            if isinstance(error, BadDataError) and not BY_OPTIONS.get():
+            if BY_OPTIONS.get():
+                raise
+            if isinstance(error, BadDataError):
                 error.what, error.way_out = in_keywords(error.what), in_keywords(error.way_out)
-            elif not BY_OPTIONS.get():
+            else:
                 error.args = (in_keywords(str(error)),)
             raise
 

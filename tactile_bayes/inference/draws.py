@@ -380,6 +380,12 @@ _NODES = np.sinh(np.linspace(-3.0, 3.0, 81))
 LEAST_SD = 1e-2  #: Least SD of a component, as a share of the mixture's: a narrower one is widened to this.
 
 
+def distinct_rows(theta: FloatArray) -> tuple[FloatArray, IndexArray]:
+    """Distinct rows, in order, and where each of the given (n, p) stands among them."""
+    rows, index = np.unique(theta, axis=0, return_inverse=True)
+    return rows, index.reshape(-1)  # which not all versions of numpy do
+
+
 def paired_points(key: FloatArray, replicates: Labels, dimension: int, rng: np.random.Generator) -> FloatArray:
     """(n, dimension) uniform points in (0, 1) for drawing further quantities, one point per draw.
 

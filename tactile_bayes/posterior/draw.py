@@ -11,7 +11,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, field, names_of, replace
 from tactile_bayes.errors import NotConvergedError, UsageError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import END_ERROR, INDEPENDENT_DRAWS, ParameterDraws, Solved
+from tactile_bayes.inference.draws import END_ERROR, INDEPENDENT_DRAWS, ParameterDraws, Solved, distinct_rows
 from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 from tactile_bayes.inference.importance import TRUSTED_SHAPE, Gaussians, ImportanceOptions, importance
 from tactile_bayes.inference.modes import LogDensity
@@ -137,8 +137,8 @@ class Sampled(Record, eq=False):
         if not len(self.beside):
             return draws
         # copies of a resampled point move together: each new point costs a linear solution
-        points, back = np.unique(draws.flat, axis=0, return_inverse=True)
-        moved = (points + rng.standard_normal(points.shape) @ self.spread.T)[back.reshape(-1)]
+        points, back = distinct_rows(draws.flat)
+        moved = (points + rng.standard_normal(points.shape) @ self.spread.T)[back]
         return replace(draws, theta=with_beside(moved, self.beside).reshape(*draws.theta.shape[:2], -1))
 
 

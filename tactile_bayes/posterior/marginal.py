@@ -10,7 +10,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
-from tactile_bayes.inference.draws import Solution, Solved
+from tactile_bayes.inference.draws import Solution, Solved, distinct_rows
 from tactile_bayes.posterior.bump import log_normal_density
 from tactile_bayes.posterior.window import (
     FieldColumns,
@@ -345,8 +345,7 @@ class CollapsedTarget:
         self, theta: FloatArray, rng: np.random.Generator, *, solved: Solved | None = None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Draw amplitudes (m, v), level (m,) and noise scale (m,) given the shape: exact, field first."""
-        unique, back = np.unique(theta, axis=0, return_inverse=True)
-        back = back.reshape(-1)  # which not all versions of numpy do
+        unique, back = distinct_rows(theta)
         evidence, centre, power, slope, squares = (solved or self.conditional)(unique)
         at_zero = np.concatenate([one.level()[:, 0] for one in self.fields])
         level_variance = np.concatenate([one.inverse[:, 0, 0] for one in self.fields])

@@ -14,6 +14,7 @@ from tactile_bayes.trial.figures import UndefinedError
 from tactile_bayes.trial.lines import (
     deming,
     deming_slope,
+    deming_slopes,
     jackknife_errors,
     least_squares,
     passing_bablok,
@@ -284,6 +285,20 @@ def test_what_determines_no_line_is_refused() -> None:
 def test_demings_slope_does_not_cancel() -> None:
     """u so much above q that the textbook form loses all digits of p."""
     assert deming_slope(1e12, 1e-2, 1e3, 1.0) == pytest.approx(1e-9, rel=1e-12)
+    assert deming_slopes(*np.array([[1e12], [1e-2], [1e3]]), error_ratio=1.0)[0] == pytest.approx(1e-9, rel=1e-12)
+
+
+@pytest.mark.parametrize("error_ratio", [0.25, 1.0, 4.0])
+def test_one_deming_slope_is_that_of_several(error_ratio: float) -> None:
+    """One is computed in floats, for speed."""
+    u, q, share = np.random.default_rng(5).uniform(0.1, 10.0, (3, 200))
+    p = np.sqrt(u * q) * (share / 5.0 - 1.0)
+    together = deming_slopes(u, q, p, error_ratio=error_ratio)
+    alone = [deming_slope(*one, error_ratio) for one in zip(u.tolist(), q.tolist(), p.tolist(), strict=True)]
+    np.testing.assert_allclose(together, alone, rtol=1e-12)
+    assert np.isnan(deming_slopes(np.ones(1), np.full(1, 2.0), np.zeros(1), error_ratio=error_ratio * 2)).all()
+    with pytest.raises(UndefinedError, match="vertical"):
+        deming_slope(1.0, 2.0, 0.0, error_ratio * 2)
 
 
 def test_few_masses_leave_passing_and_babloks_ends_open() -> None:
