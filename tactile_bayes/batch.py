@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 from tactile_bayes import __version__
 from tactile_bayes.declarations import EXACT, Record, from_plain, to_plain
 from tactile_bayes.errors import BadDataError, UsageError, one_line
-from tactile_bayes.shell import raise_if_asked
+from tactile_bayes.shell import raise_if_interrupted
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -41,7 +41,7 @@ _FLUSHED_EVERY_S: Final = 5.0  #: Lines reach the disk at least this often: what
 _Coder = Callable[[Any], Any]
 
 
-def _same(value: Any) -> Any:
+def _unchanged(value: Any) -> Any:
     return value
 
 
@@ -63,19 +63,19 @@ class BatchStore(UserDict[str, Any]):
     def __getitem__(self, name: str) -> Any:
         with open(self._descriptor, "rb", closefd=False) as file:  # what is written goes to the end all the same
             file.seek(self.data[name])
-            return self._decode(_unsealed(file.readline()[:-1].decode())["value"])
+            return self._decode(_without_checksum(file.readline()[:-1].decode())["value"])
 
     def add(self, name: str, value: object) -> Any:
         """Append one result and return it as it will be read back."""
         line = json.dumps({"key": name, "value": self._encode(value)}, ensure_ascii=False)
         began = self._end
-        self._append(_sealed(line))
+        self._append(_with_checksum(line))
         self.data[name] = began
         return self._decode(json.loads(line)["value"])
 
     def load(self, header: Mapping[str, Any]) -> None:
         """Find the results of an earlier run, or write the header of a new store; for the errors see `open_store`."""
-        wanted = _sealed(json.dumps(header, sort_keys=True, ensure_ascii=False))
+        wanted = _with_checksum(json.dumps(header, sort_keys=True, ensure_ascii=False))
         with open(self._descriptor, "rb", closefd=False) as file:
             first = file.readline()
             if not first.endswith(b"\n") and wanted.encode().startswith(first):  # none yet, or its beginning
@@ -89,7 +89,7 @@ class BatchStore(UserDict[str, Any]):
                 if not line.endswith(b"\n"):
                     break
                 try:
-                    record = _unsealed(line[:-1].decode("utf-8", errors="replace"))
+                    record = _without_checksum(line[:-1].decode("utf-8", errors="replace"))
                     name, _ = str(record["key"]), record["value"]
                 except (ValueError, KeyError, TypeError, RecursionError):
                     way_out = "remove that line: its item will be run again"
@@ -116,7 +116,12 @@ class BatchStore(UserDict[str, Any]):
 
 @contextlib.contextmanager
 def open_store(
-    path: Path, *, settings: Mapping[str, Any], encode: _Coder = _same, decode: _Coder = _same, read_only: bool = False
+    path: Path,
+    *,
+    settings: Mapping[str, Any],
+    encode: _Coder = _unchanged,
+    decode: _Coder = _unchanged,
+    read_only: bool = False,
 ) -> Iterator[BatchStore]:
     """Open or create a store, readable by its owner only and locked against a second run.
 
@@ -143,19 +148,19 @@ def open_store(
         os.close(descriptor)
 
 
-def unfinished(output: Path) -> Path:
+def store_path(output: Path) -> Path:
     """Where the results of a batch are kept until its output is written."""
     return output.with_name(f"{output.name}.unfinished")
 
 
 @contextlib.contextmanager
-def open_unfinished(output: Path | None, kind: Any, *, settings: Mapping[str, Any]) -> Iterator[BatchStore | None]:
+def open_store_beside(output: Path | None, kind: Any, *, settings: Mapping[str, Any]) -> Iterator[BatchStore | None]:
     """Open the store of results of a `kind`, a record or a list of them, beside the output; None without an output."""
     if output is None:
         yield None
         return
     encode, decode = partial(to_plain, digits=EXACT), partial(from_plain, kind)
-    with open_store(unfinished(output), settings=settings, encode=encode, decode=decode) as store:
+    with open_store(store_path(output), settings=settings, encode=encode, decode=decode) as store:
         yield store
 
 
@@ -168,15 +173,15 @@ def _lock(descriptor: int, path: Path, *, shared: bool) -> None:
         raise UsageError(f"{path} is in use by another run; wait for it or choose another name") from None
 
 
-def _sealed(text: str) -> str:
+def _with_checksum(text: str) -> str:
     """Format a line of a store: the text and its checksum."""
     return f"{text} {zlib.crc32(text.encode()):08x}"
 
 
-def _unsealed(line: str) -> Any:
+def _without_checksum(line: str) -> Any:
     """Read the text of a store's line; `ValueError` where it is damaged."""
     text = line.rpartition(" ")[0]
-    if _sealed(text) != line:
+    if _with_checksum(text) != line:
         raise ValueError("its checksum does not match")
     return json.loads(text)
 
@@ -194,7 +199,7 @@ def _check_header(first: bytes, wanted: Mapping[str, Any], *, path: Path) -> Non
             way_out="finish it with the version that began it, or choose another name",
             path=str(path),
         )
-    if _sealed(line.rpartition(" ")[0]) != line:
+    if _with_checksum(line.rpartition(" ")[0]) != line:
         raise BadDataError("line 1 is damaged", way_out="choose another name", path=str(path))
     new = dict(wanted["settings"])
     differ = sorted(name for name in settings.keys() | new.keys() if settings.get(name) != new.get(name))
@@ -257,7 +262,7 @@ class LocalWorkers(Executor):
 
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
-        process = context.Process(target=_work, args=(theirs,), daemon=True)
+        process = context.Process(target=_serve_items, args=(theirs,), daemon=True)
         with self._lock:
             if self._stopped:
                 raise BrokenExecutor("the processes were stopped")
@@ -283,7 +288,7 @@ class LocalWorkers(Executor):
                 process.join()
 
 
-def _work(line: Connection) -> None:
+def _serve_items(line: Connection) -> None:
     """Run items from a pipe until its other end is closed, or the parent ends, even if that was killed; no Ctrl-C."""
     import multiprocessing
 
@@ -516,7 +521,7 @@ def _run(
 
     try:
         while rest or suspects or waiting:
-            raise_if_asked()
+            raise_if_interrupted()
             if alone := not waiting and not rest:
                 submit(suspects.popleft())
             while rest and len(waiting) < ahead:
@@ -531,13 +536,13 @@ def _run(
                 else:
                     suspects.append(work)
                 continue
-            outcome = _settle(name, future)
+            outcome = _outcome_of(name, future)
             keep(outcome)
             if outcome.error == CLUSTER_LOST:  # nobody would answer: keep what has come, hand out nothing more
                 for other, (name, _) in waiting.items():
                     came = other.done()
                     other.cancel()
-                    keep(_settle(name, other) if came else Outcome(name, error=CLUSTER_LOST))
+                    keep(_outcome_of(name, other) if came else Outcome(name, error=CLUSTER_LOST))
                 for name, _ in rest:
                     keep(Outcome(name, error=CLUSTER_LOST))
                 return
@@ -546,7 +551,7 @@ def _run(
             future.cancel()
         for future, (name, _) in waiting.items():
             if future.done() and not future.cancelled() and not isinstance(future.exception(), BrokenExecutor):
-                keep(_settle(name, future))
+                keep(_outcome_of(name, future))
         if workers is not None:
             workers.stop()
         raise
@@ -560,7 +565,7 @@ def _attempt(function: Callable[[Item], Result], name: str, item: Item) -> Outco
         return Outcome(name, error=one_line(error))
 
 
-def _settle(name: str, future: Future[Outcome[Result]]) -> Outcome[Result]:
+def _outcome_of(name: str, future: Future[Outcome[Result]]) -> Outcome[Result]:
     """Read the outcome of a finished future; a lost worker or a result that cannot be sent is the item's error."""
     try:
         return future.result()

@@ -14,29 +14,29 @@ import click
 
 from tactile_bayes import __version__
 from tactile_bayes.errors import EXIT_FAULT, EXIT_INTERRUPTED, EXIT_READER_GONE, EXIT_USAGE, TactileBayesError
-from tactile_bayes.shell import ReaderGoneError, ended_in_order, protect_streams, release_streams
+from tactile_bayes.shell import ReaderGoneError, interrupt_on_signals, protect_streams, release_streams
 
 _HYPHEN = "\ue000"  # Stands for one while lines are broken: "--array-calibration" is a word to copy.
 
 
-class WholeWords(click.HelpFormatter):
+class UnbrokenHelp(click.HelpFormatter):
     """Help whose lines do not break at hyphens."""
 
     def write(self, string: str) -> None:
         super().write(string.replace(_HYPHEN, "-"))
 
     def write_text(self, text: str) -> None:
-        super().write_text(_joined(text))
+        super().write_text(_unbroken(text))
 
     def write_dl(self, rows: Iterable[tuple[str, str]], col_max: int = 30, col_spacing: int = 2) -> None:
-        super().write_dl([(_joined(word), _joined(told)) for word, told in rows], col_max, col_spacing)
+        super().write_dl([(_unbroken(word), _unbroken(told)) for word, told in rows], col_max, col_spacing)
 
 
-def _joined(text: str) -> str:
+def _unbroken(text: str) -> str:
     return re.sub(r"(?<=[\w-])-(?=\w)|(?<!\S)-(?=[\w-])", _HYPHEN, text)
 
 
-click.Context.formatter_class = WholeWords
+click.Context.formatter_class = UnbrokenHelp
 
 # group -> name -> (function in a module under tactile_bayes.commands, imported when it runs; one line of help)
 GROUPS: dict[str, dict[str, tuple[str, str]]] = {
@@ -135,7 +135,7 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     protect_streams()
     try:
-        with ended_in_order():
+        with interrupt_on_signals():
             status = _run()
     except KeyboardInterrupt:  # once more, while the first was answered
         status = EXIT_INTERRUPTED
@@ -154,7 +154,7 @@ def _run() -> int:
         click.echo(f"interrupted: {told}" if told else "interrupted", err=True)
         return EXIT_INTERRUPTED
     except click.ClickException as error:
-        _show(error)
+        _print_error(error)
         return error.exit_code
     except TactileBayesError as error:
         click.echo(f"error: {error}", err=True)
@@ -177,7 +177,7 @@ _CLICK_WORDS = {
 }
 
 
-def _show(error: click.ClickException) -> None:
+def _print_error(error: click.ClickException) -> None:
     """Print an error of the words on the command line, in one line as all others; without any words, the help."""
     context = error.ctx if isinstance(error, click.UsageError) else None
     if type(error).__name__ == "NoArgsIsHelpError":  # of click 8.2 and later

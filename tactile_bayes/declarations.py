@@ -9,7 +9,7 @@ A declaration gives a field its type, range and meaning::
         radius_mm: Annotated[float, Meta(gt=0)] | None = None  #: Of the arc across the head.
 
 Schemas take the meaning from there. That of an option, which a command's help has, is a text among its rules:
-``every: Annotated[int, Meta(ge=1), "Use one frame of every N."] = 1``; `says` says that of a kind of value.
+``every: Annotated[int, Meta(ge=1), "Use one frame of every N."] = 1``; `described` says that of a kind of value.
 `from_plain` makes one of what JSON or TOML held, `to_plain` the reverse; docs/record_schema.py makes the schemas in
 data_schema/. Files go through `files.documents.read_record`, which first refuses doubled keys, huge numbers and depth.
 Arrays are nested lists in files; `geometry.Vector` and `geometry.Matrix` declare them. A range belongs to its own
@@ -36,7 +36,7 @@ from msgspec import Meta as Meta
 from msgspec import UnsetType as UnsetType
 from msgspec import field as field
 
-from tactile_bayes.errors import BadDataError, UsageError, meant, number_words
+from tactile_bayes.errors import BadDataError, UsageError, number_words, suggestion
 
 T = TypeVar("T")
 EXACT: Final = 17  #: Significant digits that give a float back as it was.
@@ -67,11 +67,11 @@ class Record(_Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     def __repr__(self) -> str:
-        values = (f"{name}={_short(getattr(self, name))}" for name in self.__struct_fields__)
+        values = (f"{name}={_value_repr(getattr(self, name))}" for name in self.__struct_fields__)
         return f"{type(self).__qualname__}({', '.join(values)})"
 
 
-def says(meaning: str, **rules: Any) -> Meta:
+def described(meaning: str, **rules: Any) -> Meta:
     """What a field means, with its range and more."""
     return Meta(description=meaning, **rules)
 
@@ -79,18 +79,18 @@ def says(meaning: str, **rules: Any) -> Meta:
 class Options(Record):
     """Options of a command or function: a value that its declaration does not allow is a `UsageError`, also in Python.
 
-    What the command line needs besides stands in a field's ``extra``, see `commands.options.takes`.
+    What the command line needs besides stands in a field's ``extra``, see `commands.options.record_options`.
     """
 
     def __post_init__(self) -> None:
-        for name, kind in kinds(type(self)).items():
+        for name, kind in field_types(type(self)).items():
             value = getattr(self, name)
-            if _refused(kind, value, exact=True) is not None:
+            if _refusal(kind, value, exact=True) is not None:
                 fault = _fault(kind, value, name)
                 raise UsageError(f"{fault.what}; {fault.way_out}")
 
 
-def kinds(record: Any) -> Mapping[str, Any]:
+def field_types(record: Any) -> Mapping[str, Any]:
     """What is declared for each field of a record."""
     return {part.name: part.type for part in _fields(record)}
 
@@ -107,7 +107,7 @@ def default_of(record: Any, name: str) -> Any:
     return None if part.default is msgspec.NODEFAULT else part.default
 
 
-def value_kind(kind: Any) -> Any:
+def value_type(kind: Any) -> Any:
     """What a value is that somebody gives: the declaration without None, range and meaning."""
     members = [one for one in _members(kind) if one is not type(None)]
     return _bare(members[0] if len(members) == 1 else kind)
@@ -121,7 +121,7 @@ def range_of(kind: Any) -> tuple[Any, Any, tuple[str, ...]]:
 
 
 def meaning_of(kind: Any) -> str:
-    """What a declaration says that it means, in a text or by `says`."""
+    """What a declaration says that it means, in a text or by `described`."""
     texts = [one for one in getattr(kind, "__metadata__", ()) if isinstance(one, str)]
     return texts[0] if texts else str(_rules(kind).get("description", ""))
 
@@ -132,7 +132,7 @@ def extra_of(kind: Any) -> Mapping[str, Any]:
     return found
 
 
-def part_of(record: Any, names: Sequence[str], meaning: str) -> Any:
+def subrecord(record: Any, names: Sequence[str], meaning: str) -> Any:
     """A record of some fields of another, with this docstring: of a file that holds no others."""
     fields = [(part.name, part.type, part.default) for part in _fields(record) if part.name in names]
     fields.sort(key=lambda one: names.index(one[0]))
@@ -140,7 +140,7 @@ def part_of(record: Any, names: Sequence[str], meaning: str) -> Any:
     return msgspec.defstruct(name, fields, bases=(Record,), namespace={"__doc__": meaning}, frozen=True, kw_only=True)
 
 
-def settle(record: Any, **values: Any) -> None:
+def set_fields(record: Any, **values: Any) -> None:
     """Set fields of a record in its ``__post_init__``, such as an array that was checked; never later."""
     for name, value in values.items():
         msgspec.structs.force_setattr(record, name, value)
@@ -154,19 +154,19 @@ def names_of(kind: Any) -> tuple[str, ...]:
 
 def as_dict(record: Any) -> dict[str, Any]:
     """A record's values by name, those of records and data classes in it too; for what JSON holds see `to_plain`."""
-    return {name: _each(getattr(record, name), _unfolded) for name in names_of(record)}
+    return {name: _map_values(getattr(record, name), _value_as_dict) for name in names_of(record)}
 
 
-def _unfolded(value: Any) -> Any:
+def _value_as_dict(value: Any) -> Any:
     return as_dict(value) if isinstance(value, msgspec.Struct) or dataclasses.is_dataclass(value) else value
 
 
-def _each(value: Any, changed: Callable[[Any], Any], *, lists: bool = False) -> Any:
+def _map_values(value: Any, changed: Callable[[Any], Any], *, lists: bool = False) -> Any:
     """A value, or each in dictionaries, lists and tuples, `changed`; with `lists` tuples become lists."""
     if isinstance(value, dict):
-        return {key: _each(one, changed, lists=lists) for key, one in value.items()}
+        return {key: _map_values(one, changed, lists=lists) for key, one in value.items()}
     if type(value) in (list, tuple):
-        return (list if lists else type(value))(_each(one, changed, lists=lists) for one in value)
+        return (list if lists else type(value))(_map_values(one, changed, lists=lists) for one in value)
     return changed(value)
 
 
@@ -184,23 +184,23 @@ def from_plain(kind: type[T], document: object, *, where: str = "") -> T:
 def _converted(kind: type[T], document: object) -> T:
     """A record of plain data, in which 200.0 is a whole number, as it is to a schema."""
     try:
-        return msgspec.convert(document, kind, dec_hook=_custom)
+        return msgspec.convert(document, kind, dec_hook=_decode_value)
     except msgspec.ValidationError:
-        return msgspec.convert(_each(document, _whole), kind, dec_hook=_custom)
+        return msgspec.convert(_map_values(document, _whole), kind, dec_hook=_decode_value)
 
 
 def _whole(value: object) -> object:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def check(record: Record, where: str = "") -> None:
+def check_record(record: Record, where: str = "") -> None:
     """Hold a record that was made in Python against its declaration; for the errors see `from_plain`."""
     from_plain(type(record), to_plain(record, digits=17), where=where)
 
 
 def to_plain(record: object, *, digits: int = 9) -> Any:
     """Plain data of a record for JSON: arrays as nested lists, floats with this many significant digits."""
-    return rounded(msgspec.to_builtins(record, enc_hook=_lists, str_keys=True), digits, lists=True)
+    return rounded(msgspec.to_builtins(record, enc_hook=_encode_array, str_keys=True), digits, lists=True)
 
 
 def rounded(value: T, digits: int = 9, *, lists: bool = False) -> T:
@@ -211,17 +211,17 @@ def rounded(value: T, digits: int = 9, *, lists: bool = False) -> T:
             return type(one)(**{name: rounded(getattr(one, name), digits) for name in one.__struct_fields__})
         return float(f"{one:.{digits}g}") if isinstance(one, float) else one
 
-    found: T = _each(value, short, lists=lists)
+    found: T = _map_values(value, short, lists=lists)
     return found
 
 
 def schema_name(kind: Any) -> str | None:
     """The value that the key ``schema`` of a record's files has; None where they have none."""
-    declared = _bare(kinds(kind).get("schema")) if _is_record(kind) else None
+    declared = _bare(field_types(kind).get("schema")) if _is_record(kind) else None
     return str(get_args(declared)[0]) if get_origin(declared) is Literal else None
 
 
-def _short(value: Any) -> str:
+def _value_repr(value: Any) -> str:
     """A value's repr; for arrays and long values their kind with shape or length: no draws are printed."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return repr(value) if value.shape == () else f"<array {'x'.join(map(str, value.shape))}>"
@@ -231,7 +231,7 @@ def _short(value: Any) -> str:
     return f"<{kind} of {len(value)}>" if hasattr(value, "__len__") else f"<{kind}>"
 
 
-def _custom(kind: Any, value: object) -> object:
+def _decode_value(kind: Any, value: object) -> object:
     """A path of a text, or an array of nested lists of numbers, for a field that is declared as one."""
     if kind is Path:
         if value and isinstance(value, str | Path):
@@ -255,7 +255,7 @@ def _custom(kind: Any, value: object) -> object:
         ) from None
 
 
-def _lists(value: object) -> object:
+def _encode_array(value: object) -> object:
     if hasattr(value, "tolist"):
         return value.tolist()
     raise NotImplementedError(f"no way to write a {type(value)}")
@@ -271,28 +271,28 @@ def _fault(kind: Any, value: Any, where: str) -> BadDataError:
         found = _key_at_fault(record, value, where)
         if found:
             return found
-    for part, of_part, one in _parts(kind if record is None else record, value, where):
-        if _refused(of_part, one) is not None:
+    for part, of_part, one in _parts_of(kind if record is None else record, value, where):
+        if _refusal(of_part, one) is not None:
             return _fault(of_part, one, part)
-    why = _refused(kind, value)
+    why = _refusal(kind, value)
     name = where or "the document"
     if isinstance(why, BadDataError):  # of a record's own rules, or of an array
-        what = _of_rule(where, why.what, record) if why.what else f"{name} is {shown(value)}"
+        what = _rule_text(where, why.what, record) if why.what else f"{name} is {short_repr(value)}"
         return BadDataError(what, way_out=why.way_out)
-    return BadDataError(f"{name} is {shown(value)}", way_out=_way_out(kind, value))
+    return BadDataError(f"{name} is {short_repr(value)}", way_out=_way_out(kind, value))
 
 
-def _of_rule(where: str, what: str, record: Any) -> str:
+def _rule_text(where: str, what: str, record: Any) -> str:
     """What a rule of a record or an array's form is broken by, with its place."""
     if not where or record is None:
         return f"{where} {what}".strip()
     return f"{where}.{what}" if what.split(" ")[0] in record.__struct_fields__ else f"{where}: {what}"
 
 
-def _refused(kind: Any, value: Any, *, exact: bool = False) -> Exception | None:
+def _refusal(kind: Any, value: Any, *, exact: bool = False) -> Exception | None:
     """Why a value is none of its kind, or with `exact` would have to be made one, as 3.0 a whole number; else None."""
     try:
-        msgspec.convert(value, kind, dec_hook=_custom) if exact else _converted(kind, value)
+        msgspec.convert(value, kind, dec_hook=_decode_value) if exact else _converted(kind, value)
     except msgspec.ValidationError as error:
         return error.__cause__ if isinstance(error.__cause__, BadDataError) else error
     return None if _finite(value) else ValueError("no finite number")
@@ -311,12 +311,12 @@ def _key_at_fault(record: Any, value: Mapping[str, Any], where: str) -> BadDataE
     known = [*([config.tag_field] if config.tag_field else []), *fields]
     for key in value if config.forbid_unknown_fields else ():
         if key not in known:
-            return BadDataError(f"{_joined(where, _shown_key(key))} is not known", way_out=meant(str(key), known))
+            return BadDataError(f"{_joined(where, _shown_key(key))} is not known", way_out=suggestion(str(key), known))
     missing = [name for name, part in fields.items() if part.required and name not in value]
     return BadDataError(f"{where or 'the document'} has no {missing[0]}", way_out="add it") if missing else None
 
 
-def _parts(kind: Any, value: Any, where: str) -> Iterator[tuple[str, Any, Any]]:
+def _parts_of(kind: Any, value: Any, where: str) -> Iterator[tuple[str, Any, Any]]:
     """Parts of a value with the place, the kind that is declared for it, and the part."""
     if isinstance(value, dict):
         if _is_record(kind):
@@ -326,7 +326,7 @@ def _parts(kind: Any, value: Any, where: str) -> Iterator[tuple[str, Any, Any]]:
         for of_key, of_value in (
             get_args(one) for one in map(_bare, _members(kind)) if get_origin(one) in (dict, Mapping)
         ):
-            yield from ((_joined(where, f"key {shown(key)}"), of_key, key) for key in value)
+            yield from ((_joined(where, f"key {short_repr(key)}"), of_key, key) for key in value)
             yield from ((_joined(where, _shown_key(key)), of_value, one) for key, one in value.items())
     if isinstance(value, list | tuple):
         for one in map(_bare, _members(kind)):
@@ -378,9 +378,9 @@ def _way_out(kind: Any, value: Any) -> str:
         names = ", ".join(str(one.__struct_config__.tag) for one in forms)
         return f"give as its {forms[0].__struct_config__.tag_field} one of {names}"
     choices = [str(one) for form in map(_bare, members) if get_origin(form) is Literal for one in get_args(form)]
-    if isinstance(value, str) and len(choices) > 1 and (near := meant(value, choices)).startswith("did"):
+    if isinstance(value, str) and len(choices) > 1 and (near := suggestion(value, choices)).startswith("did"):
         return f"{near} Give one of {', '.join(choices)}"
-    return f"give {' or '.join(dict.fromkeys(_in_words(one) for one in members))}"
+    return f"give {' or '.join(dict.fromkeys(_kind_words(one) for one in members))}"
 
 
 _KINDS: Final[Mapping[Any, str]] = {
@@ -394,7 +394,7 @@ _KINDS: Final[Mapping[Any, str]] = {
 }
 
 
-def _in_words(kind: Any) -> str:
+def _kind_words(kind: Any) -> str:
     """A single kind with its range."""
     bare, rules = _bare(kind), _rules(kind)
     origin, args = get_origin(bare) or bare, get_args(bare)
@@ -403,7 +403,7 @@ def _in_words(kind: Any) -> str:
     if origin in (int, float):
         return number_words(*range_of(kind), whole=origin is int)
     if origin is str:
-        return _texts(rules)
+        return _text_words(rules)
     if origin is tuple and args[-1] is not Ellipsis:
         return f"a list of {len(args)}"
     if origin in (list, tuple):
@@ -413,7 +413,7 @@ def _in_words(kind: Any) -> str:
     return "a table of keys" if _is_record(bare) else _KINDS.get(origin, "a list of numbers")
 
 
-def _texts(rules: Mapping[str, Any]) -> str:
+def _text_words(rules: Mapping[str, Any]) -> str:
     """A text's rule: its own words (``extra={"words": ...}``) or its meaning, for a pattern is nothing for people."""
     if "words" in rules.get("extra", {}):
         return str(rules["extra"]["words"])
@@ -442,10 +442,10 @@ def _joined(where: str, key: object) -> str:
 
 def _shown_key(key: object) -> str:
     text = str(key)
-    return text if text.isidentifier() and len(text) <= 60 else shown(key)
+    return text if text.isidentifier() and len(text) <= 60 else short_repr(key)
 
 
-def shown(value: object) -> str:
+def short_repr(value: object) -> str:
     """A value as an error shows it, in up to 60 characters."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -88,7 +88,7 @@ def number_words(least: float | None, most: float | None, open_ends: Collection[
     return f"a {'whole ' if whole else ''}number{told}"
 
 
-def meant(name: str, known: Collection[str]) -> str:
+def suggestion(name: str, known: Collection[str]) -> str:
     """The way out for a name that is not known: that of another unit, the one that was probably meant, or all."""
     lower = {one.lower(): one for one in known}
     stem = _without_unit(name)
@@ -137,8 +137,8 @@ class BadDataError(TactileBayesError, ValueError):
         text = f"{head}; {_shortened(self.way_out)}" if self.way_out else head
         return "\\n".join(text.splitlines())  # names and values from a file may hold newlines
 
-    def at(self, path: object) -> BadDataError:
-        """The same error, naming the file it was found in."""
+    def with_path(self, path: object) -> BadDataError:
+        """The same error with the path of its file, unless it has one."""
         return type(self)(self.what, way_out=self.way_out, path=self.path or str(path))
 
 
@@ -148,7 +148,7 @@ def in_file(path: object) -> Iterator[None]:
     try:
         yield
     except BadDataError as error:
-        raise error.at(path) from None
+        raise error.with_path(path) from None
 
 
 class DeviceError(TactileBayesError):

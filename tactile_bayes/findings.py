@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Final, Literal, get_args
 
-from tactile_bayes.declarations import Record, from_plain, replace, settle
+from tactile_bayes.declarations import Record, from_plain, replace, set_fields
 from tactile_bayes.errors import BadDataError
 
 Severity = Literal["caution", "check"]
@@ -77,9 +77,9 @@ class Finding(Record):
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise BadDataError(f"finding of unknown kind {self.kind!r}", way_out=f"one of {', '.join(KINDS)}")
-        settle(self, severity=KINDS[self.kind])
+        set_fields(self, severity=KINDS[self.kind])
 
-    def at(self, about: str) -> Finding:
+    def labelled(self, about: str) -> Finding:
         """The same finding, about one of several maps or visits."""
         return replace(self, about=f"{about}, {self.about}" if self.about else about)
 
@@ -95,7 +95,7 @@ def finding(kind: str, text: str, remedy: str = "", on_paper: str = "", about: s
     return Finding(KINDS.get(kind, "check"), kind, text, remedy, on_paper, about)
 
 
-def by_weight(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Cautions before checks, otherwise in their order, each once."""
     each = list(dict.fromkeys(findings))
     return tuple(sorted(each, key=lambda one: one.severity != "caution"))
@@ -110,17 +110,17 @@ def verdict(findings: Iterable[Finding], *, answered: bool) -> Verdict:
 
 def finding_lines(findings: Iterable[Finding], severity: Severity | None = None, *, paper: bool = False) -> list[str]:
     """A line for each finding, cautions first; of one severity where it is given."""
-    shown = [one for one in by_weight(findings) if severity in (None, one.severity)]
+    shown = [one for one in by_severity(findings) if severity in (None, one.severity)]
     return [f"{LEADS[one.severity]}{one.sentence(paper=paper)}." for one in shown]
 
 
 def finding_summary(findings: Iterable[Finding], severity: Severity, *, most: int) -> list[str]:
     """The first findings of one severity in one line that counts the others; empty without any."""
-    texts = [one.sentence() for one in by_weight(findings) if one.severity == severity]
-    return joined(texts, most=most, lead=LEADS[severity])
+    texts = [one.sentence() for one in by_severity(findings) if one.severity == severity]
+    return first_texts(texts, most=most, lead=LEADS[severity])
 
 
-def joined(texts: Sequence[str], *, most: int, lead: str) -> list[str]:
+def first_texts(texts: Sequence[str], *, most: int, lead: str) -> list[str]:
     """The first texts in one line after `lead`, which counts the others; empty without any."""
     more = f" (and {len(texts) - most} more)" if len(texts) > most else ""
     return [f"{lead}{'; '.join(texts[:most])}{more}."] if texts else []
@@ -131,6 +131,6 @@ def findings_in(listed: object) -> tuple[Finding, ...]:
     return from_plain(tuple[Finding, ...], listed, where="findings")
 
 
-def capital(text: str) -> str:
+def capitalised(text: str) -> str:
     """A text that begins a sentence."""
     return f"{text[0].upper()}{text[1:]}"

@@ -1,7 +1,7 @@
 """Options declared once: type, range, meaning and default stand at a field, and the rest comes from there.
 
-Click options (`commands.options.takes`), keywords and checks of Python, the settings file with its schema, and the
-settings of a provenance are made of these records.
+Click options (`commands.options.record_options`), keywords and checks of Python, the settings file with its schema, and
+the settings of a provenance are made of these records.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Annotated, Any, Final, Literal
 from tactile_bayes import presets
 from tactile_bayes.declarations import Meta, Options
 from tactile_bayes.errors import UsageError
-from tactile_bayes.presets import Background, Method, Noise, Normalise, Rotation, SceneAsked, TrackerProtocol
+from tactile_bayes.presets import Background, Method, Noise, Normalise, Rotation, SceneName, TrackerProtocol
 
 
 class BumpPrior(Options):
@@ -42,7 +42,7 @@ MOST_ITEMS: Final = 1_000_000  #: Of a batch: memory holds a name and an outcome
 IN_FILE: Final = Meta(extra={"file": True})  #: Of a setting in the file of `--settings`, not on the command line.
 
 
-def named(metavar: str, *, option: str = "", also: str = "", **rules: Any) -> Meta:
+def cli_meta(metavar: str, *, option: str = "", also: str = "", **rules: Any) -> Meta:
     """Rules of an option whose value has a name in the help.
 
     `option` and `also` name it on the command line, if not by its field, and a second time.
@@ -51,8 +51,8 @@ def named(metavar: str, *, option: str = "", also: str = "", **rules: Any) -> Me
     return Meta(extra={name: value for name, value in held.items() if value}, **rules)
 
 
-Above0 = Annotated[float, Meta(gt=0)]
-Least0 = Annotated[float, Meta(ge=0)]
+Positive = Annotated[float, Meta(gt=0)]
+NonNegative = Annotated[float, Meta(ge=0)]
 FieldCosines = Annotated[int, Meta(ge=6, le=presets.MOST_FIELD_COSINES)] | Literal["auto"]
 
 
@@ -70,7 +70,7 @@ class FitSettings(BumpPrior, kw_only=True):
         "not known (normalise none)",
     ] = None
     fit_radius_mm: Annotated[
-        Above0 | None, IN_FILE, "Radius of the fitted window. Default: the calibration's, else 20"
+        Positive | None, IN_FILE, "Radius of the fitted window. Default: the calibration's, else 20"
     ] = None
     rotation: Annotated[
         Rotation,
@@ -79,7 +79,7 @@ class FitSettings(BumpPrior, kw_only=True):
     ] = "auto"
     centre_mm: Annotated[
         tuple[float, float] | None,
-        named("X Y"),
+        cli_meta("X Y"),
         "Place on the map to measure. Default: the highest bump that can be a lump.",
     ] = None
     noise: Annotated[
@@ -104,7 +104,7 @@ class FitSettings(BumpPrior, kw_only=True):
         IN_FILE,
         "Wanted Monte-Carlo error of interval ends, in mm; the finer of this and --accuracy-sd holds",
     ] = None
-    scene: Annotated[SceneAsked, "Structures in the fit window; auto: the simplest scene that the map supports."] = (
+    scene: Annotated[SceneName, "Structures in the fit window; auto: the simplest scene that the map supports."] = (
         "auto"
     )
     max_steps: Annotated[
@@ -127,19 +127,19 @@ class MapOptions(Options):
 
     cell_mm: Annotated[float, Meta(ge=0.01, le=50), "Side of the square cells, mm."] = presets.CELL_MM
     pressure_window_kpa: Annotated[
-        tuple[Least0, Least0], named("LOW HIGH"), "Leave out frames whose mean pressure lies outside."
+        tuple[NonNegative, NonNegative], cli_meta("LOW HIGH"), "Leave out frames whose mean pressure lies outside."
     ] = presets.PRESSURE_WINDOW_KPA
     normalise: Annotated[
         Normalise, "gain: estimate one gain per frame; mean: divide each frame by its mean (the paper); none: keep kPa."
     ] = presets.DEFAULT_NORMALISE
     latency_ms: Annotated[
         Annotated[float, Meta(ge=-10_000, le=10_000)] | Literal["auto"],
-        named("MS|auto"),
+        cli_meta("MS|auto"),
         "Delay of the tracker's time stamps; auto: estimate it from the scan, or refuse.",
     ] = 0.0
     plane_radius_mm: Annotated[
-        Above0 | Literal["auto", "all"],
-        named("MM|auto|all"),
+        Positive | Literal["auto", "all"],
+        cli_meta("MM|auto|all"),
         "Fit the plane to frames within this distance of the mass; auto: those whose array can reach it.",
     ] = "all"
     flat_field: Annotated[bool, "Remove the head's own response, measured on frames without a lump."] = False
@@ -150,7 +150,7 @@ class MapOptions(Options):
         "scan is refused.",
     ] = False
     every: Annotated[
-        int, named("N", ge=1), "Use one frame of every N: quicker, and noisier; `tradeoff map` measures both."
+        int, cli_meta("N", ge=1), "Use one frame of every N: quicker, and noisier; `tradeoff map` measures both."
     ] = 1
 
     def __post_init__(self) -> None:
@@ -166,11 +166,11 @@ class MapOptions(Options):
             )
 
 
-GROWN_BY: Final = (0.2,)
+GROWTH_SHARES: Final = (0.2,)
 """Shares of the diameter that a growth's probability is told for; 20 % is the step of RECIST 1.1."""
 
 
-class Comparing(Options):
+class CompareOptions(Options):
     """How visits are compared."""
 
     days: Annotated[
@@ -178,7 +178,7 @@ class Comparing(Options):
     ] = None
     grown_by: Annotated[
         tuple[Annotated[float, Meta(gt=-1, lt=10)], ...], "Shares of the diameter by which it may have grown or more."
-    ] = GROWN_BY
+    ] = GROWTH_SHARES
     same_mass: Annotated[
         bool, "Say that the visits are of one mass where landmarks are missing, or place it too far apart."
     ] = False
@@ -247,12 +247,12 @@ class PlanOptions(Options, kw_only=True):
     ] = (1, 3, 5)
     power: Annotated[
         Annotated[float, Meta(ge=0.5, le=0.99)] | None,
-        named("SHARE"),
+        cli_meta("SHARE"),
         "Find the number of patients that reaches this power, such as 0.9.",
     ] = None
     precision: Annotated[
         Annotated[float, Meta(ge=1.05, le=10)] | None,
-        named("FACTOR"),
+        cli_meta("FACTOR"),
         "Find the number of patients whose interval of the tactile error spans this factor from end to end, such as 2.",
     ] = None
     against: Annotated[str, "Modality of the pilot to compare with."] = "ultrasound"
@@ -261,8 +261,8 @@ class PlanOptions(Options, kw_only=True):
     workers: Workers = 1
 
     @property
-    def wanted(self) -> dict[Aim, float]:
-        """What was given."""
+    def targets(self) -> dict[Aim, float]:
+        """The power and precision to reach, those that are set."""
         each: dict[Aim, float | None] = {"power": self.power, "precision": self.precision}
         return {aim: target for aim, target in each.items() if target is not None}
 
@@ -270,30 +270,34 @@ class PlanOptions(Options, kw_only=True):
 class CampaignOptions(Options, kw_only=True):
     """How the exams of a table are mapped and matched, and what is done with them."""
 
-    excision: Annotated[Path | None, named("EX.csv"), "Sizes measured after excision: adds the trial's report."] = None
-    columns: Annotated[
-        Path | None, named("MAP.toml"), "Layout of a wide EX.csv: which column holds what, in which unit."
-    ] = None
-    protocol: Annotated[Path | None, named("FILE.toml"), "Pre-specified analysis of the trial, as for `validate`."] = (
+    excision: Annotated[Path | None, cli_meta("EX.csv"), "Sizes measured after excision: adds the trial's report."] = (
         None
     )
+    columns: Annotated[
+        Path | None, cli_meta("MAP.toml"), "Layout of a wide EX.csv: which column holds what, in which unit."
+    ] = None
+    protocol: Annotated[
+        Path | None, cli_meta("FILE.toml"), "Pre-specified analysis of the trial, as for `validate`."
+    ] = None
     normalise: Annotated[Normalise, "As `map`."] = presets.DEFAULT_NORMALISE
     match_mm: Annotated[
         float,
-        named("MM", gt=0),
+        cli_meta("MM", gt=0),
         "Distance within which a mass is the one that another exam of the breast names by place.",
     ] = presets.MATCH_MM
     figures: Annotated[bool, "Draw map and size posterior of each exam."] = False
     dry_run: Annotated[bool, "Print what would be done, and do nothing."] = False
     copy_to: Annotated[
-        str | None, named("s3://BUCKET/FOLDER"), "Copy every file into this folder of an object store, step by step."
+        str | None, cli_meta("s3://BUCKET/FOLDER"), "Copy every file into this folder of an object store, step by step."
     ] = None
     workers: Workers = 1
-    scheduler: Annotated[str | None, named("ADDRESS"), "Send the exams to a dask scheduler (extra [cluster])."] = None
+    scheduler: Annotated[str | None, cli_meta("ADDRESS"), "Send the exams to a dask scheduler (extra [cluster])."] = (
+        None
+    )
 
 
-PersonName = Annotated[str, named("FAMILY^GIVEN", max_length=194)]
-DayText = Annotated[str, named("DATE", max_length=25)]
+PersonName = Annotated[str, cli_meta("FAMILY^GIVEN", max_length=194)]
+DayText = Annotated[str, cli_meta("DATE", max_length=25)]
 
 
 class IdentityOptions(Options):
@@ -304,18 +308,20 @@ class IdentityOptions(Options):
     """
 
     patient_id: Annotated[
-        str, named("ID", max_length=64), "Patient ID; in csv files the beginning of the record ID."
+        str, cli_meta("ID", max_length=64), "Patient ID; in csv files the beginning of the record ID."
     ] = ""
     patient_name: Annotated[PersonName, "Patient's name: FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX."] = ""
-    birth_date: Annotated[str, named("YYYY-MM-DD", max_length=10), "Patient's date of birth: YYYY-MM-DD."] = ""
-    sex: Annotated[Literal["F", "M", "O", ""], named("F|M|O"), "Patient's sex: F, M or O."] = ""
-    issuer: Annotated[str, named("NAME", max_length=64), "Who issued the patient ID."] = ""
-    accession: Annotated[str, named("NUMBER", max_length=16), "Accession number."] = ""
+    birth_date: Annotated[str, cli_meta("YYYY-MM-DD", max_length=10), "Patient's date of birth: YYYY-MM-DD."] = ""
+    sex: Annotated[Literal["F", "M", "O", ""], cli_meta("F|M|O"), "Patient's sex: F, M or O."] = ""
+    issuer: Annotated[str, cli_meta("NAME", max_length=64), "Who issued the patient ID."] = ""
+    accession: Annotated[str, cli_meta("NUMBER", max_length=16), "Accession number."] = ""
     referring_physician: Annotated[PersonName, "Referring physician's name, likewise."] = ""
-    study_id: Annotated[str, named("ID", max_length=16), "Study ID."] = ""
-    study_description: Annotated[str, named("TEXT", max_length=64), "Study description."] = ""
+    study_id: Annotated[str, cli_meta("ID", max_length=16), "Study ID."] = ""
+    study_description: Annotated[str, cli_meta("TEXT", max_length=64), "Study description."] = ""
     study_uid: Annotated[
-        str, named("UID", max_length=64), "Study Instance UID. Default: one that follows from the content of the maps."
+        str,
+        cli_meta("UID", max_length=64),
+        "Study Instance UID. Default: one that follows from the content of the maps.",
     ] = ""
     study_date: Annotated[DayText, "Date of the exam: YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the zone."] = ""
     content_date: Annotated[DayText, "Date at which the content was made. Default: the exam's."] = ""
@@ -333,59 +339,61 @@ class RecordOptions(Options, kw_only=True):
     output: Path
     head_url: str
     tracker_url: Annotated[
-        str | None, named("URL", option="tracker"), "Port of the tracker; without, there are no poses."
+        str | None, cli_meta("URL", option="tracker"), "Port of the tracker; without, there are no poses."
     ] = None
     tracker_protocol: Annotated[TrackerProtocol, "Protocol of the tracker; a PATRIOT speaks liberty."] = "fastrak"
     head_baud: Annotated[Baud, "Baud rate of the head's port."] = 2_000_000
     tracker_baud: Annotated[Baud | None, "Baud rate of the tracker's port. Default: the protocol's."] = None
-    tracker_rom: Annotated[tuple[Path, ...], named("ROM"), "ndi: a wireless tool's description, one for each."] = ()
+    tracker_rom: Annotated[tuple[Path, ...], cli_meta("ROM"), "ndi: a wireless tool's description, one for each."] = ()
     tool: Annotated[
-        str | None, named("NAME", also="station"), "Tool or station on the head, needed where the tracker has several."
+        str | None,
+        cli_meta("NAME", also="station"),
+        "Tool or station on the head, needed where the tracker has several.",
     ] = None
     reference: Annotated[
-        str | None, named("NAME"), "Tool or station fixed to the body; poses relative to it are free of breathing."
+        str | None, cli_meta("NAME"), "Tool or station fixed to the body; poses relative to it are free of breathing."
     ] = None
     every: Annotated[int, Meta(ge=1, le=255), "Record every n-th frame only."] = 1
-    duration_s: Annotated[Above0 | None, named("S", option="duration"), "Stop after this time, s."] = None
+    duration_s: Annotated[Positive | None, cli_meta("S", option="duration"), "Stop after this time, s."] = None
     at_once: Annotated[bool, "Start at once, without waiting for space. Default: only with --duration."] = False
     clock: Annotated[
         Literal["arrival", "shared"], "Time the poses by their arrival, or trust one clock of both devices."
     ] = "arrival"
     invert_rotation: Annotated[bool, "The tracker gives the inverse rotation."] = False
-    like: Annotated[Path | None, named("SCAN.mcap"), "Take geometry and calibration from this scan."] = None
+    like: Annotated[Path | None, cli_meta("SCAN.mcap"), "Take geometry and calibration from this scan."] = None
     head_geometry: Annotated[
-        Path | None, named("HEAD.json"), "Positions of the taxels and of the tracker's sensor."
+        Path | None, cli_meta("HEAD.json"), "Positions of the taxels and of the tracker's sensor."
     ] = None
-    array_calibration: Annotated[Path | None, named("ARRAY.json"), "Array calibration, made by `calibrate array`."] = (
-        None
-    )
+    array_calibration: Annotated[
+        Path | None, cli_meta("ARRAY.json"), "Array calibration, made by `calibrate array`."
+    ] = None
     uncalibrated: Annotated[bool, "Record with the nominal gain: for bladder steps."] = False
     accept_calibration: Annotated[bool, "Accept an array calibration that is stale or of another head."] = False
     calibration_days: Annotated[float, Meta(ge=0), "Age from which an array calibration is stale, days."] = 1.0
-    landmarks: Annotated[Path | None, named("FILE"), "Take landmarks from a JSON file or a scan."] = None
+    landmarks: Annotated[Path | None, cli_meta("FILE"), "Take landmarks from a JSON file or a scan."] = None
     side: Annotated[Literal["left", "right", "phantom"] | None, "Breast that is scanned."] = None
     posture: Annotated[Literal["supine", "oblique", "sitting", "phantom"] | None, "Posture during the scan."] = None
-    lubricant: Annotated[str | None, named("TEXT"), "Lubricant on the skin."] = None
-    examiner: Annotated[str | None, named("CODE"), "A code, not a name."] = None
-    subject: Annotated[str | None, named("CODE"), "A code, not a name."] = None
+    lubricant: Annotated[str | None, cli_meta("TEXT"), "Lubricant on the skin."] = None
+    examiner: Annotated[str | None, cli_meta("CODE"), "A code, not a name."] = None
+    subject: Annotated[str | None, cli_meta("CODE"), "A code, not a name."] = None
     session_file: Annotated[
         Path | None,
-        named("SESSION.toml", option="session"),
+        cli_meta("SESSION.toml", option="session"),
         "Read these five, and other facts in plain text, from a file; an option overrides it.",
     ] = None
     live: Annotated[bool, "Draw the map on the terminal while it grows."] = False
     serve: Annotated[
-        str | None, named("HOST:PORT"), "Show the map in a browser on this computer, with a tone for the pressure."
+        str | None, cli_meta("HOST:PORT"), "Show the map in a browser on this computer, with a tone for the pressure."
     ] = None
     size_calibration: Annotated[
         str,
-        named("solid-mean|plane-strain|none|SIZE.json"),
+        cli_meta("solid-mean|plane-strain|none|SIZE.json"),
         "Size calibration of the live view, whose frames are divided by their means.",
     ] = "solid-mean"
     force: bool = False
 
 
-Span = tuple[Least0, Least0]  #: Begin and length, s.
+Span = tuple[NonNegative, NonNegative]  #: Begin and length, s.
 Share = Annotated[float, Meta(ge=0, le=1)]
 
 
@@ -394,15 +402,15 @@ class FaultOptions(Options):
 
     drop: Annotated[Share, "Share of the records that are not sent."] = 0.0
     corrupt: Annotated[Share, "Share of the records with one bit changed."] = 0.0
-    stall: Annotated[Span | None, named("AT FOR"), "Send nothing for FOR s from AT s on; those records are lost."] = (
-        None
-    )
-    disconnect_s: Annotated[Least0 | None, named("AT", option="disconnect"), "Disconnect at AT s."] = None
+    stall: Annotated[
+        Span | None, cli_meta("AT FOR"), "Send nothing for FOR s from AT s on; those records are lost."
+    ] = None
+    disconnect_s: Annotated[NonNegative | None, cli_meta("AT", option="disconnect"), "Disconnect at AT s."] = None
     hold: Annotated[int, Meta(ge=1), "Tracker: measure only every n-th pose."] = 1
-    hide: Annotated[Span | None, named("AT FOR"), "Tracker: its tool is out of sight for FOR s from AT s on."] = None
+    hide: Annotated[Span | None, cli_meta("AT FOR"), "Tracker: its tool is out of sight for FOR s from AT s on."] = None
     breathe_mm: Annotated[
         float,
-        named("MM", option="breathe", ge=0, le=100),
+        cli_meta("MM", option="breathe", ge=0, le=100),
         "Tracker: a second tool, Reference (or station 2), fixed to a body that breathes by MM; the first is Probe (or "
         "1).",
     ] = 0.0
@@ -422,7 +430,9 @@ class CaseOptions(Options, kw_only=True):
     fat_kpa: Annotated[float, Meta(gt=0), "Young's modulus of fat."] = presets.FAT_KPA
     poisson: Annotated[float, "Poisson's ratio of the tissues."] = presets.POISSON
     gland_ratio: Annotated[float, Meta(gt=0), "Modulus of gland over fat."] = presets.GLAND_RATIO
-    thickness_mm: Annotated[Above0 | None, "Depth of the chest wall, mm. Default: 70, or deeper for deep lumps."] = None
+    thickness_mm: Annotated[Positive | None, "Depth of the chest wall, mm. Default: 70, or deeper for deep lumps."] = (
+        None
+    )
     fineness: Annotated[int, Meta(ge=1, le=8), "Mesh fineness; doubling it halves the elements."] = 2
 
 
@@ -433,9 +443,9 @@ class StudyOptions(CaseOptions, kw_only=True):
         Literal["plane-strain", "solid"],
         "The paper's two-dimensional body, or balls under the whole head in three dimensions.",
     ] = "plane-strain"
-    grid: Annotated[str, named("paper|FILE"), "The paper's 150 cases, or a table of cases."] = "paper"
+    grid: Annotated[str, cli_meta("paper|FILE"), "The paper's 150 cases, or a table of cases."] = "paper"
     seat: Annotated[
-        str, named("centred|resting|0..2"), "How far the lump stands out of the gland, if a grid does not state it."
+        str, cli_meta("centred|resting|0..2"), "How far the lump stands out of the gland, if a grid does not state it."
     ] = "centred"
     head: Literal["shoulders-inside", "shoulders-outside"] | None = None
     background: Annotated[
@@ -447,17 +457,17 @@ class StudyOptions(CaseOptions, kw_only=True):
     ] = None
 
 
-KpaRange = tuple[Above0, Above0]
+KpaRange = tuple[Positive, Positive]
 
 
 class TissueOptions(Options, kw_only=True):
     """Homogeneous tissue under a head, the pressures on it, and how unevenly the head may press."""
 
-    modulus_kpa: Annotated[KpaRange, named("LOW HIGH"), "Young's moduli of the tissue (paper: 15 to 25)."] = (
+    modulus_kpa: Annotated[KpaRange, cli_meta("LOW HIGH"), "Young's moduli of the tissue (paper: 15 to 25)."] = (
         15.0,
         25.0,
     )
-    pressure_kpa: Annotated[KpaRange, named("LOW HIGH"), "Mean pressures under the head (paper: 5 to 14)."] = (
+    pressure_kpa: Annotated[KpaRange, cli_meta("LOW HIGH"), "Mean pressures under the head (paper: 5 to 14)."] = (
         presets.PRESSURE_WINDOW_KPA
     )
     thickness_mm: Annotated[
@@ -496,7 +506,7 @@ class SbcOptions(Options, kw_only=True):
         "Method of the posterior draws, as in `estimate`; ensemble takes about 20 times as long.",
     ] = "importance"
     field_cosines: Annotated[
-        FieldCosines, named("N|auto"), "Basis functions of the noise field, as field_cosines of `estimate`."
+        FieldCosines, cli_meta("N|auto"), "Basis functions of the noise field, as field_cosines of `estimate`."
     ] = "auto"
     seed: Seed = 1
 
@@ -524,7 +534,7 @@ class LearnOptions(Options, kw_only=True):
         "none.",
     ] = None
     fit_radius_mm: Annotated[
-        Above0 | None,
+        Positive | None,
         f"Radius of the table's fit windows, mm, if the table does not state it. Default: {presets.FIT_RADIUS_MM:g}.",
     ] = None
     noise: Annotated[

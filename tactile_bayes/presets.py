@@ -63,9 +63,11 @@ METHODS: Final[tuple[Method, ...]] = get_args(Method)
 Noise = Literal["independent", "field"]
 Background = Literal["fixed", "free"]
 Rotation = Literal["auto", "off", "on"]
-SceneAsked = Literal["auto", "none", "round", "ellipse", "rotated", "second-lump", "rib"]
+SceneName = Literal["auto", "none", "round", "ellipse", "rotated", "second-lump", "rib"]
 INTERVAL: Final = 0.95
-HELD: Final = 0.9  #: Probability of the intervals of a size calibration that are held against bodies left out.
+HELD_OUT_PROBABILITY: Final = (
+    0.9  #: Probability of the intervals of a size calibration that are held against bodies left out.
+)
 # Along each axis, of a map's noise field. Fewer are faster; what is finer than they resolve counts as independent.
 # A narrow bump gets more than these by itself, up to the second number.
 FIELD_COSINES: Final = 18

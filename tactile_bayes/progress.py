@@ -7,5 +7,5 @@ from collections.abc import Callable
 Progress = Callable[[int, int], None]  #: Called with what is done and how much there is.
 
 
-def untold(_done: int, _total: int) -> None:
+def no_progress(_done: int, _total: int) -> None:
     """Progress that nobody watches."""

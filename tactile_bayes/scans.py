@@ -9,7 +9,7 @@ from typing import Annotated, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import Meta, Record, field, settle
+from tactile_bayes.declarations import Meta, Record, field, set_fields
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray, check_rigid
@@ -172,7 +172,7 @@ class HeadGeometry(Record, eq=False):
             raise BadDataError(f"pitch_mm is {self.pitch_mm}", way_out="it must be positive, in mm")
         transform = _check_finite(self.scanhead_from_tracker, name="scanhead_from_tracker", shape=(4, 4))
         check_rigid(transform, name="scanhead_from_tracker")
-        settle(self, surface_mm=surface, scanhead_from_tracker=transform)
+        set_fields(self, surface_mm=surface, scanhead_from_tracker=transform)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -194,7 +194,7 @@ class ElementCalibration(Record, eq=False):
             index = tuple(int(i) for i in np.argwhere(gain < 0)[0])
             what = f"gain_kpa_per_count is negative at {index} ({gain[index]:.4g})"
             raise BadDataError(what, way_out="correct it, or calibrate anew")
-        settle(self, gain_kpa_per_count=gain, offset_kpa=offset)
+        set_fields(self, gain_kpa_per_count=gain, offset_kpa=offset)
 
     def linear_kpa(self, counts: CountArray | FloatArray) -> FloatArray:
         """Gain x (..., rows, columns) counts + offset, of saturated readings too."""
@@ -220,7 +220,7 @@ class PressureFrames(Record, eq=False):
             raise BadDataError(what, way_out="it must be uint16 (n, rows, columns), one frame per time")
         view = self.counts.view()
         view.flags.writeable = False
-        settle(self, time_s=time, counts=view)
+        set_fields(self, time_s=time, counts=view)
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -251,7 +251,7 @@ class TrackerPoses(Record, eq=False):
             i = int(off[0])
             what = f"quaternion_wxyz has norm {norm[i]:.4g} at index {i} ({len(off)} in all depart from 1 by over 1 %)"
             raise BadDataError(what, way_out="give unit quaternions, scalar first")
-        settle(self, time_s=time, position_mm=position, quaternion_wxyz=quaternion)
+        set_fields(self, time_s=time, position_mm=position, quaternion_wxyz=quaternion)
 
     def __len__(self) -> int:
         return len(self.time_s)
@@ -271,7 +271,7 @@ class Landmarks(Record, eq=False):
             raise BadDataError(f"spread_mm is {self.spread_mm}", way_out="give a distance of 0 mm or more")
         for name in ("sternal_notch_mm", "xiphoid_mm", "nipple_mm"):
             if getattr(self, name) is not None:
-                settle(self, **{name: _check_finite(getattr(self, name), name=name, shape=(3,))})
+                set_fields(self, **{name: _check_finite(getattr(self, name), name=name, shape=(3,))})
 
     def points(self) -> dict[str, FloatArray]:
         """(3,) points in `base` by name: ``sternal_notch``, ``xiphoid``, and ``nipple`` where it was touched."""

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final, TextIO
 
 from tactile_bayes.errors import UsageError
-from tactile_bayes.progress import Progress, untold
+from tactile_bayes.progress import Progress, no_progress
 
 # --- Text on a terminal: lines break between words at its width, the size and the verdict are bold, cautions coloured.
 
@@ -42,21 +42,21 @@ _WIDE: Final = "\x1e"  #: Stands behind a letter of two columns while a line is 
 _HANGING: Final = 2  #: Columns by which the further lines of a sentence are indented.
 
 
-def shown_columns(text: str) -> int:
+def text_width(text: str) -> int:
     """Columns that a text takes: two for each wide letter (East Asian), none for what stands on another."""
     return sum(0 if unicodedata.combining(letter) else 1 + _is_wide(letter) for letter in text)
 
 
 def padded(text: str, columns: int) -> str:
     """The text with blanks behind it to so many columns."""
-    return text + " " * (columns - shown_columns(text))
+    return text + " " * (columns - text_width(text))
 
 
 def _is_wide(letter: str) -> bool:
     return unicodedata.east_asian_width(letter) in ("W", "F")
 
 
-def columns_of(stream: TextIO) -> int:
+def terminal_columns(stream: TextIO) -> int:
     """Columns of the terminal that the stream writes to, or as COLUMNS states them; 0 where it is none."""
     try:
         if not stream.isatty():
@@ -78,15 +78,15 @@ def has_styles(environment: Mapping[str, str] = os.environ) -> bool:
     return can and not environment.get("NO_COLOR") and environment.get("TERM", "dumb") not in ("dumb", "")
 
 
-def dressed(text: str, *, columns: int, styles: bool) -> str:
+def fit_terminal(text: str, *, columns: int, styles: bool) -> str:
     """The text for a terminal of that width, in lines that break between words; JSON, read by programs, as it is."""
     if columns < LEAST_COLUMNS or text.lstrip()[:1] in ("{", "["):
         return text
-    return "\n".join(_dressed_line(line, columns, styles=styles) for line in text.split("\n"))
+    return "\n".join(_fit_line(line, columns, styles=styles) for line in text.split("\n"))
 
 
-def _dressed_line(line: str, columns: int, *, styles: bool) -> str:
-    if shown_columns(line) > columns:
+def _fit_line(line: str, columns: int, *, styles: bool) -> str:
+    if text_width(line) > columns:
         end = COMMAND_END if line.startswith("$ ") else ""
         wrapper = textwrap.TextWrapper(
             width=columns - len(end),
@@ -107,7 +107,7 @@ def _indent(line: str) -> int:
     """Columns to the text of a row beside its name, or a little more than those before a sentence."""
     margin = len(line) - len(line.lstrip())
     name, gap, rest = line[margin:].partition("  ")
-    beside = margin + shown_columns(name) + len(gap) + len(rest) - len(rest.lstrip())
+    beside = margin + text_width(name) + len(gap) + len(rest) - len(rest.lstrip())
     return beside if gap and beside <= MOST_NAME else margin + _HANGING if margin <= _HANGING else margin
 
 
@@ -151,8 +151,8 @@ class PrintableStream:
 
     def write(self, text: str) -> int:
         shown = printable(text)
-        if columns := columns_of(self._stream):
-            shown = dressed(shown, columns=columns, styles=has_styles())
+        if columns := terminal_columns(self._stream):
+            shown = fit_terminal(shown, columns=columns, styles=has_styles())
         self._try(self._stream.write, shown)
         return len(text)
 
@@ -213,17 +213,17 @@ def raw_stream(stream: Any) -> TextIO:
 
 # --- Signals that end a command in order, as Ctrl-C does.
 
-_asked = False
+_interrupted = False
 
 
 @contextlib.contextmanager
-def ended_in_order() -> Iterator[None]:
+def interrupt_on_signals() -> Iterator[None]:
     """Let SIGTERM (`kill`, `timeout`, a batch system) and SIGHUP (a closed terminal) interrupt as Ctrl-C does.
 
     What is ignored stays so: `nohup` ignores SIGHUP.
     """
-    global _asked
-    _asked = False
+    global _interrupted
+    _interrupted = False
     before: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # called in a thread, which gets no signals
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -232,21 +232,21 @@ def ended_in_order() -> Iterator[None]:
     try:
         yield
     finally:
-        _asked = False
+        _interrupted = False
         for changed, handler in before.items():
             signal.signal(changed, handler)
 
 
-def raise_if_asked() -> None:
+def raise_if_interrupted() -> None:
     """Raise `KeyboardInterrupt` again where code of others dropped it, as compiled modules do while being imported."""
-    if _asked:
+    if _interrupted:
         raise KeyboardInterrupt
 
 
 def _interrupt(number: int, frame: object) -> None:
     del number, frame
-    global _asked
-    _asked = True
+    global _interrupted
+    _interrupted = True
     raise KeyboardInterrupt
 
 
@@ -277,7 +277,7 @@ def progress_bar(
     bar = out.isatty()
     every_s = REDRAW_S if bar else log_every_s
     if every_s is None:
-        yield untold
+        yield no_progress
         return
     begun, drawn = clock(), 0
     due = begun + (QUIET_S if bar else every_s)

@@ -33,7 +33,7 @@ from tactile_bayes.batch import (
     run_batch,
 )
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.shell import ended_in_order
+from tactile_bayes.shell import interrupt_on_signals
 
 
 def draw(seed: int) -> tuple[int, float]:
@@ -705,7 +705,7 @@ def test_an_interruption_that_an_item_lets_go_is_not_lost() -> None:
         return item
 
     before = signal.getsignal(signal.SIGTERM)
-    with ended_in_order(), pytest.raises(BatchInterrupted, match=r"2 of 9 done") as stop:
+    with interrupt_on_signals(), pytest.raises(BatchInterrupted, match=r"2 of 9 done") as stop:
         run_batch(deaf, range(9), key=str)
     assert signal.getsignal(signal.SIGTERM) is before
     assert [one.value for one in stop.value.outcomes] == [0, 1]

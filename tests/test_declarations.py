@@ -24,7 +24,7 @@ from tactile_bayes.declarations import (
     from_plain,
     names_of,
     replace,
-    settle,
+    set_fields,
     to_plain,
 )
 from tactile_bayes.errors import BadDataError
@@ -223,7 +223,7 @@ class Settled(Record, eq=False):
     where: Mapping[str, Ball] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        settle(self, values=np.asarray(self.values, dtype=float))
+        set_fields(self, values=np.asarray(self.values, dtype=float))
 
 
 def test_a_record_settles_its_fields_when_it_is_made_and_when_it_is_changed():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.findings import by_weight, finding, verdict
+from tactile_bayes.findings import by_severity, finding, verdict
 
 CAUTION = finding("late_poses", "poses came late", remedy="--latency-ms auto", on_paper="map the scan again")
 CHECK = finding("few_strokes", "the scan has 2 strokes only")
@@ -18,7 +18,7 @@ def test_a_caution_makes_a_result_doubtful_and_a_check_does_not():
 
 
 def test_cautions_come_first_and_each_finding_once():
-    assert by_weight([CHECK, CAUTION, CHECK]) == (CAUTION, CHECK)
+    assert by_severity([CHECK, CAUTION, CHECK]) == (CAUTION, CHECK)
 
 
 def test_paper_never_reads_an_option():

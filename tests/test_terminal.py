@@ -17,7 +17,7 @@ import pytest
 
 import tactile_bayes as tb
 from tactile_bayes.findings import LEADS
-from tactile_bayes.shell import STYLES, dressed, padded, shown_columns
+from tactile_bayes.shell import STYLES, fit_terminal, padded, text_width
 
 ESCAPES = re.compile(r"\x1b\[[0-9;]*m")
 SENTENCE = "What would narrow it: more exams of this mass, pooled (estimate --pool); the depth of the lump."
@@ -53,7 +53,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("columns", [40, 60, 80, 120])
 def test_a_line_breaks_between_words_and_loses_none(columns):
-    lines = dressed(SENTENCE, columns=columns, styles=False).split("\n")
+    lines = fit_terminal(SENTENCE, columns=columns, styles=False).split("\n")
     assert all(len(line) <= columns for line in lines)
     assert " ".join(line.strip() for line in lines) == SENTENCE
     assert all(line.startswith("  ") and line[2] != " " for line in lines[1:])
@@ -61,17 +61,17 @@ def test_a_line_breaks_between_words_and_loses_none(columns):
 
 def test_the_text_of_a_row_stays_in_its_column():
     row = f"skin            curved by -0.7 per m{' along the path' * 5}"
-    first, second = dressed(row, columns=80, styles=False).split("\n")
+    first, second = fit_terminal(row, columns=80, styles=False).split("\n")
     assert first.startswith("skin            curved")
     assert re.match(r" {16}\S", second)
 
 
 def test_wide_letters_take_two_columns_and_those_on_others_none():
-    assert [shown_columns(text) for text in ("左乳", "gauche", "e\u0301", "")] == [4, 6, 1, 0]
+    assert [text_width(text) for text in ("左乳", "gauche", "e\u0301", "")] == [4, 6, 1, 0]
     assert padded("左乳", 6) == "左乳  "
     row = f"左乳  {'左乳 ' * 20}"
-    lines = dressed(row, columns=40, styles=False).split("\n")
-    assert all(shown_columns(line) <= 40 for line in lines)
+    lines = fit_terminal(row, columns=40, styles=False).split("\n")
+    assert all(text_width(line) <= 40 for line in lines)
     assert all(line.startswith(" " * 6) and line[6] == "左" for line in lines[1:])
     assert "".join("".join(lines).split()) == "左乳" * 21
 
@@ -79,7 +79,7 @@ def test_wide_letters_take_two_columns_and_those_on_others_none():
 def test_a_number_keeps_its_unit():
     line = "overlapping frames agree to within " + "1.4 % and 3 mm, " * 12
     for columns in range(40, 60):
-        shown = dressed(line, columns=columns, styles=False)
+        shown = fit_terminal(line, columns=columns, styles=False)
         assert not re.search(r"\d\n *(%|mm)", shown)
         assert "\x1f" not in shown
 
@@ -90,24 +90,24 @@ def test_a_number_keeps_its_unit():
     ids=["one word", "an object", "a list", "short lines", "nothing"],
 )
 def test_what_has_no_place_to_break_or_is_for_programs_stays(text):
-    assert dressed(text, columns=80, styles=True) == text
+    assert fit_terminal(text, columns=80, styles=True) == text
 
 
 def test_a_command_that_goes_on_can_be_pasted():
     line = "$ tactile-bayes map demo/scan.mcap -o a_folder_with_a_name/map.nc --figure a_folder_with_a_name/map.png"
-    shown = dressed(line, columns=60, styles=False)
+    shown = fit_terminal(line, columns=60, styles=False)
     assert all(len(one) <= 60 for one in shown.split("\n"))
     assert shown.replace("\\\n", "").split() == line.split()
 
 
 def test_a_terminal_without_a_size_gets_the_text_as_it_is():
-    assert dressed(SENTENCE, columns=0, styles=True) == SENTENCE
+    assert fit_terminal(SENTENCE, columns=0, styles=True) == SENTENCE
 
 
 def test_every_lead_of_a_finding_has_a_style():
     assert set(LEADS.values()) <= {lead for leads in STYLES.values() for lead in leads}
-    wrapped = dressed(f"CAUTION: {SENTENCE}", columns=40, styles=True)
-    assert ESCAPES.sub("", wrapped) == dressed(f"CAUTION: {SENTENCE}", columns=40, styles=False)
+    wrapped = fit_terminal(f"CAUTION: {SENTENCE}", columns=40, styles=True)
+    assert ESCAPES.sub("", wrapped) == fit_terminal(f"CAUTION: {SENTENCE}", columns=40, styles=False)
     assert all(line.startswith("\x1b[33m") and line.endswith("\x1b[0m") for line in wrapped.split("\n"))
 
 

@@ -29,7 +29,7 @@ from tactile_bayes.shell import progress_bar
 _BESIDE: Final = {"head_geometry": of_head, "array_calibration": of_calibration, "landmarks": of_landmarks}
 
 
-class Wanted(Record):
+class ImportRequest(Record):
     """What the call asks for, besides its files."""
 
     kind: str | None
@@ -66,7 +66,7 @@ def import_action(
     arrays = replace(ArrayMap() if columns is None else read_array_map(columns), **stated.given)
     beside = {name: path for name in ("poses", *_BESIDE) if (path := given.pop(name)) is not None}
     grid = GridOptions(**{name: given.pop(name) for name in names_of(GridOptions)})
-    wanted = Wanted(**given, grid=grid, arrays=arrays, beside=beside)
+    wanted = ImportRequest(**given, grid=grid, arrays=arrays, beside=beside)
     if len(sources) == 1 and not output.is_dir():
         lines, failed = _import(sources[0], output, wanted), EXIT_DONE
     else:
@@ -75,7 +75,7 @@ def import_action(
     return failed
 
 
-def _import_each(sources: tuple[Path, ...], folder: Path, wanted: Wanted) -> tuple[list[str], int]:
+def _import_each(sources: tuple[Path, ...], folder: Path, wanted: ImportRequest) -> tuple[list[str], int]:
     """Bring each in by itself: what was done, and the code of the first that failed."""
     suffix = {source: ".mcap" if _kind(source, None, wanted) == "scan" else ".nc" for source in sources}
     targets = {source: folder / f"{source.name.partition('.')[0]}{suffix[source]}" for source in sources}
@@ -102,7 +102,7 @@ def _import_each(sources: tuple[Path, ...], folder: Path, wanted: Wanted) -> tup
     return lines, failed
 
 
-def _kind(source: Path, output: Path | None, wanted: Wanted) -> str:
+def _kind(source: Path, output: Path | None, wanted: ImportRequest) -> str:
     """Scan or map: as asked, by the output's suffix, by options that only scans have, else by the source's."""
     if wanted.kind is not None:
         return wanted.kind
@@ -111,7 +111,7 @@ def _kind(source: Path, output: Path | None, wanted: Wanted) -> str:
     return "scan" if arrays or ".mcap" in (given, suffix) else "map"
 
 
-def _import(source: Path, output: Path, wanted: Wanted) -> list[str]:
+def _import(source: Path, output: Path, wanted: ImportRequest) -> list[str]:
     refuse_existing(output, force=wanted.force)
     kind = _kind(source, output, wanted)
     check_suffix(output, "MCAP" if kind == "scan" else "netCDF")
@@ -129,7 +129,7 @@ def _import(source: Path, output: Path, wanted: Wanted) -> list[str]:
     return [f"{output}: {kind}", *lines]
 
 
-def _import_scan(source: Path, output: Path, wanted: Wanted) -> list[str]:
+def _import_scan(source: Path, output: Path, wanted: ImportRequest) -> list[str]:
     lost: tuple[str, ...] = ()
     notes: list[str] = []
     truth = None
@@ -156,7 +156,7 @@ def _arrangement_lines(scan: Scan) -> list[str]:
     return [*finding_lines(check.doubts), *(finding_lines(check.findings_of(scan)) or [check.words])]
 
 
-def _import_map(source: Path, output: Path, wanted: Wanted) -> list[str]:
+def _import_map(source: Path, output: Path, wanted: ImportRequest) -> list[str]:
     with progress_bar("steps", time_left=False) as progress:
         tactile_map, notes = import_grid(source, wanted.grid, progress=progress)
         asked = {**as_dict(wanted.grid), "spacing_mm": tactile_map.recipe.cell_mm}

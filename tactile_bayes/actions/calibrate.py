@@ -10,7 +10,7 @@ import click
 
 from tactile_bayes.api.repeatability import exams_in, learn_from_exams
 from tactile_bayes.api.size_calibration import learn
-from tactile_bayes.commands.options import also_read, typed_options
+from tactile_bayes.commands.options import protect_inputs, typed_options
 from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.instrument import ArrayCalibrationFile, write_array_calibration
@@ -105,7 +105,7 @@ def calibrate_size_action(
     with progress_bar("maps" if correct is not None else "effective draws") as progress:
         learned = learn(table, LearnOptions(**options), typed, correct=correct, against=against, progress=progress)
     if correct is not None:
-        also_read(*learned.inputs.values())
+        protect_inputs(*learned.inputs.values())
     learned.write(output, force=force)
     calibration = learned.calibration
     if isinstance(calibration, BodyCalibration):
@@ -121,7 +121,7 @@ def calibrate_size_action(
 def calibrate_repeatability_action(folder: Path, output: Path, size_calibration: str | None, force: bool) -> None:
     """Learn how far sizes of one mass lie apart between its exams at this site."""
     if size_calibration is not None:
-        also_read(size_calibration_path(size_calibration))
+        protect_inputs(size_calibration_path(size_calibration))
     learned = learn_from_exams(exams_in(folder), size_calibration=size_calibration)
     learned.write(output, force=force)
     click.echo(repeatability_text(learned), nl=False)

@@ -14,7 +14,7 @@ from tactile_bayes.campaigns.campaign import run_campaign
 from tactile_bayes.campaigns.exams import SCANS, Found, find_exams
 from tactile_bayes.campaigns.report import names_line
 from tactile_bayes.campaigns.steps import CampaignSettings
-from tactile_bayes.commands.options import settings_of
+from tactile_bayes.commands.options import make_settings
 from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import refuse_existing
@@ -47,10 +47,10 @@ def campaign_init_action(folder: Path | str, output: Path, names: str | None, ad
         write_manifest(output, found.rows, force=force)
     elif found.rows:
         add_rows(before, found.rows)
-    _say_found(found, output, before.rows if before else None)
+    _print_table_summary(found, output, before.rows if before else None)
 
 
-def _say_found(found: Found, output: Path, before: Sequence[Mapping[str, str]] | None) -> None:
+def _print_table_summary(found: Found, output: Path, before: Sequence[Mapping[str, str]] | None) -> None:
     """What the table holds now, what is to be looked at, and the next command."""
     rows = [*(before or ()), *found.rows]
     patients = {row["patient"].casefold() for row in rows} - {""}
@@ -80,7 +80,7 @@ def campaign_run_action(
     """Map, estimate and pool the exams of a table, and report the trial."""
     asked = {name: options.pop(name) for name in names_of(CampaignOptions)}
     given = None if repeatability in (None, NONE) else Path(str(repeatability))
-    estimate = settings_of(settings_file=settings_file, repeatability=given, **options)
+    estimate = make_settings(settings_file=settings_file, repeatability=given, **options)
     found = run_campaign(
         exams,
         output,

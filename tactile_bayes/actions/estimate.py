@@ -15,7 +15,7 @@ from tactile_bayes.api.pooled import pool_answers
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
 from tactile_bayes.api.sized import Answer, Failure
 from tactile_bayes.batch import BatchInterrupted, Outcome, fault_lines, open_executor, run_batch
-from tactile_bayes.commands.options import settings_of
+from tactile_bayes.commands.options import make_settings
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.files.atomic import given_twice
@@ -79,7 +79,7 @@ def estimate_action(
     **asked: Any,
 ) -> int:
     """Estimate a lump's size from tactile maps, with a credible interval."""
-    settings = settings_of(**asked)
+    settings = make_settings(**asked)
     if len(maps) > 1:
         refuse_checkpoint(settings)
     if figure is not None and settings.size_calibration == "none":

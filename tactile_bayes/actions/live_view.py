@@ -123,7 +123,7 @@ class Estimator:
         self._process.stop()
 
 
-class Turn:
+class RiseRotation:
     """Choice of the next rise to estimate, one at a time: most are no lump and each costs as much as a lump.
 
     The one that was a lump last time, or else the next lower one; now and then the highest, which may be new. How wide
@@ -158,11 +158,11 @@ class Turn:
         return lump or not glance
 
 
-_TURN = Turn()
+_TURN = RiseRotation()
 LIVE_DRAWS = 400
 
 
-def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: Turn = _TURN) -> LiveAnswer:
+def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: RiseRotation = _TURN) -> LiveAnswer:
     """Size by the fast method with the lump's place, or the reason why there is none."""
     try:
         centres = candidate_centres(tactile_map)

@@ -29,7 +29,7 @@ def map_action(
     if twice := given_twice(scans):
         raise UsageError(f"{twice} is given twice; its frames would count twice: give each scan once")
     if output is None:
-        output = beside(scans[0])
+        output = default_map_path(scans[0])
         if output.exists() and not force:
             raise UsageError(f"{output} exists; name another with -o, or give --force")
         refuse_existing(output, force=force)
@@ -59,6 +59,6 @@ def map_action(
                 click.echo(f"{step}: {after - before:.3f} s", err=True)
 
 
-def beside(scan: Path) -> Path:
+def default_map_path(scan: Path) -> Path:
     """Where the map of a scan is written if no one says so: in its folder, and named after it."""
     return scan.parent / ("map.nc" if scan.stem == "scan" else f"{scan.stem}.nc")

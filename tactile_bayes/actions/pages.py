@@ -14,12 +14,12 @@ from tactile_bayes.api.estimates import exam_of_files, export
 from tactile_bayes.api.estimating import estimate_file
 from tactile_bayes.api.settings import dates_of, refuse_checkpoint, times_of
 from tactile_bayes.api.sized import SizeEstimate
-from tactile_bayes.commands.options import settings_of, typed_options
+from tactile_bayes.commands.options import make_settings, typed_options
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import given_twice
 from tactile_bayes.files.reports import json_text
-from tactile_bayes.options import Comparing
+from tactile_bayes.options import CompareOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import compare_summary, compare_text
 from tactile_bayes.report.exam_page import exam_page
@@ -47,13 +47,13 @@ def compare_action(
     **asked: Any,
 ) -> int:
     """Compare the size of a mass at two visits and more."""
-    comparing = Comparing(
+    comparing = CompareOptions(
         days=times_of(days or None, dates_of(dates) or None),
         grown_by=tuple(percent / 100 for percent in grown_by),
         same_mass=same_mass,
         registration_mm=registration_mm,
     )
-    settings = settings_of(**asked)
+    settings = make_settings(**asked)
     visits = [first, *(tuple(path for _, path in group) for _, group in groupby(later, itemgetter(0)))]
     if twice := given_twice(path for maps in visits for path in maps):
         raise UsageError(f"{twice} is given twice; give each map once, at its own visit")
@@ -101,7 +101,7 @@ def report_action(
     page.check()
     typed = [name for name in asked if name in typed_options()]
     found = exam_of_files(
-        files, lambda: settings_of(**asked), typed=typed, notice=lambda line: click.echo(line, err=True)
+        files, lambda: make_settings(**asked), typed=typed, notice=lambda line: click.echo(line, err=True)
     )
     exam = replace(found, given=words)
     page.write(exam_page(exam))

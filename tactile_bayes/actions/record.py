@@ -21,7 +21,7 @@ import click
 import numpy as np
 
 from tactile_bayes.api.arguments import PathLike, path_of, plain, takes
-from tactile_bayes.commands.options import also_read
+from tactile_bayes.commands.options import protect_inputs
 from tactile_bayes.declarations import as_dict, default_of, field
 from tactile_bayes.errors import EXIT_DONE, EXIT_INTERRUPTED, DeviceError, UsageError, check_number
 from tactile_bayes.files.atomic import refuse_existing, unwritable
@@ -217,7 +217,7 @@ def record_action(output: Path, **options: Any) -> int:
     if request.size_calibration != default_of(RecordOptions, "size_calibration"):
         from tactile_bayes.files.size_json import size_calibration_path  # with it comes what sizes a lump
 
-        also_read(size_calibration_path(request.size_calibration))
+        protect_inputs(size_calibration_path(request.size_calibration))
     report, interrupted = make_recording(request)
     click.echo(record_text(report, output=str(output)), nl=False)
     if report.fault:

@@ -23,7 +23,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.select import Span, intervals, missing_records, with_times
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scans import HeadGeometry, Scan
-from tactile_bayes.shell import padded, shown_columns
+from tactile_bayes.shell import padded, text_width
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.pooling import Calibration
 
@@ -32,19 +32,19 @@ def show_action(file: Path, as_json: bool) -> None:
     """Show what a file holds: schema, shape, units, quality, provenance."""
     shipped = size_calibration_path(file.name) if str(file) in SHIPPED and not file.exists() else None
     found = describe(shipped or file)
-    click.echo(dump_json(found) if as_json else "\n".join([*shown(found), RESEARCH_USE, ""]), nl=False)
+    click.echo(dump_json(found) if as_json else "\n".join([*fact_lines(found), RESEARCH_USE, ""]), nl=False)
 
 
 _MOST_NUMBERS = 30  #: Of a list that is shown whole.
 
 
-def shown(found: dict[str, Any], indent: str = "") -> Iterator[str]:
+def fact_lines(found: dict[str, Any], indent: str = "") -> Iterator[str]:
     """Description of a file, one fact per line."""
-    width = max(map(shown_columns, found), default=0)
+    width = max(map(text_width, found), default=0)
     for name, value in found.items():
         if isinstance(value, dict) and value:
             yield f"{indent}{name}"
-            yield from shown(value, indent + "  ")
+            yield from fact_lines(value, indent + "  ")
         else:
             yield f"{indent}{padded(name, width)}  {_plain(value)}"
 

@@ -10,7 +10,7 @@ import click
 import numpy as np
 
 from tactile_bayes.actions.show import describe_scan
-from tactile_bayes.batch import fault_lines, open_executor, open_unfinished, run_batch, unfinished
+from tactile_bayes.batch import fault_lines, open_executor, open_store_beside, run_batch, store_path
 from tactile_bayes.declarations import as_dict, names_of
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.atomic import write_text
@@ -97,7 +97,7 @@ def population_action(
     )
     with (
         open_executor(workers=workers, cluster=scheduler) as executor,
-        open_unfinished(output, list[MassRow], settings=as_dict(population)) as store,
+        open_store_beside(output, list[MassRow], settings=as_dict(population)) as store,
         progress_bar("masses") as progress,
     ):
         masses = range(asked.masses + asked.centred)
@@ -108,14 +108,14 @@ def population_action(
     for line in fault_lines(failed):
         click.echo(f"could not be simulated: mass {line}", err=True)
     if not failed:
-        unfinished(output).unlink(missing_ok=True)
+        store_path(output).unlink(missing_ok=True)
     found = sum(row.detected for row in rows)
     done = len(outcomes) - len(failed)
     click.echo(f"{output}: {done} masses, {len(rows)} exams, a lump found in {found}, seed {asked.seed}")
     click.echo(RESEARCH_USE)
     if failed:
         missing = f"{len(failed)} of {len(outcomes)} masses are missing"
-        raise TactileBayesError(f"{missing}; {unfinished(output)} keeps the others: run again")
+        raise TactileBayesError(f"{missing}; {store_path(output)} keeps the others: run again")
 
 
 def table_text(rows: list[MassRow]) -> str:

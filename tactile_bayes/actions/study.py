@@ -20,9 +20,9 @@ from tactile_bayes.batch import (
     Outcome,
     fault_lines,
     open_executor,
-    open_unfinished,
+    open_store_beside,
     run_batch,
-    unfinished,
+    store_path,
 )
 from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import TactileBayesError, UsageError, in_file
@@ -114,7 +114,7 @@ def study_action(
         click.echo(study_table(rows) if sys.stdout.isatty() else table_text(rows), nl=False)
     else:
         write_text(output, table_text(rows), force=force)
-        unfinished(output).unlink(missing_ok=True)
+        store_path(output).unlink(missing_ok=True)
     click.echo(study_text(rows), err=output is None)
     told = [RESEARCH_USE]
     if paths:
@@ -169,7 +169,7 @@ def run_study(
     for geometry in geometries:
         settings.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
     with (
-        open_unfinished(output, list[paper.StudyRow], settings=settings.as_dict()) as store,
+        open_store_beside(output, list[paper.StudyRow], settings=settings.as_dict()) as store,
         progress_bar("geometries") as progress,
     ):
         try:
@@ -324,7 +324,7 @@ def sbc_action(
     try:
         with (
             open_executor(workers=workers, cluster=scheduler) as executor,
-            open_unfinished(output, sbc.MapRanks, settings=sbc.settings(size=DEFAULT, **how)) as store,
+            open_store_beside(output, sbc.MapRanks, settings=sbc.settings(size=DEFAULT, **how)) as store,
             progress_bar("maps") as progress,
         ):
             made = max(asked.maps - (0 if store is None else len(store)), 0)  # by this run
@@ -342,7 +342,7 @@ def sbc_action(
     for line in fault_lines(failed):
         click.echo(f"could not be estimated: map {line}", err=True)
     if output is not None and not failed:
-        unfinished(output).unlink(missing_ok=True)
+        store_path(output).unlink(missing_ok=True)
     try:
         if figure is not None:
             laboratory.sbc_figure(found, figure, force=force)

@@ -16,7 +16,7 @@ from tactile_bayes.api.estimating import estimate_file, estimate_inputs
 from tactile_bayes.api.pooled import pool_estimates
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import SizeEstimate
-from tactile_bayes.commands.options import also_read, settings_of
+from tactile_bayes.commands.options import make_settings, protect_inputs
 from tactile_bayes.declarations import replace, to_plain
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError, in_file
 from tactile_bayes.files.atomic import given_twice
@@ -142,7 +142,7 @@ def tradeoff_forward_action(
 ) -> int:
     """Measure error in amplitude, width and size against CPU time, for the lump of a scene."""
     if size_calibration not in (None, LEARNED):
-        also_read(size_calibration_path(size_calibration))
+        protect_inputs(size_calibration_path(size_calibration))
     with in_file(scene or ""):
         drawn = Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)) if scene is None else read_scene(scene)
         case = tradeoffs.case_of(drawn, head=head)
@@ -199,7 +199,7 @@ def tradeoff_estimate_action(
     """Measure what each setting of `estimate` costs on a map, and how far its size interval is off."""
     if twice := given_twice(maps):
         raise UsageError(f"{twice} is given twice; give each map once")
-    settings = settings_of(
+    settings = make_settings(
         settings_file=settings_file, size_calibration=size_calibration, centre_mm=centre_mm, seed=seed
     )
     if len(maps) > 1 and centre_mm is not None:

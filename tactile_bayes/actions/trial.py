@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from tactile_bayes.api.trials import analyse, load_trial, planned, read_pilot, settings_by
-from tactile_bayes.commands.options import also_read, typed_options
+from tactile_bayes.commands.options import protect_inputs, typed_options
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.report.pages import PageFiles
@@ -35,7 +35,7 @@ def validate_action(
         PageFiles(html, pdf, force).check()
     title, chosen = settings_by(protocol, settings, typed=typed_options())
     inputs = load_trial(trial, excision, columns)
-    also_read(*inputs.files.values())
+    protect_inputs(*inputs.files.values())
     found = analyse(inputs, chosen, protocol=protocol, title=title)
     try:
         if output:
@@ -62,7 +62,7 @@ def plan_action(
     given = {name: options[name] for name in options.keys() & typed_options()}
     read = read_pilot(pilot, excision, given.get("against"))
     if read is not None:
-        also_read(*read.trial.files.values())
+        protect_inputs(*read.trial.files.values())
         for doubt in read.doubts():
             click.echo(f"{pilot}: {doubt}", err=True)
     with progress_bar("designs") as progress:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, ParamSpec, TypeVar, overload
 import numpy as np
 
 from tactile_bayes.declarations import Record, default_of, names_of
-from tactile_bayes.errors import BY_OPTIONS, BadDataError, TactileBayesError, UsageError, meant
+from tactile_bayes.errors import BY_OPTIONS, BadDataError, TactileBayesError, UsageError, suggestion
 from tactile_bayes.files.atomic import Format, check_suffix
 from tactile_bayes.files.tables import Sheet
 
@@ -86,7 +86,7 @@ def takes(
         def called(*args: _Given.args, **keywords: _Given.kwargs) -> _Returned:
             for name in keywords:
                 if name not in known:
-                    raise TypeError(f"{function.__name__} has no keyword {name!r}; {meant(name, known)}")
+                    raise TypeError(f"{function.__name__} has no keyword {name!r}; {suggestion(name, known)}")
             return entered(*args, **keywords)
 
         more = (inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=fields[name]) for name in fields)

@@ -17,9 +17,9 @@ from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import CANNOT_SHOW, EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
-from tactile_bayes.findings import Finding, Verdict, by_weight, finding, finding_lines, verdict
+from tactile_bayes.findings import Finding, Verdict, by_severity, finding, finding_lines, verdict
 from tactile_bayes.inference.draws import Draws
-from tactile_bayes.options import GROWN_BY, Comparing
+from tactile_bayes.options import GROWTH_SHARES, CompareOptions
 from tactile_bayes.presets import REGISTRATION_MM
 from tactile_bayes.report.compare import CompareReport, compare_report, compare_summary, compare_text
 from tactile_bayes.report.exam_words import Given
@@ -183,7 +183,12 @@ Files = Sequence[Sequence[Path]]  #: That the maps of each visit came from.
 
 
 def compare_answers(
-    visits: Sequence[Sequence[Answer]], settings: Settings, comparing: Comparing, *, names: Names, files: Files = ()
+    visits: Sequence[Sequence[Answer]],
+    settings: Settings,
+    comparing: CompareOptions,
+    *,
+    names: Names,
+    files: Files = (),
 ) -> Comparison:
     """Compare the visits of one mass, from answers for their maps in order of time."""
     if len(visits) < 2 or not all(visits):
@@ -199,13 +204,13 @@ def compare_answers(
         raise UsageError(f"{named[index]} and {named[earlier]} are of one scan; give one map of each scan")
     compared = _compared(visits, calibration, settings, comparing)
     of_visits = (
-        one.at(f"visit {number}" if len(maps) == 1 else f"visit {number}, map {i}")
+        one.labelled(f"visit {number}" if len(maps) == 1 else f"visit {number}, map {i}")
         for number, maps in enumerate(visits, start=1)
         for i, answer in enumerate(maps, start=1)
         for one in answer.report.findings
         if one.kind != "outside_calibration"  # of a size alone: judged anew
     )
-    compared = replace(compared, findings=by_weight((*compared.findings, *of_visits)))
+    compared = replace(compared, findings=by_severity((*compared.findings, *of_visits)))
     scans = [scan for one in visits for scan in _scans(one)]
     recorded = {name: value for name, value in settings.recorded().items() if name in _RECORDED}
     provenance = Provenance("compare", recorded | as_dict(comparing), digests, seed=settings.seed, scans=scans)
@@ -222,7 +227,7 @@ def compare_answers(
 
 
 def compare_estimates(
-    visits: Visits, settings: Settings, comparing: Comparing, *, names: Names, files: Files = ()
+    visits: Visits, settings: Settings, comparing: CompareOptions, *, names: Names, files: Files = ()
 ) -> Comparison:
     """Compare visits, maps estimated again where they are of another mass; see `compare_answers`."""
     every = iter(one_mass([one for visit in visits for one in visit]))
@@ -232,7 +237,7 @@ def compare_estimates(
 
 
 def _compared(
-    visits: Sequence[Sequence[Answer]], calibration: BodyCalibration, settings: Settings, comparing: Comparing
+    visits: Sequence[Sequence[Answer]], calibration: BodyCalibration, settings: Settings, comparing: CompareOptions
 ) -> Compared:
     """Sizes of the visits, where codes and places do not contradict that they are of one mass."""
     found = [[answer for answer in maps if answer.shape is not None] for maps in visits]
@@ -324,7 +329,7 @@ def _sized(
     for number, (maps, at) in enumerate(zip(shapes, fitted, strict=True), start=1):
         chance = one_size_of(log_sizes(at, maps), priors.between_maps)
         if chance < LEAST_PROBABILITY:
-            findings.append(disagreement("its maps show different sizes", chance).at(f"visit {number}"))
+            findings.append(disagreement("its maps show different sizes", chance).labelled(f"visit {number}"))
     another = None if priors.another_exam is None else joint(priors.another_exam)
     return Compared("compared", "", "", apart, tuple(findings), sizes, another)
 
@@ -356,7 +361,7 @@ def compare(
     *more: Any,
     days: Sequence[float] | None = None,
     dates: Sequence[str] | None = None,
-    grown_by: Sequence[float] = GROWN_BY,
+    grown_by: Sequence[float] = GROWTH_SHARES,
     same_mass: bool = False,
     registration_mm: float = REGISTRATION_MM,
     **settings: Any,
@@ -393,7 +398,7 @@ def compare(
     dated = None if dates is None else sequence_of("dates", dates, "dates, one for each visit")
     times = times_of(None if later is None else list(later), dated)
     shares = tuple(plain(one) for one in sequence_of("grown_by", grown_by, "shares, such as 0.2 for 20 %"))
-    comparing = Comparing(times, shares, same_mass, plain(registration_mm))
+    comparing = CompareOptions(times, shares, same_mass, plain(registration_mm))
     comparing.check_visits(2 + len(more))
     visits = [
         estimated(one if isinstance(one, Sequence) and not isinstance(one, str) else [one], settings)

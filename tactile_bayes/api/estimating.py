@@ -16,7 +16,7 @@ from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.npz import CheckpointFile
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.size_json import SHIPPED, default_for, read_size_calibration, size_calibration_path
-from tactile_bayes.findings import by_weight
+from tactile_bayes.findings import by_severity
 from tactile_bayes.mapping.map import TactileMap, many_cells
 from tactile_bayes.options import PRIORS, FitSettings
 from tactile_bayes.posterior.draw import SamplerSettings
@@ -172,7 +172,7 @@ def _with_place(
         if one.estimate.size is not None
     ]
     touching = estimate_document.touching_findings(estimate_document.touching_masses(sized))
-    return replace(estimate, findings=by_weight((*side, *estimate.findings, *touching)))
+    return replace(estimate, findings=by_severity((*side, *estimate.findings, *touching)))
 
 
 def named_calibration(settings: Settings, normalise: str) -> tuple[Path | None, Calibration | None]:

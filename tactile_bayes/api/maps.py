@@ -32,7 +32,7 @@ from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA, RESEARCH_USE
-from tactile_bayes.progress import Progress, untold
+from tactile_bayes.progress import Progress, no_progress
 from tactile_bayes.report.map import map_figure
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, Scan, TrackerPoses
 
@@ -149,7 +149,7 @@ def read_map(path: PathLike) -> Map:
 
 @takes(MapOptions)
 def build_map(
-    scans: Any, *, max_pose_gap_ms: float = MAX_POSE_GAP_MS, progress: Progress = untold, **options: Any
+    scans: Any, *, max_pose_gap_ms: float = MAX_POSE_GAP_MS, progress: Progress = no_progress, **options: Any
 ) -> Map:
     """Build one map from a scan, or from several scans of one examination.
 

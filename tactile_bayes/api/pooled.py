@@ -18,7 +18,7 @@ from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError
 from tactile_bayes.files.posterior_nc import write_posterior
 from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.files.reports import EstimateReport, PooledReport
-from tactile_bayes.findings import by_weight
+from tactile_bayes.findings import by_severity
 from tactile_bayes.options import PRIORS
 from tactile_bayes.posterior.estimate import way_to_head
 from tactile_bayes.report.pooled import elsewhere, pooled_findings, pooled_report
@@ -124,7 +124,7 @@ def pool_answers(
         *first, last = [f"{one.max_size_mm.median:.1f}" for one in reports if one.max_size_mm is not None]
         sizes = f"{', '.join(first)} and {last}" if first else last
         pooled = replace(pooled, reason=f"{pooled.reason}, {sizes} mm")
-    pooled = replace(pooled, findings=by_weight(pooled_findings(pooled, reports)))
+    pooled = replace(pooled, findings=by_severity(pooled_findings(pooled, reports)))
     # pooled files have the key `calibration`, and the priors together
     recorded = settings.recorded()
     prior = {name: recorded.pop(name) for name in PRIORS}

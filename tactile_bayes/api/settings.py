@@ -7,9 +7,9 @@ from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from tactile_bayes.declarations import Meta, extra_of, kinds, part_of
+from tactile_bayes.declarations import Meta, extra_of, field_types, subrecord
 from tactile_bayes.errors import UsageError
-from tactile_bayes.options import IN_FILE, PRIORS, FitSettings, named
+from tactile_bayes.options import IN_FILE, PRIORS, FitSettings, cli_meta
 from tactile_bayes.presets import INTERVAL
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ class Settings(FitSettings, kw_only=True):
 
     size_calibration: Annotated[
         str | Calibration | None,
-        named("solid|eq6|solid-mean|plane-strain|none|SIZE.json"),
+        cli_meta("solid|eq6|solid-mean|plane-strain|none|SIZE.json"),
         "Calibration from widths to sizes: a shipped one, your own file, or none (widths only). Default: solid, or "
         "solid-mean for maps of frames divided by their means; eq6 is the paper's Eq 6 over such bodies.",
     ] = None
@@ -43,13 +43,13 @@ class Settings(FitSettings, kw_only=True):
     ] = None
     repeatability: Annotated[
         Repeatability | None,
-        named("SITE.json"),
+        cli_meta("SITE.json"),
         "Spread between exams of one mass at this site, from `calibrate repeatability`: sizes then have one interval, "
         "for any exam there. Default: two, for exams as the paper's and as simulated ones.",
     ] = None
     known: Annotated[
         tuple[tuple[str, float], ...],
-        named("NAME VALUE"),
+        cli_meta("NAME VALUE"),
         "Known property of the body: seat (0 centred on the gland's edge, 1.2 clear of it), depth_mm, stiffness_ratio, "
         "fat_kpa, gland_ratio or thickness_mm.",
     ] = ()
@@ -60,7 +60,7 @@ class Settings(FitSettings, kw_only=True):
     ] = None
     settings_file: Annotated[
         Path | None,
-        named("FILE.toml", option="settings"),
+        cli_meta("FILE.toml", option="settings"),
         "Priors and rarely used options: background, fit_radius_mm, noise, max_steps... (settings.schema.json).",
     ] = None
 
@@ -93,9 +93,9 @@ class Settings(FitSettings, kw_only=True):
         return plain
 
 
-SettingsFile: Final = part_of(
+SettingsFile: Final = subrecord(
     Settings,
-    [*PRIORS, *(name for name, kind in kinds(Settings).items() if extra_of(kind).get("file"))],
+    [*PRIORS, *(name for name, kind in field_types(Settings).items() if extra_of(kind).get("file"))],
     "Settings of `estimate --settings`: priors and rarely used options; a missing key keeps its default.",
 )
 """Record of the file."""

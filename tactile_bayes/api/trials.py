@@ -22,7 +22,7 @@ from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.tables import Sheet, Table, check_references, read_table
 from tactile_bayes.options import MOST_PATIENTS, Aim, PlanErrors, PlanOptions, TrialSettings
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
-from tactile_bayes.progress import Progress, untold
+from tactile_bayes.progress import Progress, no_progress
 from tactile_bayes.report.pages import Growth, PageFiles
 from tactile_bayes.report.trial import DIGITS, plan_text, trial_text
 from tactile_bayes.report.trial_html import plan_figure, trial_html
@@ -281,7 +281,7 @@ def plan(
     *,
     pilot: PathLike | pandas.DataFrame | None = None,
     excision: PathLike | pandas.DataFrame | None = None,
-    progress: Progress = untold,
+    progress: Progress = no_progress,
     **options: Any,
 ) -> TrialPlan:
     """Plan a trial: power, widths of intervals and the worth of more maps, by simulation.
@@ -322,7 +322,7 @@ def planned(given: Mapping[str, Any], pilot: Pilot | None, progress: Progress) -
     """Plan with the options and errors that are given, then the errors of the pilot, then the defaults."""
     asked = PlanOptions(**{name: value for name, value in given.items() if name not in _ERRORS})
     stated = {name: value for name, value in given.items() if name in _ERRORS}
-    wanted = asked.wanted
+    wanted = asked.targets
     if wanted and "patients" in given:
         raise UsageError("--power and --precision find the number of patients; leave out --patients")
     by_default = as_dict(PlanErrors(**stated))

@@ -23,7 +23,7 @@ from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
 from tactile_bayes.files.reports import EstimateReport, PooledReport, centre_of
 from tactile_bayes.files.tables import Table
-from tactile_bayes.findings import Finding, by_weight, capital, finding_lines, verdict
+from tactile_bayes.findings import Finding, by_severity, capitalised, finding_lines, verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.report.campaign_page import ExamEntry, MassRow, VisitEntry, campaign_html, worst
 from tactile_bayes.report.compare import CompareReport, growths
@@ -107,7 +107,7 @@ def exam_rows(campaign: Campaign, pooled: Pooled) -> list[Row]:
     for index, row in enumerate(rows):
         if not row.failed:
             told = (*row.findings, *together.get(row.exam.name, ()), *more[row.exam.path])
-            rows[index] = replace(row, findings=by_weight(told))
+            rows[index] = replace(row, findings=by_severity(told))
     return rows
 
 
@@ -487,4 +487,4 @@ def repeatability_words(campaign: Campaign) -> str:
     if found is None:
         return f"spread between exams not learned: {campaign.not_learned}" if campaign.not_learned else ""
     words = found.words()
-    return f"{capital(words)}; every size is by this spread, learned from the repeats ({layout.REPEATABILITY})."
+    return f"{capitalised(words)}; every size is by this spread, learned from the repeats ({layout.REPEATABILITY})."

@@ -35,7 +35,7 @@ from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.manifest_csv import ESTIMATE, EXAMS, GROWTH, MAP, MASSES, REPEATABILITY, SHAPE, SIZED, Exam
 from tactile_bayes.files.provenance import recordings
 from tactile_bayes.files.size_json import default_for, read_repeatability, read_size_calibration, size_calibration_path
-from tactile_bayes.progress import Progress, untold
+from tactile_bayes.progress import Progress, no_progress
 from tactile_bayes.report.growth_page import Course
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.pooling import Repeatability
@@ -58,7 +58,7 @@ _AHEAD_IN_BLOCK: Final = 8  #: Blocks hold so many times what an executor takes 
 
 def no_bar(_label: str) -> AbstractContextManager[Progress]:
     """Nobody is told."""
-    return nullcontext(untold)
+    return nullcontext(no_progress)
 
 
 @dataclass(eq=False)
@@ -90,7 +90,7 @@ class Campaign:
     repeatability: Repeatability | None = None  #: Learned from the repeats.
     not_learned: str = ""  #: Why it was not, where masses have repeats.
     _sizes_unknown: bool = False
-    _tell: Progress = untold
+    _tell: Progress = no_progress
     _needed: Counter[str] = field(default_factory=Counter)  #: By step, still to be run or found done, as far as known.
     _done: int = 0  #: Steps of this run.
     _repeated: set[str] = field(default_factory=set)

@@ -35,10 +35,10 @@ from tactile_bayes.files.provenance import Provenance, scan_facts
 from tactile_bayes.files.reading import NETCDF_BYTES, fetched, kind_of, put, read_bytes
 from tactile_bayes.files.reports import EstimateReport, json_text
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
-from tactile_bayes.findings import by_weight
+from tactile_bayes.findings import by_severity
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.options import CampaignOptions, Comparing, MapOptions
+from tactile_bayes.options import CampaignOptions, CompareOptions, MapOptions
 from tactile_bayes.report.estimate_document import side_of, size_diagnostics
 from tactile_bayes.report.estimate_figures import draw_map, draw_size
 from tactile_bayes.report.exam_page import exam_page
@@ -276,7 +276,7 @@ def _estimated(folder: Path, settings: Settings, match: Match | None) -> SizeEst
     maps = (found.tactile_map, *(map_of_exam(folder / layout.MAP, one) for one in match.named))
     if all(one.patient_from_plane is not None for one in maps):
         return found
-    findings = by_weight((*found.estimate.findings, OWN_AXES))
+    findings = by_severity((*found.estimate.findings, OWN_AXES))
     return replace(found, estimate=replace(found.estimate, findings=findings))
 
 
@@ -336,7 +336,7 @@ def make_growth(
     files = [[folder / name / layout.MAP for name in names] for names in visits]
     dates = [date.fromisoformat(day) for day in course.dates if day]
     days = tuple(float((day - dates[0]).days) for day in dates) if len(dates) == len(visits) else None
-    comparing = Comparing(days=days, same_mass=not placed)
+    comparing = CompareOptions(days=days, same_mass=not placed)
     compared = compare_answers(answers, settings, comparing, names=visits, files=files)
     report = compared.report.checked()
     drawn = [

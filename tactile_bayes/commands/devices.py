@@ -6,7 +6,7 @@ from typing import get_args
 
 import click
 
-from tactile_bayes.commands.options import FORCE, SPEED, FilePath, FiniteRange, command, number, output, takes
+from tactile_bayes.commands.options import FORCE, SPEED, FilePath, FiniteRange, command, number, output, record_options
 from tactile_bayes.declarations import names_of
 from tactile_bayes.options import FaultOptions, RecordOptions
 from tactile_bayes.presets import TrackerProtocol
@@ -18,7 +18,7 @@ PROTOCOLS = get_args(TrackerProtocol)
 @command("record", "record.record_action")
 @output("SCAN.mcap", "MCAP", "Scan file to write.", required=True)
 @click.option("--head", "head_url", required=True, metavar="URL", help="Port of the scan head.")
-@takes(RecordOptions, *_RECORDING)
+@record_options(RecordOptions, *_RECORDING)
 @FORCE
 def record_command() -> None:
     """Record a scan head and a tracker.
@@ -47,9 +47,9 @@ def record_command() -> None:
     "--once", is_flag=True, help="End when the scan has been sent and read. Default: wait for the next start."
 )
 @SPEED
-@takes(FaultOptions, "drop", "corrupt", "stall", "disconnect_s", show_default=False)
-@takes(FaultOptions, "hold")
-@takes(FaultOptions, "hide", "breathe_mm", show_default=False)
+@record_options(FaultOptions, "drop", "corrupt", "stall", "disconnect_s", show_default=False)
+@record_options(FaultOptions, "hold")
+@record_options(FaultOptions, "hide", "breathe_mm", show_default=False)
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Random seed of the faults.")
 def emulate_command() -> None:
     """Serve a scan as a scan head or a tracker would send it, or as both, at its own rate, with faults on request.
@@ -75,13 +75,13 @@ def emulate_command() -> None:
 @click.option(
     "--pivot", "pivot_url", metavar="URL", help="Check for inverse rotations: turn this tracker about a fixed point."
 )
-@takes(
+@record_options(
     RecordOptions,
     "tracker_protocol",
     metavar="PROTOCOL",
     help=f"Protocol of the tracker to rotate: {', '.join(PROTOCOLS)}.",
 )
-@takes(RecordOptions, "tool")
+@record_options(RecordOptions, "tool")
 @number("--duration", FiniteRange(min=0.2), 10.0, "How long to rotate it, s.", metavar="S")
 def devices_command() -> None:
     """List the serial ports and the devices that are probably on them.
@@ -96,7 +96,7 @@ def devices_command() -> None:
 @command("replay", "devices.replay_action")
 @click.argument("scan", metavar="SCAN.mcap", type=FilePath())
 @output("OUT.mcap", "MCAP", "Save what is recorded.")
-@takes(RecordOptions, "live", "serve", "size_calibration")
+@record_options(RecordOptions, "live", "serve", "size_calibration")
 @SPEED
 @FORCE
 def replay_command() -> None:

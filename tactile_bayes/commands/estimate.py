@@ -10,7 +10,7 @@ import click
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.commands import options
 from tactile_bayes.errors import UsageError
-from tactile_bayes.options import GROWN_BY, Comparing, MapOptions
+from tactile_bayes.options import GROWTH_SHARES, CompareOptions, MapOptions
 
 _FILE = options.FilePath()
 
@@ -22,7 +22,7 @@ _FILE = options.FilePath()
     "netCDF",
     "Where to write the map. Default: beside the first scan; map.nc for scan.mcap, s01.nc for s01.mcap.",
 )
-@options.takes(MapOptions)
+@options.record_options(MapOptions)
 @options.figure("Draw the map and its coverage.")
 @options.FORCE
 @click.option("-v", "--verbose", is_flag=True, help="Print all figures of the map; times on stderr.")
@@ -40,13 +40,13 @@ def map_command() -> None:
 
 @options.command("estimate", "estimate.estimate_action")
 @click.argument("maps", metavar="MAP.nc...", nargs=-1, required=True, type=_FILE)
-@options.takes(Settings, "size_calibration", "method", "seed", "interval")
+@options.record_options(Settings, "size_calibration", "method", "seed", "interval")
 @options.output("POST.nc", "netCDF", "Write all draws (netCDF that arviz opens).")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON: one object, or a list for several maps.")
 @options.figure("Draw the size posterior, or the map where there is no size.")
 @options.figure("Draw the map with the lump's size, or with the places looked at.", "--map-figure")
 @options.figure("Draw data, fit and residual of the fit window, or the map where there is no estimate.", "--fit-figure")
-@options.takes(Settings, "centre_mm", "scene", "settings_file", "accuracy_sd", "known", "repeatability")
+@options.record_options(Settings, "centre_mm", "scene", "settings_file", "accuracy_sd", "known", "repeatability")
 @click.option("--pool", is_flag=True, help="Pool the maps, all of one mass, into one size.")
 @options.number("--workers", click.IntRange(min=1), 1, "Number of worker processes, for several maps.")
 @options.scheduler_option("several maps")
@@ -104,7 +104,7 @@ def numbered(args: Sequence[str], *, strict: bool = True) -> list[str]:
     return found
 
 
-_PERCENT = tuple(100 * share for share in GROWN_BY)
+_PERCENT = tuple(100 * share for share in GROWTH_SHARES)
 
 
 @options.command("compare", "pages.compare_action", kind=VisitsCommand)
@@ -135,21 +135,21 @@ _PERCENT = tuple(100 * share for share in GROWN_BY)
     metavar="PERCENT",
     help="Growth of the diameter, in percent, that a probability of more is told for.",
 )
-@options.takes(Comparing, "same_mass", "registration_mm")
-@options.takes(
+@options.record_options(CompareOptions, "same_mass", "registration_mm")
+@options.record_options(
     Settings, "size_calibration", metavar="solid|eq6|solid-mean|SIZE.json",
     help="Calibration over bodies. Default: solid, or solid-mean for maps of frames divided by their means."
 )  # fmt: skip
-@options.takes(Settings, "method", help="As `estimate`.")
-@options.takes(
+@options.record_options(Settings, "method", help="As `estimate`.")
+@options.record_options(
     Settings, "settings_file", help="As `estimate`; between_map_sd states the spread between exams of a visit."
 )  # fmt: skip
-@options.takes(
+@options.record_options(
     Settings, "repeatability",
     help="Spread between exams of one mass at this site, from `calibrate repeatability`. Default: two intervals, for "
     "exams as alike as simulated ones and as the paper's."
 )  # fmt: skip
-@options.takes(Settings, "seed", "interval")
+@options.record_options(Settings, "seed", "interval")
 @options.JSON
 @options.output(
     "GROWTH.html", "HTML", "Write one page: the maps on common axes, the size at each visit, and the change."
@@ -176,19 +176,19 @@ def compare_command() -> None:
 @options.output("EXAM.html", None, "Page to write.", required=True)
 @options.page_options("EXAM.pdf", "Tactile exam")
 @click.option("--date", "day", default="", metavar="YYYY-MM-DD", help="Date to print on the page. Default: none.")
-@options.takes(
+@options.record_options(
     Settings,
     "size_calibration",
     metavar="solid|eq6|solid-mean|plane-strain|SIZE.json",
     help="Calibration from widths to sizes, as of `estimate`. Default: the one that fits the maps.",
 )
-@options.takes(Settings, "settings_file", help="Settings, as of `estimate`.")
-@options.takes(
+@options.record_options(Settings, "settings_file", help="Settings, as of `estimate`.")
+@options.record_options(
     Settings,
     "repeatability",
     help="Spread between exams of one mass at this site, as of `estimate`. Default: two intervals.",
 )
-@options.takes(Settings, "seed", "interval")
+@options.record_options(Settings, "seed", "interval")
 @options.FORCE
 def report_command() -> None:
     """Write one page of an exam: the map, the size with its intervals, the place, and how good the exam was.

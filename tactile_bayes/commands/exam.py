@@ -9,7 +9,17 @@ from typing import Final
 import click
 
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.commands.options import FORCE, JSON, SESSION, FilePath, command, figure, output, path_option, takes
+from tactile_bayes.commands.options import (
+    FORCE,
+    JSON,
+    SESSION,
+    FilePath,
+    command,
+    figure,
+    output,
+    path_option,
+    record_options,
+)
 from tactile_bayes.files.arrays_layout import GridOptions, Stated, layout_lines
 from tactile_bayes.options import IdentityOptions, MapOptions, RecordOptions
 from tactile_bayes.presets import CORRECTIONS, METHODS
@@ -17,7 +27,9 @@ from tactile_bayes.presets import CORRECTIONS, METHODS
 
 @command("demo", "exam.demo_action")
 @output("DIR", None, "Folder for the files.", default=Path("tactile-bayes-demo"), show_default=True)
-@takes(Settings, "method", type=click.Choice(METHODS[:3]), help="Method of the first estimate; see `estimate --help`.")
+@record_options(
+    Settings, "method", type=click.Choice(METHODS[:3]), help="Method of the first estimate; see `estimate --help`."
+)
 @click.option("--force", is_flag=True, help="Overwrite the files of an earlier demo.")
 def demo_command() -> None:
     """Run the main job on an embedded scan: map, estimate, and the report of a trial.
@@ -38,7 +50,7 @@ def demo_command() -> None:
     type=click.Choice(["scan", "map"]),
     help="What SRC holds. Default: as the output's suffix says; a table or image without a scan's options is a map.",
 )
-@takes(GridOptions)
+@record_options(GridOptions)
 @click.option(
     "--correct",
     "corrections",
@@ -51,8 +63,8 @@ def demo_command() -> None:
 @click.option("--template", is_flag=True, help="Print a MAP.toml for --columns: of SRC, with what its shapes tell.")
 @path_option("--columns", "MAP.toml", "Scan: what SRC calls its arrays.")
 @path_option("--poses", "FILE", "Scan: the tracker's poses, in a table of their own.")
-@takes(RecordOptions, "head_geometry", "array_calibration", "landmarks")
-@takes(Stated)
+@record_options(RecordOptions, "head_geometry", "array_calibration", "landmarks")
+@record_options(Stated)
 @SESSION
 @FORCE
 def import_command() -> None:
@@ -83,7 +95,7 @@ import_command.help = f"{cleandoc(import_command.help or '')}\n\n{_ARRAYS}"
 
 @command("check", "exam.check_action")
 @click.argument("scans", nargs=-1, required=True, metavar="SCAN...", type=FilePath())
-@takes(MapOptions, "pressure_window_kpa")
+@record_options(MapOptions, "pressure_window_kpa")
 @output(
     "HEAD.json",
     None,
@@ -127,7 +139,7 @@ _FORMATS: Final = ("dicom", "fhir", "nrrd", "csv")
     "Patient and study from a modality worklist item (.dcm or DICOM JSON), or from JSON of plain keys.",
 )
 @click.option("--patient-id-from-scan", is_flag=True, help="Use the scan's subject code as the patient ID.")
-@takes(IdentityOptions)
+@record_options(IdentityOptions)
 @path_option("--dictionary", "DICT.csv", "With csv: write the data dictionary of the REDCap form.")
 @FORCE
 def export_command() -> None:

@@ -21,7 +21,7 @@ def calibrate_command() -> None:
 @options.command("size", "calibrate.calibrate_size_action", within=calibrate_command)
 @click.argument("table", metavar="TABLE.csv", type=_FILE)
 @options.output("SIZE.json", "JSON", "Where to write the calibration.", required=True)
-@options.takes(declared.LearnOptions, "form")
+@options.record_options(declared.LearnOptions, "form")
 @click.option(
     "--correct",
     metavar="CALIBRATION",
@@ -33,10 +33,10 @@ def calibrate_command() -> None:
     "TABLE.csv",
     "Lumps of another origin, with the columns of `population`: how far their sizes are off goes into intervals.",
 )
-@options.takes(declared.LearnOptions, "fit", "normalise", "background", "fit_radius_mm", "noise")
-@options.takes(declared.LearnOptions, "least_stiffness_ratio")
+@options.record_options(declared.LearnOptions, "fit", "normalise", "background", "fit_radius_mm", "noise")
+@options.record_options(declared.LearnOptions, "least_stiffness_ratio")
 @options.figure("Draw Fig 8 of the paper from the table's lumps (eq6 only).")
-@options.takes(declared.LearnOptions, "seed")
+@options.record_options(declared.LearnOptions, "seed")
 @options.FORCE
 def size() -> None:
     """Learn Eq 6, d = m sigma / (e a^f) + b, from a study or a set of phantoms, or over a population of bodies.
@@ -149,7 +149,7 @@ def simulate_command() -> None:
 
 @options.command("population", "simulation.population_action")
 @options.output("TABLE.csv", "CSV", "Where to write the table.", required=True)
-@options.takes(declared.PopulationOptions, "masses", "centred", "scans", "normalise")
+@options.record_options(declared.PopulationOptions, "masses", "centred", "scans", "normalise")
 @options.path_option(
     "--head",
     "HEAD.json",
@@ -163,7 +163,7 @@ def simulate_command() -> None:
     help="Ranges of lumps, bodies and exams, in the tables [bodies] and [exams]. Default: those of the shipped "
     "calibrations.",
 )
-@options.takes(declared.PopulationOptions, "seed")
+@options.record_options(declared.PopulationOptions, "seed")
 @options.WORKERS
 @options.scheduler_option("the masses")
 @options.FORCE
@@ -181,7 +181,7 @@ def population_command() -> None:
 
 
 @options.command("sbc", "study.sbc_action")
-@options.takes(declared.SbcOptions)
+@options.record_options(declared.SbcOptions)
 @options.WORKERS
 @options.scheduler_option("the maps")
 @options.output("TABLE.csv", "CSV", "Write truths and ranks; an interrupted run resumes from it.")
@@ -203,7 +203,7 @@ def sbc_command() -> None:
 
 
 @options.command("study", "study.study_action")
-@options.takes(declared.StudyOptions, "model", "grid", "seat")
+@options.record_options(declared.StudyOptions, "model", "grid", "seat")
 @options.output("TABLE.csv", "CSV", "Write the table. Default: print it.")
 @options.path_option(
     "--figures",
@@ -222,9 +222,9 @@ def sbc_command() -> None:
     metavar="D H/D",
     help="Lump of figure 6: diameter in mm, and depth over diameter. Default: 12.5 0.825, the paper's.",
 )
-@options.takes(declared.SectionOptions)
+@options.record_options(declared.SectionOptions)
 @options.head_option("Default: shoulders-inside for plane-strain, shoulders-outside for solid.")
-@options.takes(declared.StudyOptions, *names_of(declared.CaseOptions), "background", "flat_field")
+@options.record_options(declared.StudyOptions, *names_of(declared.CaseOptions), "background", "flat_field")
 @options.WORKERS
 @options.scheduler_option("the geometries")
 @options.FORCE
@@ -247,8 +247,8 @@ def study_command() -> None:
 
 
 @options.command("tables", "study.tables_action")
-@options.takes(declared.StudyOptions, "seat", help="How far the lump stands out of the gland.")
-@options.takes(declared.SectionOptions)
+@options.record_options(declared.StudyOptions, "seat", help="How far the lump stands out of the gland.")
+@options.record_options(declared.SectionOptions)
 @options.head_option("Default: shoulders-inside.")
 @click.option("--heads", "search", is_flag=True, help="Compute the tables for many heads, and name the nearest one.")
 @options.WORKERS
@@ -271,9 +271,9 @@ def head_command() -> None:
 
 
 @options.command("uniformity", "study.head_uniformity_action", within=head_command)
-@options.takes(declared.SectionOptions)
+@options.record_options(declared.SectionOptions)
 @options.head_option("Default: shoulders-inside.")
-@options.takes(declared.TissueOptions)
+@options.record_options(declared.TissueOptions)
 @options.JSON
 def head_uniformity_command() -> None:
     """Compute how evenly one head presses on homogeneous tissue.
@@ -287,7 +287,7 @@ def head_uniformity_command() -> None:
 
 @options.command("design", "study.head_design_action", within=head_command)
 @options.head_option("Default: both are searched.")
-@options.takes(declared.TissueOptions)
+@options.record_options(declared.TissueOptions)
 @options.figure("Draw the non-uniformity over radius and shoulder.")
 @options.JSON
 @options.FORCE
@@ -322,8 +322,8 @@ _FIDELITIES = ("solid", "plane-strain", "empirical", "empirical-gaussian")
     metavar="X Y",
     help="The lump's place on the scan's map, mm. Default: the highest bump that can be one; 0 0 for a scene of none.",
 )
-@options.takes(declared.MapOptions, "every", help="Compare one frame in so many.")
-@options.takes(declared.MapOptions, "cell_mm", "pressure_window_kpa")
+@options.record_options(declared.MapOptions, "every", help="Compare one frame in so many.")
+@options.record_options(declared.MapOptions, "cell_mm", "pressure_window_kpa")
 @options.number("--latency-ms", click.FLOAT, 0.0, "Delay of the tracker's time stamps.")
 @options.figure("Draw frames, maps and what the model leaves.")
 @options.JSON
@@ -400,12 +400,12 @@ def tradeoff_forward_command() -> None:
     metavar="solid|solid-mean|plane-strain|none|SIZE.json",
     help="Calibration from widths to sizes, as in `estimate`.",
 )
-@options.takes(Settings, "centre_mm")
-@options.takes(Settings, "settings_file", help="Settings, as in `estimate`.")
+@options.record_options(Settings, "centre_mm")
+@options.record_options(Settings, "settings_file", help="Settings, as in `estimate`.")
 @_TOLERANCE
 @_RUNS
 @options.figure("Draw error against time.")
-@options.takes(Settings, "seed")
+@options.record_options(Settings, "seed")
 @options.JSON
 @options.FORCE
 def tradeoff_estimate_command() -> None:
@@ -427,7 +427,7 @@ def tradeoff_estimate_command() -> None:
 @_TOLERANCE
 @_RUNS
 @options.figure("Draw error against time.")
-@options.takes(Settings, "seed")
+@options.record_options(Settings, "seed")
 @options.JSON
 @options.FORCE
 def tradeoff_map_command() -> None:

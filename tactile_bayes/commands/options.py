@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin
 import click
 
 from tactile_bayes.api.settings import Settings, read_settings
-from tactile_bayes.declarations import Record, default_of, extra_of, kinds, meaning_of, range_of, value_kind
+from tactile_bayes.declarations import Record, default_of, extra_of, field_types, meaning_of, range_of, value_type
 from tactile_bayes.errors import BY_OPTIONS, number_words
 from tactile_bayes.files.atomic import Format, check_suffix, refuse_existing, refuse_same
 from tactile_bayes.options import RecordOptions
@@ -66,7 +66,7 @@ class FilePath(click.Path):
         return path
 
 
-def also_read(*paths: Path | None) -> None:
+def protect_inputs(*paths: Path | None) -> None:
     """Refuse the call if one of its outputs is one of these further inputs."""
     context = click.get_current_context(silent=True)
     seen: list[tuple[Path, bool]] = [] if context is None else context.meta.get(_SEEN, [])
@@ -130,18 +130,18 @@ def head_option(default: str) -> Callable[[Callable[..., Any]], Callable[..., An
     )
 
 
-def settings_of(*, settings_file: Path | None = None, repeatability: Path | None = None, **options: Any) -> Settings:
+def make_settings(*, settings_file: Path | None = None, repeatability: Path | None = None, **options: Any) -> Settings:
     """Make settings from options and from the files that they name, none of which may be an output of the call."""
     from tactile_bayes.files.size_json import read_repeatability, size_calibration_path
 
     if (calibration := options.get("size_calibration")) is not None:
-        also_read(size_calibration_path(calibration))
+        protect_inputs(size_calibration_path(calibration))
     if repeatability is not None:
         options["repeatability"] = read_repeatability(repeatability)
     if settings_file is None:
         return Settings(**options)
     settings = Settings(**options, **read_settings(settings_file))
-    also_read(settings.checkpoint)
+    protect_inputs(settings.checkpoint)
     if settings.checkpoint is not None:
         refuse_same([settings.checkpoint], [settings_file])
     return settings
@@ -197,7 +197,7 @@ class NumberOr(_ParamType):
             self.fail(f"{value!r} is not a number, nor {' nor '.join(map(repr, self.words))}", param, ctx)
 
 
-def takes(record: type[Record], *names: str, **attributes: Any) -> Decorator:
+def record_options(record: type[Record], *names: str, **attributes: Any) -> Decorator:
     """The options of a command for some fields of a record, in this order; for all where none is named.
 
     Type, range, default and help come from the field's declaration, `metavar` and the name from its ``extra``;
@@ -219,17 +219,17 @@ def _several(*options: Decorator) -> Decorator:
 
 
 def _option(record: type[Record], name: str, attributes: Mapping[str, Any]) -> Decorator:
-    kind, default = kinds(record)[name], default_of(record, name)
+    kind, default = field_types(record)[name], default_of(record, name)
     extra = extra_of(kind)
     flag = f"--{extra.get('option', name).replace('_', '-')}"
     also = [f"--{extra['also']}"] if "also" in extra else []
     of_field: dict[str, Any] = {"help": meaning_of(kind), "metavar": extra.get("metavar")}
     if default is False:
         of_field["is_flag"] = True
-    elif value_kind(kind) is bool:
+    elif value_type(kind) is bool:
         flag, of_field["default"] = f"{flag}/--no-{flag[2:]}", None
     else:
-        bare = value_kind(kind)
+        bare = value_type(kind)
         pairs = get_origin(bare) is tuple and get_args(bare)[1:] == (...,)
         shown = default not in (None, (), "")
         of_field |= {"type": _click_type(get_args(bare)[0] if pairs else kind)}
@@ -250,9 +250,9 @@ MOST_CHOICES: Final = 50  #: Letters of all the choices of an option up to which
 
 def _click_type(kind: Any) -> Any:
     """What click makes of a value, by what is declared for it."""
-    bare = value_kind(kind)
+    bare = value_type(kind)
     if words := [word for one in get_args(bare) if get_origin(one) is Literal for word in get_args(one)]:
-        return NumberOr(*words, number=int if int in map(value_kind, get_args(bare)) else float)
+        return NumberOr(*words, number=int if int in map(value_type, get_args(bare)) else float)
     if get_origin(bare) is Literal:
         return click.Choice([one for one in get_args(bare) if one])
     if get_origin(bare) is tuple:
@@ -306,7 +306,7 @@ def page_options(metavar: str, title: str) -> Decorator:
 
 
 PRINTED: Final = "Also print it to PDF, by an installed Chromium or WeasyPrint."
-SESSION = takes(
+SESSION = record_options(
     RecordOptions,
     "session_file",
     help="Facts of the exam for the scan: subject, side, posture, examiner, visit and more, in plain text.",

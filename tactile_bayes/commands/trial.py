@@ -15,7 +15,7 @@ _FILE = options.FilePath()
 @click.argument("trial", metavar="TRIAL.csv", type=_FILE)
 @options.path_option("--excision", "EX.csv", "Sizes measured after excision.", required=True)
 @options.path_option("--columns", "MAP.toml", "Layout of a wide TRIAL.csv: which column holds which reading.")
-@options.takes(TrialSettings, "intervals", "resamples", "seed", "error_ratio", "bayes")
+@options.record_options(TrialSettings, "intervals", "resamples", "seed", "error_ratio", "bayes")
 @click.option(
     "-v",
     "--methods",
@@ -42,11 +42,11 @@ def validate_command() -> None:
 
 
 @options.command("plan", "trial.plan_action")
-@options.takes(PlanOptions, "patients", "maps", "power", "precision")
-@options.takes(PlanErrors)
+@options.record_options(PlanOptions, "patients", "maps", "power", "precision")
+@options.record_options(PlanErrors)
 @options.path_option("--pilot", "TRIAL.csv", "Take the errors that no option gives from this trial; needs --excision.")
 @options.path_option("--excision", "EX.csv", "Sizes measured after excision in the pilot.")
-@options.takes(PlanOptions, "against", "trials", "seed", "workers")
+@options.record_options(PlanOptions, "against", "trials", "seed", "workers")
 @options.JSON
 @options.output("PLAN.json", "JSON", "Write the plan as JSON to this file.")
 @options.figure("Draw power against the number of patients.")
@@ -95,13 +95,13 @@ def campaign_init_command() -> None:
 @options.command("run", "campaign.campaign_run_action", within=campaign_command)
 @click.argument("exams", metavar="EXAMS.csv", type=_FILE)
 @options.output("DIR", None, "Folder for all files.", required=True)
-@options.takes(CampaignOptions, "excision", "columns", "protocol")
-@options.takes(Settings, "method", help="As `estimate`.")
-@options.takes(
+@options.record_options(CampaignOptions, "excision", "columns", "protocol")
+@options.record_options(Settings, "method", help="As `estimate`.")
+@options.record_options(
     Settings, "size_calibration", metavar="NAME|SIZE.json", help="As `estimate`, unless a row names its own."
 )
-@options.takes(Settings, "settings_file", help="Priors and more, as `estimate`.")
-@options.takes(CampaignOptions, "normalise", "match_mm")
+@options.record_options(Settings, "settings_file", help="Priors and more, as `estimate`.")
+@options.record_options(CampaignOptions, "normalise", "match_mm")
 @click.option(
     "--repeatability",
     metavar="none|SITE.json",
@@ -109,8 +109,8 @@ def campaign_init_command() -> None:
     "for patients, the tables hold the narrower). Default: learned from this campaign's repeats, where 5 masses "
     "have them.",
 )
-@options.takes(Settings, "seed")
-@options.takes(CampaignOptions, "figures", "dry_run", "copy_to", "workers", "scheduler")
+@options.record_options(Settings, "seed")
+@options.record_options(CampaignOptions, "figures", "dry_run", "copy_to", "workers", "scheduler")
 def campaign_run_command() -> None:
     """Map, estimate and pool the exams of a table, and report the trial.
 

@@ -27,7 +27,7 @@ from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.posterior_nc import posterior_attributes
 from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
 from tactile_bayes.files.reports import REPORTS, EstimateReport, MassReport, PooledReport, centre_of
-from tactile_bayes.findings import capital, finding_lines
+from tactile_bayes.findings import capitalised, finding_lines
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
@@ -268,7 +268,9 @@ def masses_of(report: EstimateReport | PooledReport) -> tuple[SizedMass, ...]:
         if size is None:
             code = (not isinstance(mass, PooledReport) and mass.reason_code) or "no size"
         elif leads is not mass:
-            narrow = f"{capital(exams_label(report.figures.get('between_map_sd')))}: largest size {size_words(size)}"
+            narrow = (
+                f"{capitalised(exams_label(report.figures.get('between_map_sd')))}: largest size {size_words(size)}"
+            )
         placed = None if isinstance(mass, PooledReport) else mass
         one = SizedMass(
             mass.number if isinstance(mass, MassReport) else 1,

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from tactile_bayes.declarations import Meta, Options, field, names_of
 from tactile_bayes.errors import UsageError
-from tactile_bayes.options import Above0, named
+from tactile_bayes.options import Positive, cli_meta
 from tactile_bayes.presets import Normalise
 
 Shape = tuple[str | int, ...]
@@ -71,11 +71,11 @@ class Stated(Options, kw_only=True):
         "Scan: unit of the frames; counts are raw, others need no calibration. Default: the file's, else counts.",
     ] = None
     saturation: Annotated[
-        Above0 | None, "Scan: reading from which on a taxel carries no pressure, in the frames' unit."
+        Positive | None, "Scan: reading from which on a taxel carries no pressure, in the frames' unit."
     ] = None
     frame_shape: Annotated[
         tuple[Annotated[int, Meta(ge=1)], Annotated[int, Meta(ge=1)]] | None,
-        named("ROWS COLUMNS"),
+        cli_meta("ROWS COLUMNS"),
         "Scan: rows (across the head) and columns of frames that are one row of numbers. Default: the head's.",
     ] = None
     frame_order: Annotated[
@@ -90,7 +90,7 @@ class Stated(Options, kw_only=True):
         Literal["point", "comma"] | None,
         "Scan: decimal sign of tables. Default: told by their numbers, where these can tell.",
     ] = None
-    rate_hz: Annotated[Rate | None, named("HZ"), "Scan: frames a second, where they have no times."] = None
+    rate_hz: Annotated[Rate | None, cli_meta("HZ"), "Scan: frames a second, where they have no times."] = None
     time_unit: Annotated[TimeUnit | None, "Scan: unit of the frames' times. Default: the file's, else s."] = None
     pose_layout: Annotated[
         PoseLayout | None,
@@ -102,17 +102,17 @@ class Stated(Options, kw_only=True):
     ] = None
     pose_time_unit: Annotated[TimeUnit | None, "Scan: unit of the poses' times. Default: the file's, else s."] = None
     pose_rate_hz: Annotated[
-        Rate | None, named("HZ"), "Scan: poses a second, where they have frame numbers or no times."
+        Rate | None, cli_meta("HZ"), "Scan: poses a second, where they have frame numbers or no times."
     ] = None
     pose_offset_s: Annotated[
         Annotated[float, Meta(ge=-1e10, le=1e10)] | None,
-        named("S"),
+        cli_meta("S"),
         "Scan: added to the poses' times, for the frames' clock. Default: 0.",
     ] = None
     pose_good: Annotated[
         str | None, "Scan: value of the poses' status where the tool is seen. Default: OK, Enabled and the like."
     ] = None
-    tool: Annotated[str | None, named("NAME"), "Scan: which tool or station of the poses' file."] = None
+    tool: Annotated[str | None, cli_meta("NAME"), "Scan: which tool or station of the poses' file."] = None
 
     @property
     def given(self) -> dict[str, Any]:
@@ -137,27 +137,27 @@ _LONGEST_UNITS: Final = 20
 class GridOptions(Options, kw_only=True):
     """What is stated of a grid of values that becomes a map."""
 
-    spacing_mm: Annotated[float | None, named("H"), "Map: side of the square cells, in mm."] = None
+    spacing_mm: Annotated[float | None, cli_meta("H"), "Map: side of the square cells, in mm."] = None
     cell_mm: Annotated[
-        Above0 | None,
-        named("H"),
+        Positive | None,
+        cli_meta("H"),
         "Map: average finer cells into cells of up to this side. Default: 1 where they are finer than 0.5.",
     ] = None
     normalise: Annotated[Normalise, "Map: how the values are already normalised."] = "none"
     level: Annotated[
-        Above0 | Literal["fit"] | None,
-        named("L|fit"),
+        Positive | Literal["fit"] | None,
+        cli_meta("L|fit"),
         "Map: divide values such as kPa by their level beside the lump: a number, or fit, to take it from the map.",
     ] = None
     units: Annotated[
-        str | None, named("TEXT"), "Map: unit of values that are not normalised, such as kPa. Default: unknown."
+        str | None, cli_meta("TEXT"), "Map: unit of values that are not normalised, such as kPa. Default: unknown."
     ] = None
     no_value: Annotated[
         tuple[str, ...],
-        named("V"),
+        cli_meta("V"),
         "Map: a number or text that stands for no value, such as -9999; none: every number is a value.",
     ] = ()
-    array: Annotated[str | None, named("NAME"), "Map: which array of SRC, where it holds several."] = None
+    array: Annotated[str | None, cli_meta("NAME"), "Map: which array of SRC, where it holds several."] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -12,8 +12,8 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
-from tactile_bayes.declarations import Meta, Record, field, from_plain, names_of, replace, schema_name, shown
-from tactile_bayes.errors import BadDataError, in_file, meant
+from tactile_bayes.declarations import Meta, Record, field, from_plain, names_of, replace, schema_name, short_repr
+from tactile_bayes.errors import BadDataError, in_file, suggestion
 from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, kind_of, read_text, schema_kind
 from tactile_bayes.options import TrialSettings
 from tactile_bayes.scans import Scan
@@ -69,7 +69,7 @@ def parse_record(document: object, kind: type[T], *, path: Path) -> T:
     if wanted and found and found != wanted:
         raise BadDataError(f"is {found}, not {wanted}", way_out=f"give {wanted}", path=str(path))
     if schema and isinstance(document, dict) and document.get("schema", schema) != schema:
-        raise BadDataError(f"schema is {shown(document['schema'])}", way_out=f"give {schema!r}", path=str(path))
+        raise BadDataError(f"schema is {short_repr(document['schema'])}", way_out=f"give {schema!r}", path=str(path))
     with in_file(path):
         return from_plain(kind, document)
 
@@ -82,7 +82,7 @@ def load_json(path: Path, *, way_out: str = "give a file this program wrote") ->
         kind = kind_of(path)
         if kind and not kind.endswith("(JSON)"):
             raise BadDataError(f"is {kind}, not a JSON file", way_out=way_out, path=str(path)) from None
-        raise error.at(path) from None
+        raise error.with_path(path) from None
 
 
 def parse_json(text: str, *, name: str = "", way_out: str = "copy the file again") -> object:
@@ -220,9 +220,9 @@ def check_session(session: Mapping[str, object], *, path: Path) -> None:
             way_out = "leave it out: nothing here may identify a person"
             raise BadDataError(f"{name} may not be given", way_out=way_out, path=str(path))
         if not re.search(_FACT_NAME, name):
-            near = meant(name, names_of(Session))
+            near = suggestion(name, names_of(Session))
             way_out = near if near.startswith("did") else "keys are of small letters, digits and _"
-            raise BadDataError(f"{shown(name)} is not known", way_out=way_out, path=str(path))
+            raise BadDataError(f"{short_repr(name)} is not known", way_out=way_out, path=str(path))
     parse_record(dict(session), Session, path=path)
     parse_record(dict(session), dict[FactName, Fact], path=path)
 

@@ -21,7 +21,7 @@ from tactile_bayes.mapping.map import MapRecipe, TactileMap, block_sums
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.presets import CELL_MM, MM_PER_UNIT
-from tactile_bayes.progress import Progress, untold
+from tactile_bayes.progress import Progress, no_progress
 
 # --- A grid of numbers in a text table, as programs and spreadsheets write it.
 #
@@ -340,7 +340,7 @@ _LONGEST_MM: Final = 500.0
 """No examined breast is longer; frames that stand one in a row, or one below the other, are."""
 
 
-def import_grid(path: Path, asked: GridOptions, *, progress: Progress = untold) -> tuple[TactileMap, list[str]]:
+def import_grid(path: Path, asked: GridOptions, *, progress: Progress = no_progress) -> tuple[TactileMap, list[str]]:
     """The map of a file, and what was found on reading it; see `open_grid` and `grid_map`.
 
     Of three steps, reading, the map and what is done with it, `progress` is told the first two.

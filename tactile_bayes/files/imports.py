@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tactile_bayes.declarations import names_of, replace
-from tactile_bayes.errors import BadDataError, in_file, meant
+from tactile_bayes.errors import BadDataError, in_file, suggestion
 from tactile_bayes.files.arrays_layout import KNOWN, LAYOUT, OPTIONAL, ArrayMap, Stated, in_words
 from tactile_bayes.files.instrument import read_array_calibration, read_head_geometry, read_landmarks
 from tactile_bayes.files.named_arrays import Source, is_text, plain_names, read_named
@@ -63,7 +63,7 @@ def import_arrays(path: Path, given: ArrayMap, beside: Sequence[Source] = ()) ->
         name = {"counts": "frames"}.get(error.what.split()[0], error.what.split()[0])
         same = {name, "pose_matrix"} if name in ("position_mm", "quaternion_wxyz") else {name}
         of_it = (one.path for one in reversed(beside) if one.path and same & set(one.arrays))
-        raise error.at(next(of_it, path)) from None
+        raise error.with_path(next(of_it, path)) from None
 
 
 def _read(path: Path, given: ArrayMap, beside: Sequence[Source]) -> Source:
@@ -75,7 +75,7 @@ def _read(path: Path, given: ArrayMap, beside: Sequence[Source]) -> Source:
         return read_frames(path, given if given.frame_shape else replace(given, frame_shape=shape))
     for name in (*given.arrays, *given.values):
         if name not in KNOWN:
-            raise BadDataError(f"--columns: {name!r} is no array of a scan", way_out=meant(name, KNOWN))
+            raise BadDataError(f"--columns: {name!r} is no array of a scan", way_out=suggestion(name, KNOWN))
     there: dict[str, str] = {}
     others: set[str] = set()
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import EXACT, Meta, Record, as_dict, field, from_plain, names_of, says, to_plain
+from tactile_bayes.declarations import EXACT, Meta, Record, as_dict, described, field, from_plain, names_of, to_plain
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import dump_json, load_json, parse_record, parse_toml, read_record
@@ -218,8 +218,8 @@ class SceneFile(Record):
     lump: Annotated[tuple[LumpTable, ...], Meta(max_length=100)] = ()
     """Lumps: either Gaussian rises of the normalised pressure (amplitude, sigma), or tissue (d_mm, depth_ratio)."""
     rib: Annotated[
-        tuple[Annotated[Rib, says("One rib.")], ...],
-        says("Ribs for the solid model: rows of stiff balls along x, across the head.", max_length=10),
+        tuple[Annotated[Rib, described("One rib.")], ...],
+        described("Ribs for the solid model: rows of stiff balls along x, across the head.", max_length=10),
     ] = ()
     strokes: scenes.Strokes = field(default_factory=scenes.Strokes)
     """Back and forth across the head, line after line along it."""

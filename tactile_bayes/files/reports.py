@@ -11,11 +11,11 @@ from tactile_bayes.declarations import (
     Meta,
     Record,
     UnsetType,
+    described,
     field,
     from_plain,
     replace,
     rounded,
-    says,
     to_plain,
 )
 from tactile_bayes.errors import BadDataError
@@ -23,7 +23,7 @@ from tactile_bayes.files.documents import dump_json
 from tactile_bayes.findings import Finding, Verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.clock import Position
-from tactile_bayes.options import Above0, Least0
+from tactile_bayes.options import NonNegative, Positive
 
 ESTIMATE: Final = "tactile-bayes/estimate/1"
 POOLED: Final = "tactile-bayes/pooled/1"
@@ -36,8 +36,10 @@ ReasonCode = Literal[
     "", "empty", "undetected", "ridge", "cannot_show", "unresolved", "window", "prior", "extrapolated", "method"
 ]
 Shape = Literal["round", "ellipse", "rotated"]
-Findings = Annotated[tuple[Finding, ...], says("What speaks against the result, cautions first; see docs/formats.md")]
-Judgement = Annotated[Verdict, says("no_answer: there is no size; doubtful: a caution stands")]
+Findings = Annotated[
+    tuple[Finding, ...], described("What speaks against the result, cautions first; see docs/formats.md")
+]
+Judgement = Annotated[Verdict, described("no_answer: there is no size; doubtful: a caution stands")]
 
 
 class Sized(Record):
@@ -135,9 +137,9 @@ class Interval(Record):
 class SizeInterval(Interval):
     """A size with its interval, mm."""
 
-    median: Above0
-    low: Above0
-    high: Above0
+    median: Positive
+    low: Positive
+    high: Positive
     probability: Annotated[float, Meta(gt=0, lt=1)]
 
 
@@ -158,11 +160,11 @@ class AnotherExam(Record):
     variance_share: dict[str, Annotated[float, Meta(ge=0, le=100)]]
 
 
-SUPPOSING: Final = says(
+SUPPOSING: Final = described(
     "How large the lump would be if more were known of the body, by name (soft, hard, centred, resting): "
     "the property, its value, and the largest size with it; null without a size"
 )
-LEADING: Final = says(
+LEADING: Final = described(
     "Where it is not null, the sizes that lead (record 0130): for exams as far apart as those of "
     "patients; SD of ln size between exams, and the sizes with it"
 )
@@ -194,7 +196,7 @@ class StructureReport(Record):
     """A question about the scene, with its answer."""
 
     name: str
-    odds: Least0 | None
+    odds: NonNegative | None
     odds_are_a_bound: bool
     supported: bool
     used: bool
@@ -234,10 +236,10 @@ class OtherRise(Record):
 
     x_mm: float
     y_mm: float
-    distance_mm: Least0 | None
+    distance_mm: NonNegative | None
     amplitude: float
-    sigma_x_mm: Above0
-    sigma_y_mm: Above0
+    sigma_x_mm: Positive
+    sigma_y_mm: Positive
     probability: Chance
 
 
@@ -266,7 +268,7 @@ class Touching(Record):
     """Two sized masses that may be one lump: their numbers, mm between their centres, and the length over both."""
 
     masses: tuple[Number1, Number1]
-    apart_mm: Least0
+    apart_mm: NonNegative
     together_mm: Interval
 
 
@@ -278,9 +280,9 @@ class Figures(Record, forbid_unknown_fields=False):
     irregular_outline: Chance | bool | None = None
     between_map_sd: Annotated[float, Meta(ge=0, le=2)] | None = None
     fat_mm: Annotated[float, Meta(ge=0, le=500)] | None = None
-    end_error_mm: Least0 | None = None
-    end_error_sd: Least0 | None = None
-    effective_draws: Least0 | None = None
+    end_error_mm: NonNegative | None = None
+    end_error_sd: NonNegative | None = None
+    effective_draws: NonNegative | None = None
     size_calibration: str = ""
 
     def __post_init__(self) -> None:
@@ -420,7 +422,7 @@ class PooledReport(Report, kw_only=True):
     variance_share: dict[str, float] | None
     figures: dict[str, float]
     left_out: tuple[str, ...] = ()
-    fat_mm: Above0 | None = None
+    fat_mm: Positive | None = None
     """Depth of the fat under the head by its pressure profile; null where the maps do not tell."""
     unknowns: dict[str, float]
     site: str | None = None  #: The correction of the calibration by a site's phantoms, in words; null without one.

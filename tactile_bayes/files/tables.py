@@ -143,7 +143,7 @@ class Table(Record):
 
     def error(self, row: int, column: str, what: str, *, way_out: str) -> BadDataError:
         """Error for a cell found wrong after reading, in the reader's own form; rows count from 0."""
-        return _fault(self.line_numbers[row], column, what, way_out=way_out).at(self.path)
+        return _fault(self.line_numbers[row], column, what, way_out=way_out).with_path(self.path)
 
 
 def read_table(source: Path | Sheet, schema_name: str) -> Table:
@@ -201,7 +201,7 @@ class RawTable(Record):
 
     def error(self, line: int, column: str, what: str, *, way_out: str) -> BadDataError:
         """Error for a cell; lines count from 1."""
-        return _fault(line, column, what, way_out=way_out).at(self.path)
+        return _fault(line, column, what, way_out=way_out).with_path(self.path)
 
     def number(self, line: int, column: str, text: str) -> float:
         """Parse a finite number; an error names its cell."""

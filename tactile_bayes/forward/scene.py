@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final
 import numpy as np
 
 from tactile_bayes import presets
-from tactile_bayes.declarations import Meta, Record, as_dict, check, field, replace, says
+from tactile_bayes.declarations import Meta, Record, as_dict, check_record, described, field, replace
 from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.contact import Head as Section
 from tactile_bayes.forward.tissue import Diameter, Layers, Place, Rib, SceneBody, SolidLump, check_solid, fat_thickness
@@ -78,9 +78,9 @@ class Strokes(Record):
     """Turn of the head about the normal, away from square to the strokes, degrees."""
 
 
-Rows = Annotated[int, says("Taxels across the head.", ge=1, le=256)]
-Columns = Annotated[int, says("Taxels along the head.", ge=1, le=256)]
-Pitch = Annotated[float, says("Distance between neighbouring taxels, mm.", gt=0, lt=100)]
+Rows = Annotated[int, described("Taxels across the head.", ge=1, le=256)]
+Columns = Annotated[int, described("Taxels along the head.", ge=1, le=256)]
+Pitch = Annotated[float, described("Distance between neighbouring taxels, mm.", gt=0, lt=100)]
 
 
 class Head(Record):
@@ -200,11 +200,11 @@ class Scene(Timing):
 
     def __post_init__(self) -> None:
         """Check each part by its declaration, then the rules that involve several."""
-        check(Timing(self.seed, self.duration_s, self.frame_rate_hz, self.pose_rate_hz), "scene")
+        check_record(Timing(self.seed, self.duration_s, self.frame_rate_hz, self.pose_rate_hz), "scene")
         for name in ("background", "strokes", "head", "noise", "tracker", "taxels", "landmarks"):
-            check(getattr(self, name), name)
+            check_record(getattr(self, name), name)
         for i, lump in enumerate(self.lumps):
-            check(lump, f"lump[{i}]")
+            check_record(lump, f"lump[{i}]")
         self._check_head()
         self._check_level()
         if self.lumps and self.solid_lumps:

@@ -29,7 +29,7 @@ from tactile_bayes.forward.scene import (
 from tactile_bayes.forward.tissue import MOST_SEAT, Body, Layers, SolidLump
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import HEAD_PITCH_MM, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
-from tactile_bayes.progress import Progress, untold
+from tactile_bayes.progress import Progress, no_progress
 
 FIDELITIES: Final = ("empirical-gaussian", "empirical", "plane-strain", "solid")
 """A bump's own formula; and for lumps of tissue Eqs 1 to 4, a body in two dimensions, and one in three."""
@@ -41,7 +41,7 @@ def simulate(
     rng: np.random.Generator,
     fidelity: str | None = None,
     head: str | None = None,
-    progress: Progress = untold,
+    progress: Progress = no_progress,
 ) -> SimulatedScan:
     """Make a scan from a scene: frames at ``k / frame_rate_hz``; poses at ``k / pose_rate_hz``, stamped late by the
     latency.
@@ -113,7 +113,7 @@ def felt_at_poses(
     mean_kpa: FloatArray,
     fidelity: str | None = None,
     head: str | None = None,
-    progress: Progress = untold,
+    progress: Progress = no_progress,
 ) -> FloatArray:
     """Pressure in kPa, (n, rows, columns), that a model's head feels at given poses and mean pressures, without any
     noise.
@@ -239,7 +239,7 @@ class PlaneSection(Record, eq=False):
         level_kpa: FloatArray,
         *,
         reach_mm: float,
-        progress: Progress = untold,
+        progress: Progress = no_progress,
     ) -> FloatArray:
         """(n, rows, columns) kPa that the taxels feel at (n,) poses and mean pressures, before any noise.
 
@@ -500,7 +500,7 @@ def solid_head(head: Head, layers: Layers) -> SolidHead:
 
 
 def frames_at_poses(
-    scene: Scene, rotation: FloatArray, origin_mm: FloatArray, *, mean_kpa: FloatArray, progress: Progress = untold
+    scene: Scene, rotation: FloatArray, origin_mm: FloatArray, *, mean_kpa: FloatArray, progress: Progress = no_progress
 ) -> tuple[FloatArray, FloatArray]:
     """Pressures in kPa, (n, rows, columns), on the head at poses from `scanhead` to the scene's `plane`, without noise,
     and z in mm of its apex there, which the mean pressures decide."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated
 
-from tactile_bayes.declarations import Meta, Record, check, says, settle
+from tactile_bayes.declarations import Meta, Record, check_record, described, set_fields
 from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.presets import FAT_KPA, GLAND_RATIO, POISSON, THICKNESS_MM
 
@@ -67,10 +67,10 @@ class Body(Record):
         rule = f"be between 0 (centred) and {MOST_SEAT:g}; 1 is resting"
         require(0 <= self.seat <= MOST_SEAT, "seat", self.seat, rule)
         if 1.0 - _RESTS < self.seat < 1.0 + _THINNEST_FILM:
-            settle(self, seat=1.0)
+            set_fields(self, seat=1.0)
         if self.thickness_mm is None:
             deep = self.centre_mm + max(0.6, 0.5 * self.seat) * self.d_mm + 2.0
-            settle(self, thickness_mm=max(THICKNESS_MM, deep))
+            set_fields(self, thickness_mm=max(THICKNESS_MM, deep))
         bottom = self.centre_mm + self.radius_mm
         thickness, rule = self.layers.thickness_mm, f"be above {bottom:g} mm, the depth of the lump's lowest point"
         require(thickness > 1.0001 * bottom, "thickness_mm", thickness, rule)
@@ -110,29 +110,29 @@ PLAIN_FAT_MM = 15.0  #: Default thickness of the fat in a scene without lumps.
 _SAME_MM = 0.01  #: Fat thicknesses that lumps imply may differ by this before they are called different.
 _LEAST_COVER = 0.02  #: The skin over a lump, and the tissue under it, as a share of its half height.
 
-Place = Annotated[float, says("Centre in the plane, mm.", ge=-500, le=500)]
+Place = Annotated[float, described("Centre in the plane, mm.", ge=-500, le=500)]
 Diameter = Annotated[
     float,
-    says(
+    described(
         "Diameter, mm. Of a Gaussian lump the declared truth, from which nothing is computed; of tissue "
         "the diameter across the vertical (15).",
         gt=0,
         le=500,
     ),
 ]
-Height = Annotated[float, says("Tissue: diameter along the vertical, mm; left out for a ball.", gt=0, le=500)]
+Height = Annotated[float, described("Tissue: diameter along the vertical, mm; left out for a ball.", gt=0, le=500)]
 DepthRatio = Annotated[
     float,
-    says(
+    described(
         "Tissue: h/d, depth of the centre over the diameter; the lump must fit between skin and chest wall.",
         gt=0,
         le=100,
     ),
 ]
-Stiffness = Annotated[float, says("Tissue: modulus of the lump over that of fat (100).", gt=0, le=1_000_000)]
+Stiffness = Annotated[float, described("Tissue: modulus of the lump over that of fat (100).", gt=0, le=1_000_000)]
 Seat = Annotated[
     float,
-    says(
+    described(
         "Tissue: the fat-gland boundary lies at the centre's depth + seat x half the height: 0 through the "
         "centre (centred), 1 under the lowest point; the phantoms' resting lumps have 1.2.",
         ge=0,
@@ -237,9 +237,9 @@ def fat_thickness(body: SceneBody, lumps: Sequence[SolidLump]) -> float:
 
 def check_solid(body: SceneBody, lumps: Sequence[SolidLump], ribs: Sequence[Rib] = ()) -> None:
     """Raise an error for an impossible body, naming the key, its value and the allowed range."""
-    check(body, "body")
+    check_record(body, "body")
     for i, lump in enumerate(lumps):
-        check(lump, f"lump[{i}]")
+        check_record(lump, f"lump[{i}]")
         half = (1.0 + _LEAST_COVER) * lump.vertical_mm / 2
         least, most = half / lump.d_mm, (body.thickness_mm - half) / lump.d_mm
         if least > most:
@@ -248,7 +248,7 @@ def check_solid(body: SceneBody, lumps: Sequence[SolidLump], ribs: Sequence[Rib]
         key = f"lump[{i}].depth_ratio"
         _check_room(key, lump.depth_ratio, (least, most), "the lump", " for this size and body")
     for i, rib in enumerate(ribs):
-        check(rib, f"rib[{i}]")
+        check_record(rib, f"rib[{i}]")
         half = (1.0 + _LEAST_COVER) * rib.d_mm / 2
         ends = half, body.thickness_mm - half
         _check_room(f"rib[{i}].depth_mm", rib.depth_mm, ends, "the rib", " mm for this diameter and body")

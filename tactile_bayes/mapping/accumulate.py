@@ -16,7 +16,7 @@ from tactile_bayes.mapping.map import FEW_READINGS, MapRecipe, TactileMap
 from tactile_bayes.mapping.profile import GrowingProfile
 from tactile_bayes.mapping.select import SelectedFrames, chunks, gate
 from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA
-from tactile_bayes.progress import Progress, untold
+from tactile_bayes.progress import Progress, no_progress
 from tactile_bayes.scans import CountArray, ElementCalibration, HeadGeometry, HeadShape, Scan
 
 # --- Used frames of a scan on the map's lattice, which can be read any number of times.
@@ -216,7 +216,9 @@ class Accumulated(Record, eq=False):
     """Largest relative change of a frame's gain in the last pass; 0 unless the gains are solved for."""
 
 
-def accumulate(sources: list[Source], *, cell_mm: float, normalise: str, progress: Progress = untold) -> Accumulated:
+def accumulate(
+    sources: list[Source], *, cell_mm: float, normalise: str, progress: Progress = no_progress
+) -> Accumulated:
     """Average the normalised readings of all used frames in cells on the plane; progress starts anew in each pass.
 
     ``"mean"`` divides each frame by its mean over the valid taxels, as the paper does. A lump under the head is in that
@@ -234,7 +236,7 @@ def accumulate(sources: list[Source], *, cell_mm: float, normalise: str, progres
 
 
 def add_all(
-    sources: list[Source], levels: list[FloatArray], *, cell_mm: float, progress: Progress = untold
+    sources: list[Source], levels: list[FloatArray], *, cell_mm: float, progress: Progress = no_progress
 ) -> cells.CellSums:
     """One pass over all used frames, each divided by its level."""
     sums = cells.CellSums(cell_mm)

@@ -9,7 +9,7 @@ import numpy as np
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, check_number
-from tactile_bayes.findings import Finding, by_weight
+from tactile_bayes.findings import Finding, by_severity
 from tactile_bayes.geometry import BoolArray, FloatArray, Plane, apply, inverse, patient_from_plane
 from tactile_bayes.mapping import accumulate, latency, select
 from tactile_bayes.mapping.arrangement import check_arrangement
@@ -20,7 +20,7 @@ from tactile_bayes.mapping.plausibility import exam_figures, exam_findings, map_
 from tactile_bayes.mapping.profile import evenness_figures, head_profile_figures, motion, pose_noise_figures
 from tactile_bayes.mapping.select import SelectedFrames
 from tactile_bayes.options import MapOptions
-from tactile_bayes.progress import Progress, untold
+from tactile_bayes.progress import Progress, no_progress
 from tactile_bayes.scans import HeadShape, Scan
 
 # --- Frames near the mass, to which the paper fits its plane.
@@ -141,7 +141,7 @@ def build_map(
     scans: Scan | Sequence[Scan],
     *,
     max_pose_gap_ms: float = MAX_POSE_GAP_MS,
-    progress: Progress = untold,
+    progress: Progress = no_progress,
     **options: Any,
 ) -> TactileMap:
     """Build the tactile map of one scan, or of several scans of one examination on a common plane.
@@ -236,7 +236,7 @@ def _numbered(findings: list[tuple[Finding, ...]]) -> tuple[Finding, ...]:
     """Findings of each scan, by its number where there are several."""
     if len(findings) == 1:
         return findings[0]
-    return tuple(one.at(f"scan {number}") for number, some in enumerate(findings, start=1) for one in some)
+    return tuple(one.labelled(f"scan {number}") for number, some in enumerate(findings, start=1) for one in some)
 
 
 def _selected(scans: list[Scan], how: MapOptions, late_ms: float, gap_ms: float) -> list[SelectedFrames]:
@@ -314,7 +314,7 @@ def _as_map(
         head=_head(scans),
     )
     of_map = (*convention_findings(quality, findings), *broken_assumptions(quality), *handling_findings(quality))
-    return replace(tactile_map, findings=by_weight((*map_findings(tactile_map), *of_map, *findings)))
+    return replace(tactile_map, findings=by_severity((*map_findings(tactile_map), *of_map, *findings)))
 
 
 def _head(scans: list[Scan]) -> HeadShape:

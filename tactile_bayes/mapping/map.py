@@ -10,9 +10,9 @@ from typing import Annotated, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_bayes.declarations import Meta, Record, field, settle
+from tactile_bayes.declarations import Meta, Record, field, set_fields
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.findings import Finding, capital, finding
+from tactile_bayes.findings import Finding, capitalised, finding
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.scans import HeadShape
 
@@ -109,7 +109,7 @@ class TactileMap(Record, eq=False):
         for name in ("mean", "variance", "count", "x_mm", "y_mm"):
             view = getattr(self, name).view()
             view.flags.writeable = False
-            settle(self, **{name: view})
+            set_fields(self, **{name: view})
         infinite = np.isinf(self.mean)
         if infinite.any() and (infinite & (self.count > 0)).any():
             raise BadDataError("mean holds infinite values", way_out="mark cells without data by count 0")
@@ -399,7 +399,7 @@ class Orientation(Record):
     def sentence(self) -> str:
         """The orientation with what the letters at the edges stand for, for pages."""
         sides = "; R, L: the patient's right and left; H: head, F: feet" if self.notch is not None else ""
-        return f"{capital(self.words)}{sides}."
+        return f"{capitalised(self.words)}{sides}."
 
     def side_words(self, axis: str) -> str:
         """Name a side of the map ("+x", "-x", "+y", "-y"): the patient's with landmarks, else the picture's."""

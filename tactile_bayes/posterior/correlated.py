@@ -42,7 +42,7 @@ from tactile_bayes.posterior.marginal import APART, BLOCK, REACH_IN_RADII, Neigh
 from tactile_bayes.posterior.verdict import rim_fault
 from tactile_bayes.posterior.white import BumpFit, MapDraws
 from tactile_bayes.posterior.window import FLOOR, Problem, Window, cosines_for, independent_variance
-from tactile_bayes.presets import FIELD_COSINES, SceneAsked
+from tactile_bayes.presets import FIELD_COSINES, SceneName
 from tactile_bayes.progress import Progress
 
 # --- Check of structures at the window's rim against the map around it.
@@ -132,7 +132,7 @@ WANTED: dict[str, Neighbour] = {"second-lump": "second lump", "rib": "rib"}
 
 
 def add_beside(
-    choice: SceneChoice, surroundings: Surroundings, *, ridges: FloatArray, scene: SceneAsked = "auto"
+    choice: SceneChoice, surroundings: Surroundings, *, ridges: FloatArray, scene: SceneName = "auto"
 ) -> SceneChoice:
     """Test for a second lump or a rib beside the bump, and add it where the evidence or `scene` says so.
 
@@ -514,7 +514,7 @@ def _searched(plain: FieldFit, tactile_map: TactileMap) -> float:
 
 
 def with_neighbours(
-    choice: SceneChoice, detection: Detection, tactile_map: TactileMap, *, asked: SceneAsked
+    choice: SceneChoice, detection: Detection, tactile_map: TactileMap, *, asked: SceneName
 ) -> tuple[SceneChoice, Detection]:
     """Add a second structure where the evidence supports it, and compare the lump with a ridge where one rises.
 

@@ -16,7 +16,7 @@ from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 from tactile_bayes.inference.importance import TRUSTED_SHAPE, Gaussians, ImportanceOptions, importance
 from tactile_bayes.inference.modes import LogDensity
 from tactile_bayes.options import FitSettings
-from tactile_bayes.presets import FIT_RADIUS_MM, Background, Method, Noise, Rotation, SceneAsked
+from tactile_bayes.presets import FIT_RADIUS_MM, Background, Method, Noise, Rotation, SceneName
 from tactile_bayes.progress import Progress
 from tactile_bayes.size.draws import BUMP, BumpDraws
 from tactile_bayes.size.pooling import SizePriors
@@ -44,9 +44,9 @@ class SamplerSettings(FitSettings, kw_only=True):
     step_up: bool = True  #: Under a noise field: whether the next method is tried where the one asked for fails.
 
     @property
-    def scene_asked(self) -> SceneAsked:
+    def scene_asked(self) -> SceneName:
         """The requested scene; where none is named, the rotation option decides."""
-        by_rotation: dict[Rotation, SceneAsked] = {"on": "rotated", "off": "ellipse", "auto": "auto"}
+        by_rotation: dict[Rotation, SceneName] = {"on": "rotated", "off": "ellipse", "auto": "auto"}
         return by_rotation[self.rotation] if self.scene == "auto" else self.scene
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import NO_LUMP, Abstention, BadDataError, NotConvergedError
-from tactile_bayes.findings import Finding, by_weight, finding
+from tactile_bayes.findings import Finding, by_severity, finding
 from tactile_bayes.inference.ensemble import convergence
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plausibility import map_findings
@@ -248,7 +248,7 @@ def estimate_map(
     if estimate.code in NO_LUMP and options.scene != "none" and (why := verdict.no_verdict(tactile_map)) is not None:
         estimate = _none(why, estimate.candidates)
     of_map = (*map_findings(tactile_map), *tactile_map.findings)
-    return replace(estimate, findings=by_weight((*of_map, *estimate.findings)))
+    return replace(estimate, findings=by_severity((*of_map, *estimate.findings)))
 
 
 def _answer(work: Work) -> Estimate:

@@ -19,7 +19,7 @@ from tactile_bayes.posterior.bump import covariance_from_log_widths, drawn_width
 from tactile_bayes.posterior.draw import ROTATION_ODDS, ModalBump, Sampled, with_beside
 from tactile_bayes.posterior.marginal import STEP, CollapsedTarget, Scene
 from tactile_bayes.posterior.window import FLOOR, NEGLIGIBLE, Problem, linear_columns
-from tactile_bayes.presets import Method, SceneAsked
+from tactile_bayes.presets import Method, SceneName
 
 # --- Posterior of a scene under correlated errors: its mode, a Gaussian for each noise field, and draws.
 
@@ -250,7 +250,7 @@ class SceneChoice(Record, eq=False):
         return "ellipse" if any(one.name == "ellipse" and one.supported for one in self.structures) else "round"
 
 
-def choose_shape(problem: Problem, start: FloatArray, *, scene: SceneAsked = "auto") -> SceneChoice:
+def choose_shape(problem: Problem, start: FloatArray, *, scene: SceneName = "auto") -> SceneChoice:
     """Fit the bump from (5,) ``(u, v, x, y, r)``; test whether it is round, rotated and on a slope.
 
     Level and tilt are always integrated out, and the axis ratio stays free unless `scene` says round: dropping either

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from tactile_bayes.posterior.verdict import chance_text
-from tactile_bayes.presets import HELD, INTERVAL, RESEARCH_USE
+from tactile_bayes.presets import HELD_OUT_PROBABILITY, INTERVAL, RESEARCH_USE
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import PAPER_SPREAD
 from tactile_bayes.size.eq6 import COEFFICIENTS, AxisCalibration, LeftOutErrors, SizeCalibration
@@ -122,7 +122,7 @@ def body_calibration_text(calibration: BodyCalibration) -> str:
     """Constants, spreads, what the unknowns cost, and the errors on masses left out."""
     fit, held = defaultdict(lambda: float("nan"), {"bodies": 0.0, "maps": 0.0} | dict(calibration.fit)), ""
     if "left_out_held_percent" in fit:
-        held = f", {fit['left_out_held_percent']:.0f} % in their {100 * HELD:g} % interval"
+        held = f", {fit['left_out_held_percent']:.0f} % in their {100 * HELD_OUT_PROBABILITY:g} % interval"
     lines = [
         *_eq6_lines(calibration),
         f"between bodies, SD of ln d {fit['body_sd']:.3f} (median; it changes with amplitude, width and depth), "

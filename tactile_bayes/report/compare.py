@@ -11,10 +11,10 @@ from scipy.special import ndtri
 from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import Chance, EstimateReport, Findings, Interval, Judgement, Number1, Report
-from tactile_bayes.findings import capital, finding_lines, finding_summary
+from tactile_bayes.findings import capitalised, finding_lines, finding_summary
 from tactile_bayes.findings import verdict as verdict_of
 from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.options import Above0, Comparing, Least0
+from tactile_bayes.options import CompareOptions, NonNegative, Positive
 from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import share_words
@@ -51,8 +51,10 @@ class VisitPlace(Record):
     """How far the mass of a later visit lies from the first visit's."""
 
     visit: Annotated[int, Meta(ge=2)]
-    distance_mm: Least0 | None
-    sd_mm: Least0 | None  #: SD by which one mass comes out apart between the visits, in the direction of the shift.
+    distance_mm: NonNegative | None
+    sd_mm: (
+        NonNegative | None
+    )  #: SD by which one mass comes out apart between the visits, in the direction of the shift.
     shift_mm: tuple[float, float] | None  #: x and y in the patient's frame, from the first visit's place.
     probability: Chance | None
     """That one mass comes out as far apart or farther; below 0.02 the visits are not compared."""
@@ -68,7 +70,7 @@ class GrownBy(Record):
 class Detectable(Record):
     """Least growth and shrinkage of the diameter whose 95 % interval would leave out no change, percent."""
 
-    growth: Least0
+    growth: NonNegative
     shrinkage: Annotated[float, Meta(ge=0, le=100)]
 
 
@@ -81,15 +83,15 @@ class Rate(Interval):
 class Doubling(Record):
     """Doubling time of the volume in days at the rate's median and ends; null where it does not grow."""
 
-    median: Above0 | None
-    shortest: Above0 | None
-    longest: Above0 | None
+    median: Positive | None
+    shortest: Positive | None
+    longest: Positive | None
 
 
 class GrowthRate(Record):
     """Growth between two visits so many days apart."""
 
-    days: Above0
+    days: Positive
     percent_per_day: Rate
     doubling_days: Doubling
 
@@ -98,7 +100,7 @@ class TrendReport(Record):
     """Straight line of ln d over three visits and more."""
 
     visits: Annotated[int, Meta(ge=3)]
-    days: Above0
+    days: Positive
     percent_per_day: Rate
     doubling_days: Doubling
     straight_line_probability: Chance | None  #: That sizes on a straight line come out as far from one or farther.
@@ -107,7 +109,7 @@ class TrendReport(Record):
 class AnotherChange(Record):
     """The change if exams of one mass differ as the paper's maps did."""
 
-    between_map_sd: Least0
+    between_map_sd: NonNegative
     percent: Quantity
     probability_grown: Chance
 
@@ -151,7 +153,7 @@ class CompareReport(Report, kw_only=True):
     changes: tuple[ChangeReport, ...]
     """Change from the first visit to each later one; empty where nothing is compared."""
     trend: TrendReport | None  #: Straight line of ln d over three visits and more with days; null otherwise.
-    between_map_sd: Least0 | None  #: SD of ln d between the exams of a visit, root mean square.
+    between_map_sd: NonNegative | None  #: SD of ln d between the exams of a visit, root mean square.
     repeatability: str | UnsetType = UNSET
     """How far exams of one mass lie apart at this site, where --repeatability told it"""
     left_out: tuple[str, ...]
@@ -189,7 +191,7 @@ def compare_report(
     compared: Compared,
     visits: Sequence[Sequence[EstimateReport]],
     names: Sequence[Sequence[str]],
-    comparing: Comparing,
+    comparing: CompareOptions,
     *,
     probability: float,
     provenance: Provenance,
@@ -235,7 +237,7 @@ def compare_report(
     ).rounded
 
 
-def _change(compared: Compared, later: int, comparing: Comparing, probability: float) -> ChangeReport:
+def _change(compared: Compared, later: int, comparing: CompareOptions, probability: float) -> ChangeReport:
     """Change from the first visit to a later one, and if exams of one mass differ as the paper's maps do."""
     joint, another, days = compared.joint, compared.another, comparing.days
     assert joint is not None
@@ -351,7 +353,7 @@ def rate_sentences(report: CompareReport) -> list[str]:
 def _refusal(report: CompareReport) -> str:
     """Why nothing is compared, and what would help."""
     head = "Not compared: not shown to be one mass" if report.status == "not_one_mass" else "Not compared"
-    advice = f" {capital(report.advice)}." if report.advice else ""
+    advice = f" {capitalised(report.advice)}." if report.advice else ""
     return f"{head}: {report.reason}.{advice}"
 
 
@@ -429,7 +431,7 @@ def _rate_words(rate: GrowthRate | TrendReport) -> str:
 def _site_line(report: CompareReport) -> list[str]:
     """Whose spread between exams the intervals and the smallest detectable change suppose, where it was learned."""
     words = report.site_words
-    return [f"{capital(words)}; the figures above are for such exams."] if words else []
+    return [f"{capitalised(words)}; the figures above are for such exams."] if words else []
 
 
 def _model_line(report: CompareReport) -> str:

@@ -13,7 +13,7 @@ from tactile_bayes.declarations import as_dict, rounded
 from tactile_bayes.files import reports
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import EstimateReport, MassReport
-from tactile_bayes.findings import Finding, capital, finding, verdict
+from tactile_bayes.findings import Finding, capitalised, finding, verdict
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.inference.draws import Quantity, summarise
 from tactile_bayes.mapping.clock import SIDES, ClockPosition, Position, clock_position, clock_text
@@ -191,7 +191,7 @@ def scene_lines(choice: SceneChoice) -> list[str]:
     names = [BUMP[choice.supported], *(f"{ASKED[one.name]} {one.place}".rstrip() for one in used)]
     window = f"the fit window of {choice.fit.target.problem.radius_mm:g} mm about the lump"
     lines = [f"Scene in {window}: {' and '.join(names)}, the simplest that the map supports."]
-    lines += [f"{capital(ASKED[one.name])} is in the model {odds(one)}." for one in used]
+    lines += [f"{capitalised(ASKED[one.name])} is in the model {odds(one)}." for one in used]
     kept = [one for one in choice.structures if one.used and not one.supported and not one.place]
     lines += [f"Also in the model: {ASKED[one.name]} {odds(one)}." for one in kept]
     out = [f"{ASKED[one.name]} {odds(one)}" for one in choice.structures if not one.used]

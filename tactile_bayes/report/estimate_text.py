@@ -8,7 +8,7 @@ from typing import Any
 
 from tactile_bayes.declarations import from_plain
 from tactile_bayes.files.reports import EstimateReport, MassReport, PooledReport, SmallestLump
-from tactile_bayes.findings import capital, finding_lines, finding_summary, joined
+from tactile_bayes.findings import capitalised, finding_lines, finding_summary, first_texts
 from tactile_bayes.inference.draws import ParameterDraws, Quantity
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.result import Estimate
@@ -195,7 +195,7 @@ def estimate_text(estimate: Estimate, report: EstimateReport) -> str:
 def no_estimate_line(reason: str) -> str:
     """First line of a report without an estimate."""
     told = reason.startswith(("no lump found", "the data cannot show"))
-    return f"{capital(reason)}." if told else f"No estimate: {reason}."
+    return f"{capitalised(reason)}." if told else f"No estimate: {reason}."
 
 
 def _no_estimate(report: EstimateReport) -> list[str]:
@@ -348,7 +348,7 @@ def estimate_summary(estimate: Estimate, report: EstimateReport) -> str:
     if estimate.scene is not None:
         model = [estimate_document.scene_line(estimate.scene)]
     else:
-        model = joined(report.left_out, most=2, lead="Left out: ")
+        model = first_texts(report.left_out, most=2, lead="Left out: ")
     return "\n".join([*body, " ".join([*model, MORE]), RESEARCH_USE]) + "\n"
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, UsageError
 from tactile_bayes.files.reports import EstimateReport, MassReport, Place, Point, PooledReport, centre_of
-from tactile_bayes.findings import capital
+from tactile_bayes.findings import capitalised
 from tactile_bayes.geometry import apply
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.clock import ClockPosition, clock_position, clock_text
@@ -167,7 +167,7 @@ def headline(exam: Exam) -> str:
         interval = f"{share_words(size)} interval {size.low:.1f} to {size.high:.1f} mm"
         return f"{what} about {size.median:.1f} mm, {interval}"
     if exam.disagrees:
-        return capital(exam.report.reason)
+        return capitalised(exam.report.reason)
     if masses:
         return f"{'Lump' if len(masses) < 2 else f'{len(masses)} masses'} seen, no size"
     if exam.main.report.reason_code == CANNOT_SHOW:
@@ -240,7 +240,7 @@ def nothing_sentences(exam: Exam) -> Iterator[str]:
         return
     report, tactile_map = exam.main.report, exam.main.tactile_map
     if exam.pooled is not None:
-        yield f"{capital(exam.pooled.reason)}."
+        yield f"{capitalised(exam.pooled.reason)}."
     if report.reason_code in NO_LUMP:
         area = "" if tactile_map is None else f": {covered_text(tactile_map)}"
         yield f"No lump was found in the area that was covered{area}."
@@ -250,7 +250,7 @@ def nothing_sentences(exam: Exam) -> Iterator[str]:
             yield f"{smallest_text(report.smallest_lump)}."
         yield "A lump may be smaller, deeper or softer than these, or lie outside the area that was covered."
     else:
-        yield f"{capital(report.reason)}."
+        yield f"{capitalised(report.reason)}."
     if report.on_paper:
         yield f"What would help: {report.on_paper}."
 
@@ -267,9 +267,9 @@ def place_sentence(mass: ExamMass, probability: float) -> str:
 def short_place(mass: ExamMass) -> str:
     """Where a mass lies, without intervals."""
     if mass.place is not None:
-        return capital(mass.place.text())
+        return capitalised(mass.place.text())
     if mass.patient_mm is not None:
-        return capital(from_xiphoid(*mass.patient_mm))
+        return capitalised(from_xiphoid(*mass.patient_mm))
     return "At ({:.0f}, {:.0f}) mm on the map".format(*mass.centre_mm)
 
 

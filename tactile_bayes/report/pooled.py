@@ -9,7 +9,7 @@ import numpy as np
 from tactile_bayes.declarations import UNSET
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
 from tactile_bayes.files.reports import POOLED, EstimateReport, Interval, MassReport, PooledMap, PooledReport
-from tactile_bayes.findings import Finding, capital, finding, finding_lines, finding_summary, verdict
+from tactile_bayes.findings import Finding, capitalised, finding, finding_lines, finding_summary, verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.presets import MATCH_MM, RESEARCH_USE
@@ -149,7 +149,7 @@ def pooled_findings(pooled: PooledEstimate, reports: Sequence[EstimateReport]) -
     for index in sized if pooled.status == DISAGREE else sorted(pooled.centres):
         for one in reports[index].findings:
             if one.kind != "outside_calibration":  # of the size alone
-                yield one.at(_number(index))
+                yield one.labelled(_number(index))
     apart = apart_from_others(reports)
     for index, words in (apart or {}).items():
         yield finding("another_mass", words, about=_number(index))
@@ -258,7 +258,7 @@ def pooled_text(report: PooledReport) -> str:
     lines.append(
         f"Monte-Carlo error of the interval ends: {estimate_text.ends_text('sizes', worst.mc_error, worst.sd)}."
     )
-    lines.append(f"{capital(fat_text(report.fat_mm) + unknowns_text(report.unknowns))}.")
+    lines.append(f"{capitalised(fat_text(report.fat_mm) + unknowns_text(report.unknowns))}.")
     lines += [f"Sizes by {report.site}."] if report.site else []
     lines += [f"Left out: {'; '.join(report.left_out)}."] if report.left_out else []
     lines += [f"{report.reason}."] if report.reason else []

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from tactile_bayes.declarations import UNSET, replace
-from tactile_bayes.shell import padded, shown_columns
+from tactile_bayes.shell import padded, text_width
 from tactile_bayes.trial.accuracy import REFERENCE, ModalityRatio, PairedComparison, least_p
 from tactile_bayes.trial.figures import MIN_PATIENTS, Ends, Figure
 from tactile_bayes.trial.planning import Design, Needed, PlanReport
@@ -248,7 +248,7 @@ def figure_table(report: TrialReport, wanted: Mapping[str, tuple[str, str]]) -> 
         found = one.detected_interval
         share = "" if found is None else f"{_between((100 * found[0], 100 * found[1]), '.0f')} %"
         rows.append(("", share, *(_between(figure.interval, spec) for figure, spec in figures)))
-    widths = [max(map(shown_columns, column)) for column in zip(*(row for row in rows if len(row) > 1), strict=True)]
+    widths = [max(map(text_width, column)) for column in zip(*(row for row in rows if len(row) > 1), strict=True)]
     lines = ["  ".join(padded(cell, width) for cell, width in zip(row, widths, strict=False)).rstrip() for row in rows]
     return [line for line in lines if line]
 

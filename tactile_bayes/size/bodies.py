@@ -27,7 +27,7 @@ from typing import Annotated, Final
 import numpy as np
 
 from tactile_bayes.declarations import Meta, Record, replace
-from tactile_bayes.errors import BadDataError, UsageError, check_number, meant
+from tactile_bayes.errors import BadDataError, UsageError, check_number, suggestion
 from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
 from tactile_bayes.size import terms
 from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, Supposition
@@ -348,7 +348,7 @@ def known_body(
     names = () if hidden is None else hidden.names
     for name, value in known.items():
         if name not in names:
-            raise UsageError(f"the calibration has no property {name}; {meant(name, names or ('none',))}")
+            raise UsageError(f"the calibration has no property {name}; {suggestion(name, names or ('none',))}")
         check_number(f"known {name}", value, 0, open_ends=name != "seat")
         columns = ("d_mm", "depth_ratio") if name == "depth_mm" else (name,)
         if all(one in calibration.bodies for one in columns):

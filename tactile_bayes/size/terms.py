@@ -15,7 +15,7 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from scipy.special import ndtri
 
-from tactile_bayes.declarations import Meta, Record, field, says
+from tactile_bayes.declarations import Meta, Record, described, field
 from tactile_bayes.errors import Abstention, BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
 from tactile_bayes.presets import HEAD_PROFILE, INTERVAL, Background, Noise
@@ -25,7 +25,7 @@ LEARN_ANEW: Final = "learn the calibration anew"
 _RANGES: Final = ("amplitude", "sigma_mm", "d_mm")
 Normalise = Literal["mean", "gain", "none"]
 Range = tuple[Annotated[float, Meta(gt=0)], Annotated[float, Meta(gt=0)]]
-Domain = Annotated[Mapping[str, Range], says("Ranges in the table.", extra_json_schema={"required": [*_RANGES]})]
+Domain = Annotated[Mapping[str, Range], described("Ranges in the table.", extra_json_schema={"required": [*_RANGES]})]
 """Ranges of amplitude, sigma_mm (geometric mean) and d_mm."""
 Share = Annotated[float, Meta(ge=0)]
 Above0 = Annotated[float, Meta(gt=0)]

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Generic, TypeVar
 
 import numpy as np
 
-from tactile_bayes.declarations import Meta, Record, field, replace, says
+from tactile_bayes.declarations import Meta, Record, described, field, replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.inference.draws import Quantity, summarise
 from tactile_bayes.mapping.map import TactileMap
@@ -17,7 +17,7 @@ from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.presets import INTERVAL, MOST_FIELD_COSINES, Background
-from tactile_bayes.progress import Progress, untold
+from tactile_bayes.progress import Progress, no_progress
 from tactile_bayes.size.pooling import Calibration
 
 # --- The reported numbers of one setting, and how far they lie from a reference.
@@ -113,7 +113,7 @@ def distances(answers: Sequence[SizeAnswer], reference: SizeAnswer | None) -> Di
 # --- Settings with what each costs and answers, against one reference; the frontier, and which setting is enough.
 
 Clock = Callable[[], float]
-Seconds = Annotated[dict[str, float], says("CPU seconds by part.")]
+Seconds = Annotated[dict[str, float], described("CPU seconds by part.")]
 WORTH = 0.8  #: A setting that takes more than this share of the default's time is not worth a choice.
 MOST_S = 4.0  #: CPU seconds after which a setting is not run again: its least time is known well enough.
 
@@ -126,7 +126,7 @@ class Work(Record):
     runs: int = 3  #: Of each setting: times are the least of them, distances their root mean square.
     announce: Callable[[float], None] = lambda _seconds: None
     """Called once, when the default has been timed, with about how many CPU seconds the rest will take."""
-    progress: Progress = untold  #: Called with settings done and in all.
+    progress: Progress = no_progress  #: Called with settings done and in all.
     seed: int = 1  #: Of the random numbers.
     probability: float = INTERVAL  #: Of the intervals.
 

@@ -19,7 +19,7 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.select import select_frames
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import BumpFit, fit_bump, fitted_candidates
-from tactile_bayes.progress import Progress, untold
+from tactile_bayes.progress import Progress, no_progress
 from tactile_bayes.scans import ElementCalibration, PressureFrames, Scan
 from tactile_bayes.studies.paper import HARD_RATIO, PAPER_DIAMETERS_MM, MapFit, StudySettings, centre_line, fit_line
 
@@ -311,7 +311,7 @@ def measured_frames(
 
 
 def compare_model(
-    measured: MeasuredScan, scene: Scene, *, fidelity: str, head: str | None = None, progress: Progress = untold
+    measured: MeasuredScan, scene: Scene, *, fidelity: str, head: str | None = None, progress: Progress = no_progress
 ) -> ModelComparison:
     """One model of a scene, with its first lump put where the measured one is, against measured frames.
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import betaincinv, ndtr, ndtri, stdtrit
 
-from tactile_bayes.declarations import UNSET, Meta, Record, replace, says
+from tactile_bayes.declarations import UNSET, Meta, Record, described, replace
 from tactile_bayes.options import IntervalMethod
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 
@@ -261,7 +261,7 @@ Ends = tuple[float, float]
 Count = Annotated[int, Meta(ge=0)]
 NotNegative = Annotated[float, Meta(ge=0)]
 Share = Annotated[float, Meta(ge=0, le=1)]
-Reasons = Annotated[dict[str, Annotated[str, Meta(min_length=1)]], says("Why a figure or an interval is null.")]
+Reasons = Annotated[dict[str, Annotated[str, Meta(min_length=1)]], described("Why a figure or an interval is null.")]
 
 
 class Figures(Record):

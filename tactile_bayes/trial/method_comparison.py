@@ -10,7 +10,7 @@ from typing import Annotated, Literal, TypeVar
 import numpy as np
 from scipy.special import chdtri, chndtrix, gammaincc, nctdtrit, ndtri, stdtr
 
-from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, replace, says
+from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType, described, replace
 from tactile_bayes.trial import lines
 from tactile_bayes.trial.figures import (
     Count,
@@ -321,9 +321,9 @@ Unit = Literal["mm", "log_ratio"]
 Against = Literal["on_ex_vivo", "on_mean"]
 _Refitted = Ends | None | UnsetType
 """The interval of a figure that has none where there are more than `MOST_REFITTED` masses."""
-_LimitMm = Annotated[float, says("Limit of agreement in mm for single readings; the interval is over patients.")]
+_LimitMm = Annotated[float, described("Limit of agreement in mm for single readings; the interval is over patients.")]
 _LimitLog = Annotated[
-    float, says("Limit of agreement in ln(size / ex vivo) for single readings; the interval is over patients.")
+    float, described("Limit of agreement in ln(size / ex vivo) for single readings; the interval is over patients.")
 ]
 
 

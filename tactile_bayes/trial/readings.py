@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from tactile_bayes.declarations import Record, field, settle
+from tactile_bayes.declarations import Record, field, set_fields
 from tactile_bayes.errors import BadDataError
 
 # --- Readings of masses by several modalities, checked for consistency and grouped by mass.
@@ -71,7 +71,7 @@ class ModalitySizes(Record, eq=False):
     def __post_init__(self) -> None:
         n = len(self.ex_vivo_mm)
         if len(self.mass) != n:
-            settle(self, mass=np.arange(n))
+            set_fields(self, mass=np.arange(n))
         if not (
             self.patient.shape == self.ex_vivo_mm.shape == self.size_mm.shape == (n,) == (len(self.replicates_mm),)
         ):

@@ -13,7 +13,7 @@ from in_process import run_here
 from posterior_files import write_calibration, write_maps
 
 import tactile_bayes
-from tactile_bayes.actions.show import shown
+from tactile_bayes.actions.show import fact_lines
 
 Run = Callable[..., "CompletedProcess[str]"]
 DEMO = Path(tactile_bayes.__file__).parent / "demo"
@@ -127,6 +127,6 @@ def test_what_is_none_of_ours_is_one_line_and_exit_3(tmp_path: Path, name: str, 
 
 
 def test_many_numbers_are_counted_and_many_words_are_shown() -> None:
-    lines = list(shown({"a": [[0.5, 1.5]] * 20, "b": ["word"] * 40}))
+    lines = list(fact_lines({"a": [[0.5, 1.5]] * 20, "b": ["word"] * 40}))
     assert lines[0] == "a  40 numbers, 0.5 to 1.5"
     assert lines[1].count("word") == 40

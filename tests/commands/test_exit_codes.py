@@ -12,7 +12,7 @@ from in_process import run_here
 
 from tactile_bayes import errors
 from tactile_bayes.cli import GROUPS
-from tactile_bayes.shell import ended_in_order
+from tactile_bayes.shell import interrupt_on_signals
 from tests.conftest import ROOT
 
 INTERRUPTED = """
@@ -59,7 +59,7 @@ def test_a_signal_to_end_ends_as_ctrl_c_does(number: signal.Signals, tmp_path: P
 def test_what_nohup_ignores_stays_ignored() -> None:
     before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGTERM, signal.SIGHUP)}
     try:
-        with ended_in_order():
+        with interrupt_on_signals():
             assert all(signal.getsignal(number) is signal.SIG_IGN for number in before)
     finally:
         for number, handler in before.items():

@@ -236,11 +236,11 @@ def _read_scan(path: Path) -> object:
 
 
 def _describe(path: Path) -> object:
-    from tactile_bayes.actions.show import describe, shown
+    from tactile_bayes.actions.show import describe, fact_lines
     from tactile_bayes.files.documents import dump_json
 
     found = describe(path)
-    return dump_json(found), list(shown(found))
+    return dump_json(found), list(fact_lines(found))
 
 
 def _read_arrays(path: Path) -> object:

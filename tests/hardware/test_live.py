@@ -18,7 +18,7 @@ from emulated_devices import head_and_tracker, short_scan
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from tactile_bayes.actions.live_view import Turn, live_estimate, live_line, live_text
+from tactile_bayes.actions.live_view import RiseRotation, live_estimate, live_line, live_text
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.hardware.live import (
@@ -302,15 +302,15 @@ def test_an_address_of_this_computer(text, address):
 
 
 def test_the_estimate_looks_at_one_rise_a_time_and_stays_where_a_lump_was():
-    turn, seen, shown = Turn(), [], []
+    turn, seen, shown = RiseRotation(), [], []
     for _ in range(20):
         seen.append(turn.of(4))
         shown.append(turn.tell(lump=seen[-1] == 2))
     assert seen == [0, 1, 2, 2, 2, 2, 2, 0, 2, 2, 2, 2, 2, 2, 2, 0, 2, 2, 2, 2]
     assert [place for place, told in enumerate(shown) if not told] == [7, 15]  # a glance at the highest: nothing new
-    turn = Turn()
+    turn = RiseRotation()
     assert [(turn.of(2), turn.tell(lump=False))[0] for _ in range(5)] == [0, 1, 0, 1, 0]
-    higher = Turn()
+    higher = RiseRotation()
     assert [(at := higher.of(3), higher.tell(lump=at == 1))[0] for _ in range(4)] == [0, 1, 1, 1]
     for _ in range(4):
         at = higher.of(3)
@@ -319,7 +319,7 @@ def test_the_estimate_looks_at_one_rise_a_time_and_stays_where_a_lump_was():
 
 
 def test_the_next_fit_of_a_lump_begins_with_its_width_and_a_glance_does_not():
-    turn, begun = Turn(), []
+    turn, begun = RiseRotation(), []
     for number in range(9):
         turn.of(2)
         begun.append(turn.width_mm)
@@ -331,12 +331,12 @@ def test_the_live_estimate_is_the_estimate(state):
     from tactile_bayes.posterior.draw import SamplerSettings
     from tactile_bayes.posterior.estimate import estimate_map
 
-    text, lump_base_mm = live_estimate(state.tactile_map, None, Turn())
+    text, lump_base_mm = live_estimate(state.tactile_map, None, RiseRotation())
     options = SamplerSettings(method="laplace", rotation="off")
     found = estimate_map(state.tactile_map, calibration=None, options=options, rng=np.random.default_rng(1))
     widths = np.maximum(found.map_posterior.sigma_x_mm, found.map_posterior.sigma_y_mm)
     assert text.startswith(f"map width sigma {np.median(widths):.1f} mm (")
     flat = replace(state.tactile_map, mean=np.where(state.tactile_map.covered, 1.0, np.nan))
-    assert live_estimate(flat, None, Turn()).text.startswith("no estimate: ")
+    assert live_estimate(flat, None, RiseRotation()).text.startswith("no estimate: ")
     x, y = replace(state, lump_base_mm=lump_base_mm).lump_mm
     assert (x, y) == pytest.approx((np.median(found.map_posterior.x_mm), np.median(found.map_posterior.y_mm)), abs=0.05)

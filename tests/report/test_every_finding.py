@@ -40,7 +40,7 @@ from tactile_bayes.files.manifest_csv import Exam as Listed
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
-from tactile_bayes.findings import KINDS, LEADS, Finding, by_weight, finding, verdict
+from tactile_bayes.findings import KINDS, LEADS, Finding, by_severity, finding, verdict
 from tactile_bayes.geometry import rigid
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.build import build_map
@@ -89,7 +89,7 @@ class Made:
     """The same three results with findings."""
 
     def __init__(self, findings: Sequence[Finding]) -> None:
-        self.findings = by_weight(findings)
+        self.findings = by_severity(findings)
         one, pooled, compared = sound()
         told: Any = {"findings": self.findings}
         told["verdict"] = verdict(findings, answered=True)
@@ -371,11 +371,11 @@ def test_what_speaks_against_a_map_reaches_pool_comparison_and_campaign(tmp_path
 
 
 def test_the_live_view_says_a_caution_before_the_size() -> None:
-    from tactile_bayes.actions.live_view import Turn, live_estimate
+    from tactile_bayes.actions.live_view import RiseRotation, live_estimate
 
     shipped = Path(tb.__file__).parent / "calibrations" / "solid.json"
     live = replace(plain_map(1), findings=(one_of("late_poses"), one_of("few_strokes")))
-    assert live_estimate(live, str(shipped), Turn()).text.startswith(
+    assert live_estimate(live, str(shipped), RiseRotation()).text.startswith(
         "CAUTION: words for late_poses; give --late_poses."
     )
 

@@ -11,7 +11,7 @@ from in_process import run_here
 from posterior_files import MADE
 from posterior_maps import bump_map
 
-from tactile_bayes.actions.live_view import Turn, live_estimate
+from tactile_bayes.actions.live_view import RiseRotation, live_estimate
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE
 from tactile_bayes.files.map_nc import write_map
@@ -156,8 +156,10 @@ def test_a_size_beyond_the_tables_lumps_is_cautioned(shipped: BodyCalibration, s
 
 
 def test_the_live_view_says_it_first() -> None:
-    said = live_estimate(gain_map(profile=EVEN, amplitude=0.348, sigma_x=6.1, sigma_y=5.2), str(SHIPPED), Turn()).text
+    said = live_estimate(
+        gain_map(profile=EVEN, amplitude=0.348, sigma_x=6.1, sigma_y=5.2), str(SHIPPED), RiseRotation()
+    ).text
     assert said.startswith("CAUTION: unlike the lumps that sizes were learned from: amplitude 0.3")
     assert ". largest size" in said
-    far = live_estimate(gain_map(amplitude=15.0, sigma_x=5.0, sigma_y=5.0), str(SHIPPED), Turn()).text
+    far = live_estimate(gain_map(amplitude=15.0, sigma_x=5.0, sigma_y=5.0), str(SHIPPED), RiseRotation()).text
     assert far.startswith("no estimate: too unlike the lumps that sizes were learned from")

@@ -10,7 +10,7 @@ import pytest
 from published_schemas import check_document
 from scipy import stats
 
-from tactile_bayes.declarations import check, to_plain
+from tactile_bayes.declarations import check_record, to_plain
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.report.trial import trial_text
 from tactile_bayes.report.trial_html import trial_html
@@ -70,7 +70,7 @@ def sections(name: str) -> dict:
 def test_every_report_is_valid_and_can_be_shown(name: str) -> None:
     of = TRIALS[name]()
     made = summarise(of, provenance=PROVENANCE)
-    check(made)
+    check_record(made)
     document = json.loads(dump_json(to_plain(made, digits=12)))
     check_document(document, "validate.schema.json")
     assert "nan" not in trial_text(made).replace("nant", "")

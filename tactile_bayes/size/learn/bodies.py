@@ -19,7 +19,7 @@ from scipy.special import ndtri
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.presets import HELD
+from tactile_bayes.presets import HELD_OUT_PROBABILITY
 from tactile_bayes.size.bodies import CUBIC, QUADRATIC, BodyCalibration, Centre, Spread, known_body
 from tactile_bayes.size.eq6 import BY_DEPTH, MU, PLAIN, Eq6Law, F, Powers, eq6_log_size, eq6_terms
 from tactile_bayes.size.learn import regression
@@ -167,7 +167,7 @@ def _calibration(
     spread, of_spread = regression.body_spread(rows.spread_terms(data), left, noise)
     body_sd = np.exp(rows.spread_terms(data) @ spread)
     inverse, leverage = regression.leverages(features)
-    held = float(np.mean(np.abs(left) <= ndtri(0.5 + HELD / 2) * np.sqrt(body_sd**2 + noise)))
+    held = float(np.mean(np.abs(left) <= ndtri(0.5 + HELD_OUT_PROBABILITY / 2) * np.sqrt(body_sd**2 + noise)))
     ranged = {"amplitude": np.exp(maps.log_amplitude), "sigma_mm": np.exp(maps.log_width), "d_mm": maps.d_mm}
     off = np.expm1(-left)  # of sizes of bodies left out
     figures = {
