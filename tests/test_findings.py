@@ -23,7 +23,7 @@ def test_cautions_come_first_and_each_finding_once():
 
 def test_paper_never_reads_an_option():
     assert CAUTION.sentence() == "poses came late; --latency-ms auto"
-    assert CAUTION.at("map 2").sentence(paper=True) == "map 2: poses came late; map the scan again"
+    assert CAUTION.labelled("map 2").sentence(paper=True) == "map 2: poses came late; map the scan again"
 
 
 def test_an_unknown_kind_is_refused_with_the_kinds():
