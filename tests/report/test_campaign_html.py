@@ -142,7 +142,7 @@ def test_a_mass_is_of_its_last_visit_and_names_the_exams_that_a_finding_is_of() 
 def test_what_speaks_against_a_comparison_is_told_once_beside_what_speaks_against_its_exams() -> None:
     of_exam, of_pair = finding("side", "another side"), finding("taken_as_one", "two places")
     visits = tuple(VisitEntry(code, (sized(SIZE, of_exam),), SIZE) for code in "12")
-    growth = Growth("P", "1", "1", "2", "compared", verdict="grown", findings=(of_exam.at("visit 1"), of_pair))
+    growth = Growth("P", "1", "1", "2", "compared", verdict="grown", findings=(of_exam.labelled("visit 1"), of_pair))
     row = MassRow("P", "1", visits, growth=growth)
     assert [text for _, text in row.told] == finding_lines((of_exam, of_pair), paper=True)
     page = page_of(row)
