@@ -86,8 +86,8 @@ HEADS = (
     "learned: median (90 % of sites)",
     "its 95 % interval holds it",
     "95 % intervals of sizes cover, half width",
-    "no file, first interval",
-    "no file, second",
+    "no file, narrower interval",
+    "no file, wider",
 )
 SHOWN = (
     "one map of a new mass (site's file)",
