@@ -24,7 +24,7 @@ from tactile_bayes.files.size_json import read_size_calibration, size_calibratio
 from tactile_bayes.files.tables import read_table
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.learn.bodies import learn_population, sized
+from tactile_bayes.size.learn.bodies import learn_population, size_errors
 from tactile_bayes.size.learn.regression import PopulationTable
 from tactile_bayes.studies.population import population_table
 from validation.common import Table, parser
@@ -67,7 +67,7 @@ def shipped(name: str) -> BodyCalibration:
 
 def errors(calibration: BodyCalibration, table: PopulationTable, known: Sequence[str] = ()) -> FloatArray:
     """(2, bodies) errors of ln d, and the variances stated."""
-    found = sized(calibration, table, known=known)
+    found = size_errors(calibration, table, known=known)
     return np.stack([found.error, found.variance])
 
 

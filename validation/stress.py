@@ -229,7 +229,7 @@ def exam_of(kept: dict[str, Any]) -> Exam:
     )
 
 
-def exams_in(folder: Path) -> list[Exam]:
+def exams_of_campaign(folder: Path) -> list[Exam]:
     """All exams of a folder that could be mapped; the others are named on standard output."""
     found = []
     for path in sorted(folder.glob("*.pickle")):
@@ -273,4 +273,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if given.step == "simulate":
         simulate(given.folder, given.bodies)
     else:
-        print("\n".join(table(exams_in(given.folder))))
+        print("\n".join(table(exams_of_campaign(given.folder))))

@@ -25,10 +25,10 @@ from tactile_bayes.size.visits import (
     STRANGERS,
     AmplitudeLaw,
     JointSizes,
-    Place,
+    PatientPlace,
     SharedBody,
-    apart,
     joint_sizes,
+    place_shift,
 )
 from validation.visits import draw_visits
 
@@ -60,7 +60,7 @@ class Body:
     log_d: FloatArray
     place: FloatArray
     maps: tuple[tuple[ShapeDraws, ...], ...]
-    places: tuple[Place | None, ...]
+    places: tuple[PatientPlace | None, ...]
 
 
 def bodies_in(folder: Path) -> Iterator[Body]:
@@ -71,16 +71,16 @@ def bodies_in(folder: Path) -> Iterator[Body]:
         visits = range(len(found["d_mm"]))
         exams = [[_exam(found, f"v{v}e{e}_") for e in range(2) if f"v{v}e{e}_q" in found] for v in visits]
         maps = tuple(tuple(shape for shape, _ in one) for one in exams)
-        places = tuple(Place.mean_of([place for _, place in one]) for one in exams)
+        places = tuple(PatientPlace.mean_of([place for _, place in one]) for one in exams)
         yield Body(path.stem, np.log(found["d_mm"]), found["place"], maps, places)
 
 
-def _exam(found: dict[str, FloatArray], head: str) -> tuple[ShapeDraws, Place]:
+def _exam(found: dict[str, FloatArray], head: str) -> tuple[ShapeDraws, PatientPlace]:
     drawn = [found[head + name].astype(np.float64) for name in ("log_amplitude", "log_width", "q", "r")]
     figures = {name: tuple(map(float, found[head + name])) for name in ("profile",) if head + name in found}
     labels = found[head + "labels"].astype(np.intp)
     shape = ShapeDraws(*drawn, turn_rad=float(found[head + "turn_rad"]), labels=labels, **figures)
-    return shape, Place(found[head + "centre"], found[head + "centre_cov"])
+    return shape, PatientPlace(found[head + "centre"], found[head + "centre_cov"])
 
 
 def _calibration() -> BodyCalibration:
@@ -281,7 +281,7 @@ def amplitude(table: Path) -> None:
 def _print_places(bodies: Sequence[Body]) -> None:
     """Refusals by place: of pairs of visits of one mass, and of two masses of one breast."""
     right = [
-        apart(one, other).doubtful
+        place_shift(one, other).doubtful
         for body in bodies
         for one, other in combinations(body.places, 2)
         if one is not None and other is not None
@@ -291,23 +291,23 @@ def _print_places(bodies: Sequence[Body]) -> None:
     places = [[_touched(scenes) for scenes in visits[:2]] for _, visits, _ in drawn]
     sizes = np.array([visits[0][0].solid_lumps[0].d_mm for _, visits, _ in drawn])
     true = np.array([place for *_, place in drawn])
-    right = [apart(*pair).doubtful for pair in places]
+    right = [place_shift(*pair).doubtful for pair in places]
     print(f"place, {PLACES} further bodies without their maps: of one mass refused {_share(right)}")
-    wrong = np.array([apart(places[i - 1][0], places[i][1]).doubtful for i in range(PLACES)])
+    wrong = np.array([place_shift(places[i - 1][0], places[i][1]).doubtful for i in range(PLACES)])
     beside = np.hypot(*(np.roll(true, 1, axis=0) - true).T) > (np.roll(sizes, 1) + sizes) / 2
     print(f"  of two masses anywhere in one breast refused {_share(wrong)}")
     print(f"  of those that do not overlap refused {_share(wrong[beside])}")
 
 
-def _touched(scenes: Sequence[Scene]) -> Place:
+def _touched(scenes: Sequence[Scene]) -> PatientPlace:
     """Where a visit's landmarks put its mass; the error of the maps' centres, below 0.3 mm, is left out."""
     found = []
     for scene in scenes:
         marks, lump = scene.landmarks, scene.solid_lumps[0]
         notch, xiphoid = np.array(marks.sternal_notch_mm), np.array(marks.xiphoid_mm)
         frame = patient_from_base(notch, xiphoid, normal=np.array([0.0, 0.0, 1.0]))
-        found.append(Place(apply(frame, np.array([lump.x_mm, lump.y_mm, 0.0]))[:2], 0.1**2 * np.eye(2)))
-    place = Place.mean_of(found)
+        found.append(PatientPlace(apply(frame, np.array([lump.x_mm, lump.y_mm, 0.0]))[:2], 0.1**2 * np.eye(2)))
+    place = PatientPlace.mean_of(found)
     assert place is not None
     return place
 

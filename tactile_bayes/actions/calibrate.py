@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from tactile_bayes.api.repeatability import exams_in, learn_from_exams
+from tactile_bayes.api.repeatability import exams_of_campaign, learn_from_exams
 from tactile_bayes.api.size_calibration import learn
 from tactile_bayes.commands.options import protect_inputs, typed_options
 from tactile_bayes.declarations import as_dict
@@ -122,6 +122,6 @@ def calibrate_repeatability_action(folder: Path, output: Path, size_calibration:
     """Learn how far sizes of one mass lie apart between its exams at this site."""
     if size_calibration is not None:
         protect_inputs(size_calibration_path(size_calibration))
-    learned = learn_from_exams(exams_in(folder), size_calibration=size_calibration)
+    learned = learn_from_exams(exams_of_campaign(folder), size_calibration=size_calibration)
     learned.write(output, force=force)
     click.echo(repeatability_text(learned), nl=False)

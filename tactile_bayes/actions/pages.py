@@ -10,9 +10,9 @@ from typing import Any
 import click
 
 from tactile_bayes.api.comparing import compare_estimates
-from tactile_bayes.api.estimates import exam_of_files, export
+from tactile_bayes.api.estimates import exam_from_files, export
 from tactile_bayes.api.estimating import estimate_file
-from tactile_bayes.api.settings import dates_of, refuse_checkpoint, times_of
+from tactile_bayes.api.settings import days_from_first, refuse_checkpoint, split_dates
 from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.commands.options import make_settings, typed_options
 from tactile_bayes.declarations import replace
@@ -48,7 +48,7 @@ def compare_action(
 ) -> int:
     """Compare the size of a mass at two visits and more."""
     comparing = CompareOptions(
-        days=times_of(days or None, dates_of(dates) or None),
+        days=days_from_first(days or None, split_dates(dates) or None),
         grown_by=tuple(percent / 100 for percent in grown_by),
         same_mass=same_mass,
         registration_mm=registration_mm,
@@ -72,7 +72,7 @@ def compare_action(
             progress(sum(map(len, done)), total)
     names = [[str(path) for path in maps] for maps in visits]
     found = compare_estimates(done, settings, comparing, names=names, files=visits)
-    found = replace(found, dates=dates_of(dates))
+    found = replace(found, dates=split_dates(dates))
     report = found.report.checked()
     text_of = json_text if as_json else compare_text if verbose else compare_summary
     try:
@@ -100,7 +100,7 @@ def report_action(
     words, page = Given(title, name, day), PageFiles(output, pdf, force)
     page.check()
     typed = [name for name in asked if name in typed_options()]
-    found = exam_of_files(
+    found = exam_from_files(
         files, lambda: make_settings(**asked), typed=typed, notice=lambda line: click.echo(line, err=True)
     )
     exam = replace(found, given=words)

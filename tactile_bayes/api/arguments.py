@@ -29,7 +29,7 @@ _CHOICES: Final = ("method", "normalise", "fidelity", "noise", "background", "sc
 _FLAGS: Final = ("force", "same-mass", "register-strokes", "flat-field", "patient-id-from-scan", "invert-rotation")
 
 
-def in_keywords(text: str) -> str:
+def options_as_keywords(text: str) -> str:
     """A text with keywords in place of the command line's options; commands between backticks stay."""
     parts = text.split("`")
     for i in range(0, len(parts), 2):
@@ -60,9 +60,9 @@ def door(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
             if BY_OPTIONS.get():
                 raise
             if isinstance(error, BadDataError):
-                error.what, error.way_out = in_keywords(error.what), in_keywords(error.way_out)
+                error.what, error.way_out = options_as_keywords(error.what), options_as_keywords(error.way_out)
             else:
-                error.args = (in_keywords(str(error)),)
+                error.args = (options_as_keywords(str(error)),)
             raise
 
     return called
@@ -96,7 +96,7 @@ def takes(
     return made
 
 
-def sequence_of(name: str, given: Any, what: str) -> Sequence[Any]:
+def list_of(name: str, given: Any, what: str) -> Sequence[Any]:
     """A list or other sequence as it is."""
     if isinstance(given, str | bytes) or not isinstance(given, Iterable):
         raise UsageError(f"{name} is {given!r}; give a list of {what}")
@@ -108,7 +108,7 @@ def plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-class Told(Record, eq=False):
+class TextResult(Record, eq=False):
     """What a function returns, in a notebook shown as its text."""
 
     @property

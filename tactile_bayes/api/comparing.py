@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, Told, door, path_of, plain, sequence_of, takes
-from tactile_bayes.api.estimates import estimated, settings_of
-from tactile_bayes.api.pooled import common_calibration, one_mass, place_of, without_calibration
-from tactile_bayes.api.settings import Settings, refuse_checkpoint, times_of
+from tactile_bayes.api.arguments import PathLike, TextResult, door, list_of, path_of, plain, takes
+from tactile_bayes.api.estimates import estimate_each, settings_of
+from tactile_bayes.api.pooled import common_calibration, patient_place, reestimate_at_common_mass, without_calibration
+from tactile_bayes.api.settings import Settings, days_from_first, refuse_checkpoint
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import CANNOT_SHOW, EXIT_DONE, EXIT_NO_ESTIMATE, UsageError
@@ -27,19 +27,19 @@ from tactile_bayes.report.growth_page import Course, DrawnMap, draw_comparison, 
 from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.report.pooled import disagreement, fat_apart
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import LEAST_PROBABILITY, BetweenMaps, ShapeDraws, one_size_of
+from tactile_bayes.size.draws import LEAST_PROBABILITY, BetweenMaps, ShapeDraws, one_size_by_draws
 from tactile_bayes.size.pooling import MOST_INVALID, log_sizes
 from tactile_bayes.size.terms import UNLIKE_LEARNED
 from tactile_bayes.size.visits import (
-    Apart,
     Change,
-    Compared,
     JointSizes,
-    Place,
-    apart,
+    PatientPlace,
+    PlaceShift,
+    VisitComparison,
     contradictions,
     joint_sizes,
     one_place_probability,
+    place_shift,
     visit_calibrations,
 )
 
@@ -50,10 +50,10 @@ if TYPE_CHECKING:
 # --- Two visits and more compared: whether they are of one mass, and the change of its size.
 
 
-class Comparison(Told, eq=False):
+class Comparison(TextResult, eq=False):
     """The size of one mass at several visits, and its change from the first to the last."""
 
-    compared: Compared
+    compared: VisitComparison
     report: CompareReport
     settings: Settings
     visits: tuple[tuple[SizeEstimate, ...], ...] = ()
@@ -230,7 +230,7 @@ def compare_estimates(
     visits: Visits, settings: Settings, comparing: CompareOptions, *, names: Names, files: Files = ()
 ) -> Comparison:
     """Compare visits, maps estimated again where they are of another mass; see `compare_answers`."""
-    every = iter(one_mass([one for visit in visits for one in visit]))
+    every = iter(reestimate_at_common_mass([one for visit in visits for one in visit]))
     same = tuple(tuple(next(every) for _ in visit) for visit in visits)
     answers = [[one.answer for one in visit] for visit in same]
     return replace(compare_answers(answers, settings, comparing, names=names, files=files), visits=same)
@@ -238,22 +238,22 @@ def compare_estimates(
 
 def _compared(
     visits: Sequence[Sequence[Answer]], calibration: BodyCalibration, settings: Settings, comparing: CompareOptions
-) -> Compared:
+) -> VisitComparison:
     """Sizes of the visits, where codes and places do not contradict that they are of one mass."""
     found = [[answer for answer in maps if answer.shape is not None] for maps in visits]
     missing = [words for number, maps in enumerate(visits, start=1) if (words := _missing(maps, f"visit {number}"))]
     contradicted = contradictions([_scans(one) for one in visits])
     if contradicted:
         advice = "compare exams of one mass; where a code is wrong, correct it in the scans' session and map them again"
-        return Compared("not_one_mass", "; ".join(contradicted), advice)
+        return VisitComparison("not_one_mass", "; ".join(contradicted), advice)
     if missing:
-        return Compared("no_estimate", "; ".join(missing), "scan the mass again, or leave that visit out")
+        return VisitComparison("no_estimate", "; ".join(missing), "scan the mass again, or leave that visit out")
     if unfit := without_calibration([one.report for maps in visits for one in maps]):
-        return Compared("no_estimate", unfit, "compare maps that have a size each")
-    of_maps = [[place for answer in maps if (place := place_of(answer.report)) is not None] for maps in found]
-    places = [Place.mean_of(one) for one in of_maps]
+        return VisitComparison("no_estimate", unfit, "compare maps that have a size each")
+    of_maps = [[place for answer in maps if (place := patient_place(answer.report)) is not None] for maps in found]
+    places = [PatientPlace.mean_of(one) for one in of_maps]
     away = tuple(
-        None if first is None or later is None else apart(first, later, registration_mm=comparing.registration_mm)
+        None if first is None or later is None else place_shift(first, later, registration_mm=comparing.registration_mm)
         for first, later in ((places[0], later) for later in places[1:])
     )
     doubts = [
@@ -270,13 +270,13 @@ def _compared(
     unknown = [str(number) for number, place in enumerate(places, start=1) if place is None]
     if not comparing.same_mass and doubts:
         advice = "compare exams of one mass; if it is one, --same-mass says so (a wider posture: --registration-mm)"
-        return Compared("not_one_mass", "; ".join(doubts), advice, away)
+        return VisitComparison("not_one_mass", "; ".join(doubts), advice, away)
     if not comparing.same_mass and unknown:
         reason = f"no landmarks show where the mass of visit {' and '.join(unknown)} lies in the patient"
-        return Compared("not_one_mass", reason, "touch both landmarks, or say --same-mass", away)
+        return VisitComparison("not_one_mass", reason, "touch both landmarks, or say --same-mass", away)
     doubts += [f"no landmarks show where the mass of visit {number} lies" for number in unknown]
     taken = [finding("taken_as_one", f"{text}; taken as one mass because you say so") for text in doubts]
-    return _sized(found, calibration, settings, apart=away, doubts=taken)
+    return _sized(found, calibration, settings, shifts=away, doubts=taken)
 
 
 def _missing(maps: Sequence[Answer], visit: str) -> str:
@@ -295,9 +295,9 @@ def _sized(
     calibration: BodyCalibration,
     settings: Settings,
     *,
-    apart: tuple[Apart | None, ...],
+    shifts: tuple[PlaceShift | None, ...],
     doubts: Sequence[Finding],
-) -> Compared:
+) -> VisitComparison:
     """Sizes of visits that are of one mass, or why there are none."""
     # one order whatever the caller's, so that the order of a visit's maps leaves no trace
     shapes: list[list[ShapeDraws]] = [
@@ -307,7 +307,7 @@ def _sized(
     fitted = visit_calibrations(shapes, calibration)
     far = _by_visit(shapes, fitted, far=True)
     if far:
-        return Compared("no_estimate", f"too {UNLIKE_LEARNED}: {'; '.join(far)}", "", apart)
+        return VisitComparison("no_estimate", f"too {UNLIKE_LEARNED}: {'; '.join(far)}", "", shifts)
     priors = size_priors(settings)
     words = sorted(answer.fingerprint for maps in visits for answer in maps)
 
@@ -317,21 +317,21 @@ def _sized(
 
     sizes = joint(None)
     if np.isnan(sizes.log_size).mean() > MOST_INVALID:
-        return Compared("no_estimate", "too many draws have no positive size", "", apart)
+        return VisitComparison("no_estimate", "too many draws have no positive size", "", shifts)
     outside = _by_visit(shapes, fitted)
     fat = calibration.depth
-    depths = None if fat is None else fat.apart([one.profile for maps in shapes for one in maps])
+    depths = None if fat is None else fat.disagreement_mm([one.profile for maps in shapes for one in maps])
     findings = [
         *doubts,
         *(finding("outside_calibration", f"{UNLIKE_LEARNED}: {text}") for text in outside),
         *([] if depths is None else [fat_apart(depths)]),
     ]
     for number, (maps, at) in enumerate(zip(shapes, fitted, strict=True), start=1):
-        chance = one_size_of(log_sizes(at, maps), priors.between_maps)
+        chance = one_size_by_draws(log_sizes(at, maps), priors.between_maps)
         if chance < LEAST_PROBABILITY:
             findings.append(disagreement("its maps show different sizes", chance).labelled(f"visit {number}"))
     another = None if priors.another_exam is None else joint(priors.another_exam)
-    return Compared("compared", "", "", apart, tuple(findings), sizes, another)
+    return VisitComparison("compared", "", "", shifts, tuple(findings), sizes, another)
 
 
 def _by_visit(
@@ -394,14 +394,14 @@ def compare(
     """
     used = settings_of(settings)
     refuse_checkpoint(used)
-    later = None if days is None else map(plain, sequence_of("days", days, "numbers, one for each later visit"))
-    dated = None if dates is None else sequence_of("dates", dates, "dates, one for each visit")
-    times = times_of(None if later is None else list(later), dated)
-    shares = tuple(plain(one) for one in sequence_of("grown_by", grown_by, "shares, such as 0.2 for 20 %"))
+    later = None if days is None else map(plain, list_of("days", days, "numbers, one for each later visit"))
+    dated = None if dates is None else list_of("dates", dates, "dates, one for each visit")
+    times = days_from_first(None if later is None else list(later), dated)
+    shares = tuple(plain(one) for one in list_of("grown_by", grown_by, "shares, such as 0.2 for 20 %"))
     comparing = CompareOptions(times, shares, same_mass, plain(registration_mm))
     comparing.check_visits(2 + len(more))
     visits = [
-        estimated(one if isinstance(one, Sequence) and not isinstance(one, str) else [one], settings)
+        estimate_each(one if isinstance(one, Sequence) and not isinstance(one, str) else [one], settings)
         for one in (first, second, *more)
     ]
     prints = [one.tactile_map.fingerprint for visit in visits for one in visit]

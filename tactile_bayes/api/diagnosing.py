@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, Told, door, path_of, required_path
+from tactile_bayes.api.arguments import PathLike, TextResult, door, path_of, required_path
 from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import UsageError, check_choice
 from tactile_bayes.files.posterior_nc import PosteriorDraws, read_posterior
@@ -24,7 +24,7 @@ _QUANTITIES = ("max_size_mm", "min_size_mm", "d_x_mm", "d_y_mm", "amplitude", "s
 _FIGURES = {"trace": trace_figure, "rank": rank_figure, "corner": corner_figure}
 
 
-class Diagnosis(Told, eq=False):
+class Diagnosis(TextResult, eq=False):
     """How far the draws of a posterior can be trusted."""
 
     posterior: PosteriorDraws

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, path_of, plain, sequence_of, takes
+from tactile_bayes.api.arguments import PathLike, list_of, path_of, plain, takes
 from tactile_bayes.api.estimating import Notice, estimate_file, estimate_one
 from tactile_bayes.api.maps import Map, map_of
 from tactile_bayes.api.pooled import PooledSize, pool_estimates
@@ -36,7 +36,7 @@ from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import Exam, Given, exam_map, headline
 from tactile_bayes.report.pages import PageFiles
 
-# --- One map estimated, and several of one mass pooled.
+# --- One map estimate_each, and several of one mass pooled.
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
@@ -131,7 +131,7 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
     refuse_checkpoint(used)
     if isinstance(maps, str | Path | Map | SizeEstimate | PooledSize):
         raise UsageError("pool takes several maps; give a list")
-    found = estimated(sequence_of("maps", maps, "maps, paths or estimates"), settings)
+    found = estimate_each(list_of("maps", maps, "maps, paths or estimates"), settings)
     if not found:
         raise UsageError("there is no map to pool; give at least one")
     prints = [one.tactile_map.fingerprint for one in found]
@@ -141,22 +141,22 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
     return pool_estimates(found, used, names=names)
 
 
-def estimated(given: Iterable[Any], settings: Mapping[str, Any]) -> tuple[SizeEstimate, ...]:
+def estimate_each(given: Iterable[Any], settings: Mapping[str, Any]) -> tuple[SizeEstimate, ...]:
     """Estimates of maps, or of their paths; those that are estimates already keep their own settings."""
     return tuple(one if isinstance(one, SizeEstimate) else estimate(one, **settings) for one in given)
 
 
-def listed(given: Any) -> list[Any]:
+def as_list(given: Any) -> list[Any]:
     """One map, estimate, pooled size or path as a list of it; a list of them as it is."""
     if isinstance(given, str | Path | Map | SizeEstimate | PooledSize):
         return [given]
-    return list(sequence_of("files", given, "maps, estimates or paths"))
+    return list(list_of("files", given, "maps, estimates or paths"))
 
 
-# --- The page of an exam from files: maps are estimated, an estimate is taken as it is, repeats are pooled.
+# --- The page of an exam from files: maps are estimate_each, an estimate is taken as it is, repeats are pooled.
 
 
-def exam_of_files(
+def exam_from_files(
     paths: Sequence[Path], given: Callable[[], Settings], *, typed: Collection[str], notice: Notice | None = None
 ) -> Exam:
     """Read maps, or an estimate and its map, in any order, and put a page's exam together.
@@ -174,7 +174,7 @@ def exam_of_files(
     ]
     maps = [path for path in paths if path not in estimates]
     if len(estimates) > 1 or (estimates and len(maps) > 1):
-        raise UsageError("an estimate goes with one map; several maps are estimated and pooled: give maps alone")
+        raise UsageError("an estimate goes with one map; several maps are estimate_each and pooled: give maps alone")
     if estimates:
         for name in typed:  # they would change nothing
             option = "--settings" if name == "settings_file" else f"--{name.replace('_', '-')}"
@@ -187,11 +187,11 @@ def exam_of_files(
     for path in maps:
         tell = None if notice is None else lambda line, path=path: notice(f"{path}: {line}")
         found.append(estimate_file(path, settings, notice=tell))
-    return exam_of(found, settings, files=maps)
+    return exam_from_estimates(found, settings, files=maps)
 
 
-def exam_of(found: Sequence[SizeEstimate], settings: Settings, *, files: Sequence[Path] = ()) -> Exam:
-    """Exam of maps that were estimated; several are pooled."""
+def exam_from_estimates(found: Sequence[SizeEstimate], settings: Settings, *, files: Sequence[Path] = ()) -> Exam:
+    """Exam of maps that were estimate_each; several are pooled."""
     if len(found) == 1:
         return found[0].exam()
     names = [f"map {number}" for number in range(1, len(found) + 1)]
@@ -259,19 +259,19 @@ def exam_report(
     """
     page, words = PageFiles(path_of(path), path_of(pdf), force), Given(title, name, day)
     page.check()
-    given = listed(files)
+    given = as_list(files)
     if not given:
         raise UsageError("nothing was given to report; give maps, or an estimate")
     exam: Exam
     if all(isinstance(one, str | Path) for one in given):
-        exam = exam_of_files([path_of(one) for one in given], lambda: settings_of(settings), typed=settings)
+        exam = exam_from_files([path_of(one) for one in given], lambda: settings_of(settings), typed=settings)
     elif len(given) == 1 and isinstance(given[0], PooledSize):
         exam = given[0].exam()
     else:
         used = settings_of(settings)
         if len(given) > 1:
             refuse_checkpoint(used)
-        exam = exam_of(estimated(given, settings), used)
+        exam = exam_from_estimates(estimate_each(given, settings), used)
     exam = replace(exam, given=words)
     page.write(exam_page(exam))
     return headline(exam)
@@ -341,7 +341,7 @@ def export(
         if not isinstance(value, str):
             raise UsageError(f"{name} is {value!r}; give a text")
     refuse_untaken(to, identity)
-    several = listed(files)
+    several = as_list(files)
     outputs = Outputs(path_of(path), path_of(dictionary), to=to, force=force)
     outputs.check(files=bool(several))
     exported, notes = dict[str, bytes](), tuple[str, ...]()

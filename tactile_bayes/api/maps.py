@@ -172,7 +172,7 @@ def build_map(
         When an option cannot be so, or a recording is given twice.
     """
     given = [scans] if isinstance(scans, str | Path) or not isinstance(scans, Sequence) else list(scans)
-    loaded = [scan_given(one) for one in given]
+    loaded = [as_scan(one) for one in given]
     digests = (sha256(path_of(one)) if isinstance(one, str | Path) else "" for one in given)
     facts = [scan_facts(scan, digest) for scan, digest in zip(loaded, digests, strict=True)]
     for later, earlier in repeated_scans([[one] for one in facts]).items():
@@ -199,10 +199,10 @@ def check(scan: Any, *, pressure_window_kpa: tuple[float, float] = PRESSURE_WIND
     ArrangementCheck
         `words` says what its frames agree with, `lines()` in full; `too_short` where they are too few.
     """
-    return check_scan(scan_given(scan), pressure_window_kpa=pressure_window_kpa)
+    return check_scan(as_scan(scan), pressure_window_kpa=pressure_window_kpa)
 
 
-def scan_given(given: Any) -> Scan:
+def as_scan(given: Any) -> Scan:
     """Return the scan given as a path, a `Scan` or a simulated one; refuse anything else."""
     scan = read_scan(given) if isinstance(given, str | Path) else getattr(given, "scan", given)
     if not isinstance(scan, Scan):
@@ -435,4 +435,4 @@ def _beside(given: Any, kind: type, made: Callable[[Any], Source], part: Callabl
         return Source({})
     if isinstance(given, str | Path):
         return made(path_of(given))
-    return made(given if isinstance(given, kind) else part(scan_given(given)))
+    return made(given if isinstance(given, kind) else part(as_scan(given)))

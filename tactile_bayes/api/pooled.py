@@ -25,8 +25,7 @@ from tactile_bayes.report.pooled import elsewhere, pooled_findings, pooled_repor
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import LEAST_PROBABILITY
 from tactile_bayes.size.pooling import DISAGREE, PooledEstimate, pool_maps
-from tactile_bayes.size.visits import Place as PatientPlace
-from tactile_bayes.size.visits import one_place_probability
+from tactile_bayes.size.visits import PatientPlace, one_place_probability
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
 # --- The maps of one mass, estimated again where they report another one.
 
 
-def one_mass(found: Sequence[SizeEstimate]) -> tuple[SizeEstimate, ...]:
+def reestimate_at_common_mass(found: Sequence[SizeEstimate]) -> tuple[SizeEstimate, ...]:
     """Estimates of the mass that most maps show; those of a place that somebody gave stay as they are."""
     same = list(found)
     for i, place in elsewhere([one.answer.report for one in found]).items():
@@ -50,11 +49,11 @@ def pool_estimates(
     found: Sequence[SizeEstimate], settings: Settings, *, names: Sequence[str], files: Sequence[Path] = ()
 ) -> PooledSize:
     """One size from the estimates of several maps, made again where they are of another mass; see `pool_answers`."""
-    same = one_mass(found)
+    same = reestimate_at_common_mass(found)
     return replace(pool_answers([one.answer for one in same], settings, names=names, files=files), maps=same)
 
 
-def place_of(report: EstimateReport) -> PatientPlace | None:
+def patient_place(report: EstimateReport) -> PatientPlace | None:
     """Where a map's reported mass lies in the patient; None without a lump or landmarks."""
     centre = report.centre_patient_mm
     return None if centre is None else PatientPlace(np.array(centre.median), np.diag([centre.x.sd**2, centre.y.sd**2]))
@@ -71,7 +70,7 @@ class PooledSize(SizedExam, eq=False, dict=True, kw_only=True):
     maps: tuple[SizeEstimate, ...] = ()  #: The estimates of the maps alone, where they are at hand.
 
     @property
-    def _found(self) -> PooledEstimate:
+    def _result(self) -> PooledEstimate:
         return self.pooled
 
     @property
@@ -110,7 +109,7 @@ def pool_answers(
     calibration, digests = common_calibration(answers, settings, names=names, inputs=inputs)
     # the maps' values in sorted order are part of the seed: their order on the command line leaves no trace
     words = sorted(answer.fingerprint for answer in answers)
-    places = [place for one in answers if one.shape is not None and (place := place_of(one.report)) is not None]
+    places = [place for one in answers if one.shape is not None and (place := patient_place(one.report)) is not None]
     chance = one_place_probability(places) if len(places) > 1 else None
     pooled = _no_size(reports, places, chance) or pool_maps(
         [answer.shape for answer in answers],

@@ -53,7 +53,7 @@ class _Repeat(Record, eq=False):
     spread: float  #: Between exams, that the size was estimated with.
 
 
-def exams_in(folder: Path) -> list[ExamFolder]:
+def exams_of_campaign(folder: Path) -> list[ExamFolder]:
     """Exams that a campaign estimated, by its ``exams_done.csv``."""
     table = folder / DONE
     if not table.is_file():
@@ -234,7 +234,7 @@ def calibrate_repeatability(
     """
     target = None if path is None else output_path(path, "JSON")
     given = None if size_calibration is None else str(size_calibration)
-    learned = learn_from_exams(exams_in(required_path(folder, "folder")), size_calibration=given)
+    learned = learn_from_exams(exams_of_campaign(required_path(folder, "folder")), size_calibration=given)
     if target is not None:
         learned.write(target, force=force)
     return learned.spread()

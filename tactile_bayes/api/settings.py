@@ -122,7 +122,7 @@ def refuse_checkpoint(settings: Settings) -> None:
 # --- When the visits of a comparison were.
 
 
-def times_of(days: Sequence[float] | None, dates: Sequence[str] | None) -> tuple[float, ...] | None:
+def days_from_first(days: Sequence[float] | None, dates: Sequence[str] | None) -> tuple[float, ...] | None:
     """Time of each visit in days, the first at 0, from the later ones' days or from all dates; None for neither."""
     if days is not None and dates is not None:
         raise UsageError("days and dates both say when the visits were; give one of them")
@@ -137,6 +137,6 @@ def times_of(days: Sequence[float] | None, dates: Sequence[str] | None) -> tuple
     return tuple(float((one - found[0]).days) for one in found)
 
 
-def dates_of(text: str | None) -> tuple[str, ...]:
+def split_dates(text: str | None) -> tuple[str, ...]:
     """Dates from a list with commas, such as 2026-01-15,2026-04-20; none of no text."""
     return () if text is None else tuple(one.strip() for one in text.split(","))

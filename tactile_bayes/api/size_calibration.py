@@ -41,7 +41,7 @@ _SOURCE: Final = "balls in a population of bodies, scanned by the solid model"
 _MAPS: Final = ("normalise", "background", "fit_radius_mm", "noise")  #: How a table's maps were made, if it is silent.
 
 
-class Learned(Record, eq=False):
+class LearnedCalibration(Record, eq=False):
     """A learned or corrected size calibration, with what its file holds besides."""
 
     calibration: Calibration
@@ -67,7 +67,7 @@ def learn(
     correct: str | None = None,
     against: Path | None = None,
     progress: Progress | None = None,
-) -> Learned:
+) -> LearnedCalibration:
     """Learn a size calibration in the way that table and options ask for; those of another way are refused.
 
     `given`: names of the options that somebody gave; `correct`: name or path of the calibration to correct; `against`:
@@ -96,7 +96,7 @@ def _files(**tables: Path | Sheet | None) -> dict[str, Path]:
     return {role: table for role, table in tables.items() if isinstance(table, Path)}
 
 
-def _eq6(table: Path | Sheet, asked: LearnOptions, progress: Progress | None) -> Learned:
+def _eq6(table: Path | Sheet, asked: LearnOptions, progress: Progress | None) -> LearnedCalibration:
     """Learn Eq 6 from a table of lumps, of which those softer than asked take no part.
 
     By the posterior of all coefficients from all rows (``"joint"``), or as printed, with a bootstrap (``"two-stage"``).
@@ -114,14 +114,14 @@ def _eq6(table: Path | Sheet, asked: LearnOptions, progress: Progress | None) ->
         one_axis = eq6.axis_in_two_stages if asked.fit == "two-stage" else None
         left_out, silent = None, ""  # cross-validated errors, or why Eq 6 has none
         try:
-            left_out = eq6.left_out_of_study(lumps, least_stiffness_ratio=least, fit=one_axis)
+            left_out = eq6.cross_validate(lumps, least_stiffness_ratio=least, fit=one_axis)
         except (NotConvergedError, BadDataError) as error:
             silent = str(error)
     made = (recipe.normalise, recipe.background, recipe.radius_mm, recipe.noise)
     settings = {**dict(zip(_MAPS, made, strict=True)), "least_stiffness_ratio": least, "fit": asked.fit}
     cautions = table_cautions(rows.columns, least_stiffness_ratio=least)
     learned = replace(calibration, left_out=left_out, cautions=cautions)
-    return Learned(learned, settings, _files(table=table), asked.seed, None, lumps, silent, other)
+    return LearnedCalibration(learned, settings, _files(table=table), asked.seed, None, lumps, silent, other)
 
 
 def table_cautions(columns: Mapping[str, Sequence[Any]], *, least_stiffness_ratio: float = 0.0) -> tuple[str, ...]:
@@ -140,7 +140,7 @@ def table_cautions(columns: Mapping[str, Sequence[Any]], *, least_stiffness_rati
     return tuple(found)
 
 
-def _over_bodies(table: Path | Sheet, asked: LearnOptions, against: Path | None) -> Learned:
+def _over_bodies(table: Path | Sheet, asked: LearnOptions, against: Path | None) -> LearnedCalibration:
     """Learn a calibration from a table of `population`; lumps `against` it tell by how much such bodies depart."""
     given = None if against is None else read_table(against, "population.table.json")
     rows, fit = read_table(table, "population.table.json"), measuring_options()
@@ -165,7 +165,7 @@ def _over_bodies(table: Path | Sheet, asked: LearnOptions, against: Path | None)
         settings["other_masses"] = len(set(other_table.body.tolist()))
         source = f"{settings['other_masses']} lumps of {given.path.name}"
         found = learning.learn_other_sd(found, other_table, source=source)
-    return Learned(found, settings, _files(table=table, against=against))
+    return LearnedCalibration(found, settings, _files(table=table, against=against))
 
 
 def table_recipe(table: Table, asked: LearnOptions) -> Recipe:
@@ -275,7 +275,7 @@ HARDEST_RATIO = 100.0
 """Largest E2/E1 of the simulated bodies; a harder lump counts as this one, because widths hardly change beyond it."""
 
 
-def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Progress | None) -> Learned:
+def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Progress | None) -> LearnedCalibration:
     """Correct a calibration over bodies by phantoms.
 
     `table`: a row for each map of a phantom: its bump (size_table) or its file (phantom_maps); `base`: name or path of
@@ -321,7 +321,7 @@ def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Pr
         corrected = correct_calibration(calibration, maps, base=name, left_out=left_out)
     document: Any = load_json(path)
     settings = {"correct": name, "of": "maps" if by_files else "bumps", "seed": asked.seed}
-    return Learned(corrected, settings, inputs, base=document)
+    return LearnedCalibration(corrected, settings, inputs, base=document)
 
 
 def _bump(rows: Table, i: int, row: Mapping[str, Any]) -> ShapeDraws:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, dataframe, door, in_keywords, output_path, path_of
+from tactile_bayes.api.arguments import PathLike, dataframe, door, options_as_keywords, output_path, path_of
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, UsageError
@@ -42,23 +42,23 @@ if TYPE_CHECKING:
 # --- What all estimates of a size have in common, and the masses of a map.
 
 
-class Sized(Record, eq=False, dict=True):
+class SizeResult(Record, eq=False, dict=True):
     """Base of the estimates from one map, of one of its masses, and from several maps."""
 
     @property
-    def _found(self) -> Estimate | PooledEstimate:
+    def _result(self) -> Estimate | PooledEstimate:
         raise NotImplementedError
 
     @property
     def _size(self) -> SizePosterior | None:
-        return self._found.size
+        return self._result.size
 
     @property
     def why(self) -> str:
         """Why there is no size, or no estimate at all; empty where there is a size."""
-        return "" if self._size is not None else self._found.reason
+        return "" if self._size is not None else self._result.reason
 
-    def _drawn(self, size: SizePosterior | None, name: str) -> Draws | None:
+    def _draws(self, size: SizePosterior | None, name: str) -> Draws | None:
         if size is None:
             return None
         return Draws(np.atleast_2d(getattr(size, name)), "mm", self.probability, size.replicates)
@@ -75,12 +75,12 @@ class Sized(Record, eq=False, dict=True):
         These draws are the posterior's that `save` writes and `validate` reads. Where `max_size_another_exam_mm` is not
         None, that is the one that reports lead with (docs/decisions/0130).
         """
-        return self._drawn(self._size, "max_size_mm")
+        return self._draws(self._size, "max_size_mm")
 
     @property
     def min_size_mm(self) -> Draws | None:
         """Smallest diameter; None without a size."""
-        return self._drawn(self._size, "min_size_mm")
+        return self._draws(self._size, "min_size_mm")
 
     @property
     def max_size_another_exam_mm(self) -> Draws | None:
@@ -89,10 +89,10 @@ class Sized(Record, eq=False, dict=True):
         None without a size, or where the spread between exams was stated or learned at the site: `max_size_mm` has it
         then.
         """
-        return self._drawn(None if self._size is None else self._size.another_exam, "max_size_mm")
+        return self._draws(None if self._size is None else self._size.another_exam, "max_size_mm")
 
     def _columns(self) -> dict[str, Draws]:
-        found = {name: self._drawn(self._size, name) for name in SIZES}
+        found = {name: self._draws(self._size, name) for name in SIZES}
         return {name: draws for name, draws in found.items() if draws is not None}
 
     def to_dataframe(self) -> pandas.DataFrame:
@@ -124,7 +124,7 @@ class Sized(Record, eq=False, dict=True):
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What speaks against the size, cautions first."""
-        return self._found.findings
+        return self._result.findings
 
     @property
     def verdict(self) -> Verdict:
@@ -143,7 +143,7 @@ class Sized(Record, eq=False, dict=True):
         """Names and values of the notebook's table."""
         if (size := self._size) is not None:
             for name, words in zip(EXTREMES, ("largest size", "smallest size"), strict=True):
-                yield words, repr(self._drawn(size.leading, name))
+                yield words, repr(self._draws(size.leading, name))
             if size.another_exam is not None:
                 yield f"largest size {exams_label(size.figures.get('between_map_sd'))}", repr(self.max_size_mm)
         if (chance := getattr(self, "detected_probability", None)) is not None:
@@ -157,7 +157,7 @@ class Sized(Record, eq=False, dict=True):
         return f"{told}{why}{table}<p><small>{escape(RESEARCH_USE)}</small></p>"
 
 
-class MassEstimate(Sized, eq=False, dict=True):
+class MassEstimate(SizeResult, eq=False, dict=True):
     """One of the masses on a map."""
 
     number: int  #: By evidence, the surest first; those without a size come last.
@@ -168,7 +168,7 @@ class MassEstimate(Sized, eq=False, dict=True):
     why: str  #: Why it has no size; empty where it has one.
 
     @property
-    def _found(self) -> Estimate:
+    def _result(self) -> Estimate:
         return self.mass.estimate
 
     @property
@@ -223,7 +223,7 @@ class Failure(Record):
     exit_code: int
 
 
-class SizedExam(Sized, eq=False, dict=True, kw_only=True):
+class SizedExam(SizeResult, eq=False, dict=True, kw_only=True):
     """Base of the estimates of a whole exam, from one map or from several."""
 
     provenance: Provenance
@@ -236,12 +236,12 @@ class SizedExam(Sized, eq=False, dict=True, kw_only=True):
         return self.settings.interval
 
     @property
-    def _titled(self) -> str:
+    def _title(self) -> str:
         """Name for the titles of figures: what the scans say of the exam, and the map's own."""
         return named_exam(self.name, self.provenance.scans)
 
     def _draw_size(self, size: SizePosterior, path: Path | None, *, force: bool) -> Figure:
-        shown: dict[str, Any] = {"name": self._titled, "probability": self.probability, "findings": self.findings}
+        shown: dict[str, Any] = {"name": self._title, "probability": self.probability, "findings": self.findings}
         return draw_size(size, path, **shown, force=force)
 
     def exam(self) -> Exam:
@@ -279,7 +279,7 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
     calibration: Calibration | None = None  #: The one that sized the lump, at its depth.
 
     @property
-    def _found(self) -> Estimate:
+    def _result(self) -> Estimate:
         return self.estimate
 
     @property
@@ -290,7 +290,7 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
     @property
     def advice(self) -> str:
         """What would help where there is no size."""
-        return in_keywords(self.estimate.advice)
+        return options_as_keywords(self.estimate.advice)
 
     @property
     def detected_probability(self) -> float | None:
@@ -381,14 +381,14 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
     @door
     def plot_map(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw the map with the lump's ellipse and size, or with the places looked at."""
-        return draw_map(self.tactile_map, self.answer.report, path_of(path), name=self._titled, force=force)
+        return draw_map(self.tactile_map, self.answer.report, path_of(path), name=self._title, force=force)
 
     @door
     def plot_fit(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
         """Draw data, fit and residual of the fit window, or else the map; with a path also write it."""
         if self.status != "estimate":
             return self.plot_map(path, force=force)
-        return draw_fit(self.tactile_map, self.estimate, path_of(path), name=self._titled, force=force)
+        return draw_fit(self.tactile_map, self.estimate, path_of(path), name=self._title, force=force)
 
     @door
     def save(self, path: PathLike, *, force: bool = False) -> None:

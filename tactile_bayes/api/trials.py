@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, Told, dataframe, path_of, plain, sequence_of, table_of, takes
+from tactile_bayes.api.arguments import PathLike, TextResult, dataframe, list_of, path_of, plain, table_of, takes
 from tactile_bayes.batch import open_executor, run_batch
 from tactile_bayes.declarations import EXACT, Record, as_dict, names_of, replace, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 # --- Analysis of a trial from its tables: errors, lines, agreement and calibration of each modality.
 
 
-class TrialResult(Told, eq=False):
+class TrialResult(TextResult, eq=False):
     """How each modality's sizes compare with excision.
 
     `report` is what the file of ``validate --json`` holds, and `trial` what it was made from.
@@ -197,7 +197,7 @@ MAPS_OF_AIMS = 3  #: Maps of a mass where the number of patients is asked for, b
 _ERRORS = names_of(PlanErrors)
 
 
-class TrialPlan(Told, eq=False):
+class TrialPlan(TextResult, eq=False):
     """Power and widths of intervals of planned trials; `report` is what the file of ``plan -o`` holds."""
 
     report: planning.PlanReport
@@ -312,7 +312,7 @@ def plan(
     """
     given = {name: plain(value) for name, value in options.items() if value is not None}
     for name in {"patients", "maps"} & set(given):
-        given[name] = tuple(map(plain, sequence_of(name, given[name], "whole numbers")))
+        given[name] = tuple(map(plain, list_of(name, given[name], "whole numbers")))
     readings = None if pilot is None else table_of(pilot, "pilot")
     sizes = None if excision is None else table_of(excision, "excision")
     return planned(given, read_pilot(readings, sizes, given.get("against")), progress)

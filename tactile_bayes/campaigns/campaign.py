@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from tactile_bayes.api.arguments import PathLike, Told, path_of, plain, required_path, takes
+from tactile_bayes.api.arguments import PathLike, TextResult, path_of, plain, required_path, takes
 from tactile_bayes.api.estimates import settings_of
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import open_executor
@@ -26,7 +26,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.pooling import Repeatability
 
 
-class CampaignResult(Told, eq=False):
+class CampaignResult(TextResult, eq=False):
     """What a campaign did, or would do."""
 
     campaign: Campaign

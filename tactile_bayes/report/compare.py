@@ -20,7 +20,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import share_words
 from tactile_bayes.report.pages import Growth, signed
 from tactile_bayes.size.pooling import Repeatability
-from tactile_bayes.size.visits import VOLUME, Change, Compared, JointSizes, straight_line
+from tactile_bayes.size.visits import VOLUME, Change, JointSizes, VisitComparison, straight_line
 
 # --- The report, as `compare --json` prints it.
 
@@ -188,7 +188,7 @@ SHOWN: Final = 0.95
 
 
 def compare_report(
-    compared: Compared,
+    compared: VisitComparison,
     visits: Sequence[Sequence[EstimateReport]],
     names: Sequence[Sequence[str]],
     comparing: CompareOptions,
@@ -225,7 +225,7 @@ def compare_report(
             VisitPlace(visit, None, None, None, None)
             if one is None
             else VisitPlace(visit, one.distance_mm, one.sd_mm, one.shift_mm, one.probability)
-            for visit, one in enumerate(compared.apart, start=2)
+            for visit, one in enumerate(compared.shifts, start=2)
         ),
         changes=tuple(_change(compared, number, comparing, probability) for number in later),
         trend=None if joint is None or days is None or len(visits) < 3 else _trend(joint, days, probability),
@@ -237,7 +237,7 @@ def compare_report(
     ).rounded
 
 
-def _change(compared: Compared, later: int, comparing: CompareOptions, probability: float) -> ChangeReport:
+def _change(compared: VisitComparison, later: int, comparing: CompareOptions, probability: float) -> ChangeReport:
     """Change from the first visit to a later one, and if exams of one mass differ as the paper's maps do."""
     joint, another, days = compared.joint, compared.another, comparing.days
     assert joint is not None

@@ -28,7 +28,7 @@ from tactile_bayes.report.compare import (
 from tactile_bayes.report.figure_file import figure_file, named_exam
 from tactile_bayes.report.map import draw_cells, draw_edges, ellipse_of
 from tactile_bayes.report.pages import cut, foot, page
-from tactile_bayes.size.visits import Compared, straight_line
+from tactile_bayes.size.visits import VisitComparison, straight_line
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -161,7 +161,9 @@ class Course(Record):
         return f"Visit {code}, {when}" if when else f"Visit {code}"
 
 
-def growth_page(compared: Compared, report: CompareReport, visits: Sequence[Sequence[DrawnMap]], course: Course) -> str:
+def growth_page(
+    compared: VisitComparison, report: CompareReport, visits: Sequence[Sequence[DrawnMap]], course: Course
+) -> str:
     """Full HTML page of a comparison; equal comparisons give equal text."""
     laid, view = on_common_axes(report, visits, middle=True)
     limits, words = common_limits(laid), visits[0][0].tactile_map.recipe.value_words
@@ -235,7 +237,7 @@ class _Point(Record):
     wide: Quantity | None  #: The same if exams differ as patients' do; None where one spread is stated.
 
 
-def _chart(compared: Compared, report: CompareReport, course: Course) -> str:
+def _chart(compared: VisitComparison, report: CompareReport, course: Course) -> str:
     """Largest diameter with its interval at each visit, and the trend where there is one; empty without sizes."""
     joint, (width, height) = compared.joint, _BOX_MM
     if joint is None:
@@ -301,7 +303,7 @@ def _mark(one: _Point, scale: float, *, row: int, named: bool) -> Iterator[str]:
 
 
 def draw_comparison(
-    compared: Compared,
+    compared: VisitComparison,
     report: CompareReport,
     visits: Sequence[Sequence[DrawnMap]],
     path: Path | None,
@@ -372,7 +374,7 @@ def _name_axes(axes: Axes, origin_mm: FloatArray, view: Orientation) -> None:
     draw_edges(axes, view)
 
 
-def _draw_change(axes: Axes, compared: Compared) -> None:
+def _draw_change(axes: Axes, compared: VisitComparison) -> None:
     axes.set_yticks([])
     joint = compared.joint
     if joint is None:

@@ -294,7 +294,7 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
             text = f"the depth of the fat, which would narrow the size: {self.fat_note}"
             wider = f"; for such a body the interval allows {100 * self.other_sd:.0f} % (SD) more"
             notes.append(text + (wider if self.other_sd else ""))
-        return [*notes, terms.unlike_bodies(self.bodies)] if self.bodies else notes
+        return [*notes, terms.untabled_bodies(self.bodies)] if self.bodies else notes
 
     def _at_any_depth(self, why: str) -> BodyCalibration:
         return replace(self, fat_mm=None, fat_note=why, hidden=self.hidden_any)
@@ -356,7 +356,7 @@ def known_body(
             most = None if hidden is not None and name in hidden.inverted else high * BEYOND
             check_number(f"known {name}", value, low / BEYOND, most)
     assert hidden is not None
-    expected = hidden.expected_body(known, calibration.features(log_amplitude, log_width))
+    expected = hidden.expected_departure(known, calibration.features(log_amplitude, log_width))
     explained_sd = np.minimum(own_sd, hidden.most_sd)
     return expected * explained_sd, own_sd**2 - hidden.share(*known) * explained_sd**2
 

@@ -168,7 +168,7 @@ def elongation(excess: FloatArray, covariance: FloatArray, *, shown: float, prio
     """
     measured, noise = excess / shown, covariance / shown**2
     wide = noise + prior.oval_sd**2 * np.eye(2)
-    log_odds = log_normal(measured, wide) - log_normal(measured, noise)
+    log_odds = normal_log_density(measured, wide) - normal_log_density(measured, noise)
     log_odds += np.log(prior.oval_probability) - np.log1p(-prior.oval_probability)
     probability = float(1.0 / (1.0 + np.exp(-np.clip(log_odds, -700, 700))))
     wide = wide + SHOWN_CV**2 * np.outer(measured, measured)
@@ -176,13 +176,13 @@ def elongation(excess: FloatArray, covariance: FloatArray, *, shown: float, prio
     return Elongation(probability, gain @ measured, prior.oval_sd**2 * (np.eye(2) - gain))
 
 
-def turn_matrix(angle_rad: float) -> FloatArray:
+def log_ratio_rotation(angle_rad: float) -> FloatArray:
     """(2, 2) matrix T that takes a half log axis ratio h to rotated axes as h @ T: half a turn changes nothing."""
     c, s = np.cos(2 * angle_rad), np.sin(2 * angle_rad)
     return np.array([[c, s], [-s, c]])
 
 
-def log_normal(x: FloatArray, covariance: FloatArray) -> float:
+def normal_log_density(x: FloatArray, covariance: FloatArray) -> float:
     """Log density of a normal about 0, but for a constant."""
     _, log_det = np.linalg.slogdet(covariance)
     return float(-0.5 * (x @ np.linalg.solve(covariance, x) + log_det))
@@ -360,16 +360,16 @@ def one_size_probability(centre: FloatArray, noise: FloatArray, known: BetweenMa
     if len(centre) < 2:
         return 1.0
     between = BetweenMaps(EXAM_SD, 0.0) if known is None else known
-    return float(between.density() @ apart_by_chance(centre, noise, between.grid))
+    return float(between.density() @ cochran_probability(centre, noise, between.grid))
 
 
-def one_size_of(log_sizes: Sequence[FloatArray], known: BetweenMaps | None) -> float:
+def one_size_by_draws(log_sizes: Sequence[FloatArray], known: BetweenMaps | None) -> float:
     """`one_size_probability` of maps by the draws of each one's log size."""
     centre, noise = (np.array([of(one) for one in log_sizes]) for of in (np.nanmean, np.nanvar))
     return one_size_probability(centre, noise, known)
 
 
-def apart_by_chance(centre: FloatArray, noise: FloatArray, grid: FloatArray) -> FloatArray:
+def cochran_probability(centre: FloatArray, noise: FloatArray, grid: FloatArray) -> FloatArray:
     """(n,) probability of a Q as large or larger, for each tau of a grid."""
     weight = 1.0 / (noise[:, None] + grid**2)
     mean = np.sum(weight * centre[:, None], axis=0) / weight.sum(axis=0)

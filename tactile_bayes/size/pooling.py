@@ -26,12 +26,12 @@ from tactile_bayes.size.draws import (
     SizePosterior,
     elongation,
     first_axis,
+    log_ratio_rotation,
     matched_draws,
     one_size_probability,
     outlying_maps,
     shares,
     shown_share,
-    turn_matrix,
 )
 from tactile_bayes.size.eq6 import SizeCalibration, push_sizes
 from tactile_bayes.size.terms import extrapolated
@@ -87,7 +87,7 @@ def log_sizes(calibration: BodyCalibration, maps: Sequence[ShapeDraws]) -> list[
     return [calibration.corrected_log_size(one.log_amplitude, one.log_width) for one in maps]
 
 
-class Weighted(Record, eq=False):
+class AveragedMaps(Record, eq=False):
     """Maps of a mass averaged for each of n spreads between them: (n,) values, (n, t) terms, and (k, n) weights."""
 
     weight: FloatArray
@@ -114,12 +114,12 @@ class MassMaps(Record, eq=False):
         terms = np.stack([calibration.terms(one.log_amplitude, one.log_width) for one in maps])
         return cls(maps, by_map, np.nanmean(by_map, axis=1), np.nanvar(by_map, axis=1), terms)
 
-    def weighted(self, tau: FloatArray) -> Weighted:
+    def averaged(self, tau: FloatArray) -> AveragedMaps:
         """Average the maps with the weights that (n,) spreads between them give."""
         weight = 1.0 / (self.noise[:, None] + tau**2 + 1e-12)
         weight /= weight.sum(axis=0)
         log_a, p = (np.stack([getattr(one, name) for one in self.maps]) for name in ("log_amplitude", "log_width"))
-        return Weighted(
+        return AveragedMaps(
             weight,
             np.sum(weight * self.by_map, axis=0),
             np.sum(weight**2, axis=0) * tau**2,
@@ -138,7 +138,7 @@ def lump_shape(
     for one, size in zip(maps, sizes, strict=True):
         mean, spread = _axis_ratio(one)
         mean[0] -= float(np.nanmean(calibration.round_excess(one.log_amplitude, one.log_width)))
-        turn = turn_matrix(-one.turn_rad)
+        turn = log_ratio_rotation(-one.turn_rad)
         excess += mean @ turn / k
         covariance += turn.T @ spread @ turn / k**2
         shown += shown_share(size, one.log_width) / k
@@ -189,7 +189,7 @@ def pooled_size(
         "shown_share": shown,
         "irregular_outline": float(2 * sum(one.irregular for one in maps) >= len(maps)),
     }
-    turned = np.concatenate([np.stack([one.q, one.r], axis=-1) @ turn_matrix(-one.turn_rad) for one in used])
+    turned = np.concatenate([np.stack([one.q, one.r], axis=-1) @ log_ratio_rotation(-one.turn_rad) for one in used])
     axis = first_axis(*turned.T)
     pool = _Pool(drawn, points, oval.at(points[:, 3:]), axis, replicates, calibration, priors.known, figures)
     size = pool.size(priors.between_maps or calibration.between_exams)
@@ -217,12 +217,12 @@ class _Pool(Record, eq=False, dict=True):
     def size(self, between: BetweenMaps) -> SizePosterior:
         """Sizes under a prior of the spread between maps."""
         tau = between.at(self.points[:, 1], (self.drawn.centre, self.drawn.noise))
-        maps = self.drawn.weighted(tau)
+        maps = self.drawn.averaged(tau)
         known, variances = self._left_open(maps)
         longer = np.hypot(self.half[:, 0], self.half[:, 1])
         mean = maps.mean + known + longer
         sd = np.sqrt(sum(variances.values()) + (OVAL_SD * longer) ** 2)
-        log_largest, log_smallest = self._evened(mean, sd, longer)
+        log_largest, log_smallest = self._smoothed(mean, sd, longer)
         wide = self.half @ self.first_axis >= 0
         share = {"map": float(np.nanvar(maps.mean)), **{name: float(np.nanmean(v)) for name, v in variances.items()}}
         weights = {f"weight_{i + 1}": float(one.mean()) for i, one in enumerate(maps.weight)}
@@ -242,13 +242,13 @@ class _Pool(Record, eq=False, dict=True):
     @cached_property
     def _of_one(self) -> tuple[FloatArray, FloatArray]:
         """SD(B) and the coefficients' variance of the only map, which no spread between maps moves."""
-        return self._errors(self.drawn.weighted(np.zeros(len(self.points))))
+        return self._errors(self.drawn.averaged(np.zeros(len(self.points))))
 
-    def _errors(self, maps: Weighted) -> tuple[FloatArray, FloatArray]:
+    def _errors(self, maps: AveragedMaps) -> tuple[FloatArray, FloatArray]:
         body_sd = self.calibration.body_sd(maps.log_amplitude, maps.log_width, ndtri(self.points[:, _SCORE]))
         return body_sd, self.calibration.coefficient_variance(maps.terms)
 
-    def _left_open(self, maps: Weighted) -> tuple[FloatArray, dict[str, FloatArray]]:
+    def _left_open(self, maps: AveragedMaps) -> tuple[FloatArray, dict[str, FloatArray]]:
         """(n,) mean of what the maps leave open of ln d, and its variances by source."""
         body_sd, error = self._of_one if len(maps.weight) == 1 else self._errors(maps)
         # what is known of a body explains the spread of the population's bodies, and nothing of other kinds
@@ -262,7 +262,7 @@ class _Pool(Record, eq=False, dict=True):
             **({} if site is None else {"site": site.variance(maps.log_width)}),
         }
 
-    def _evened(self, mean: FloatArray, sd: FloatArray, longer: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _smoothed(self, mean: FloatArray, sd: FloatArray, longer: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Logs of both sizes, smoothed separately for round and oval draws, so that a round lump's sizes stay equal."""
         z = ndtri(self.points[:, 0])
         largest = stratified_quantiles(mean + sd * z, mean, sd, 2 * self.replicates + (longer > 0))
@@ -314,7 +314,7 @@ def pool_maps(
     in_order = sorted(((shape, i) for i, shape in enumerate(shapes) if shape is not None), key=lambda one: one[0].order)
     used, places = [shape for shape, _ in in_order], [i for _, i in in_order]
     depth, at_depth = calibration.depth, calibration.for_maps(used)
-    fat_apart_mm = None if depth is None else depth.apart([one.profile for one in used])
+    fat_apart_mm = None if depth is None else depth.disagreement_mm([one.profile for one in used])
     named = sorted(zip(places, [one.middle for one in used], strict=True))
     far = [f"map {i + 1}: {text}" for i, middle in named for text in at_depth.outside(*middle, far=True)]
     if far:

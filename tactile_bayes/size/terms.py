@@ -162,7 +162,7 @@ class HiddenTerms(Record, eq=False, omit_defaults=True):
         gain = np.linalg.solve(self.covariance[np.ix_(at, at)], self.with_body[at])
         return float(np.clip(gain @ self.with_body[at] / self.body_variance, 0.0, MOST_SHARE))
 
-    def expected_body(self, known: Mapping[str, float], features: FloatArray) -> FloatArray:
+    def expected_departure(self, known: Mapping[str, float], features: FloatArray) -> FloatArray:
         """(...,) mean of B over its SD, given known properties, for (..., c) features of the map."""
         at = [self.names.index(name) for name in known]
         gain = np.linalg.solve(self.covariance[np.ix_(at, at)], self.with_body[at]) / np.sqrt(self.body_variance)
@@ -276,7 +276,7 @@ def unknown_head(calibration_head: object) -> str:
     return f"whether the map's head is the calibration's ({calibration_head}): the map does not name its head"
 
 
-def unlike_bodies(ranges: Mapping[str, tuple[float, float]]) -> str:
+def untabled_bodies(ranges: Mapping[str, tuple[float, float]]) -> str:
     """Bodies unlike those that a calibration was learned over as a source left out; these by their columns."""
     words = {
         "stiffness_ratio": "lumps {:.3g} to {:.3g} times as stiff as fat",
@@ -364,7 +364,7 @@ class FatDepth(Record, eq=False):
             return None, f"the fat under the head is {fat_mm:.3g} mm deep (table: {low:.3g} to {high:.3g} mm)"
         return fat_mm, ""
 
-    def apart(self, profiles: Sequence[tuple[float, ...] | None]) -> tuple[float, float] | None:
+    def disagreement_mm(self, profiles: Sequence[tuple[float, ...] | None]) -> tuple[float, float] | None:
         """Least and largest F in mm, where maps differ too much to be of one body.
 
         None where they agree to three SDs of a difference between two exams, or where fewer than two tell it.

@@ -30,8 +30,8 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference import draws
 from tactile_bayes.presets import REGISTRATION_MM
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, log_normal, matched_draws
-from tactile_bayes.size.pooling import POOLED_DRAWS, MassMaps, SizePriors, Weighted, log_sizes, lump_shape
+from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, matched_draws, normal_log_density
+from tactile_bayes.size.pooling import POOLED_DRAWS, AveragedMaps, MassMaps, SizePriors, log_sizes, lump_shape
 
 MOST_VISITS: Final = 10
 DIMENSIONS: Final = 6
@@ -43,14 +43,14 @@ CODES: Final = {"subject": "patients", "side": "sides", "mass": "masses"}
 VOLUME: Final = 3.0  #: d ln V / d ln d of a lump that keeps its form.
 
 
-class Place(Record, eq=False):
+class PatientPlace(Record, eq=False):
     """Place of a mass at one visit in the patient's frame; what posture and landmarks add is no part of it."""
 
     centre_mm: FloatArray
     covariance_mm2: FloatArray  #: Of the maps' centres.
 
     @classmethod
-    def mean_of(cls, places: Sequence[Place]) -> Place | None:
+    def mean_of(cls, places: Sequence[PatientPlace]) -> PatientPlace | None:
         """Mean place of a visit's maps; None for none."""
         if not places:
             return None
@@ -59,7 +59,7 @@ class Place(Record, eq=False):
         return cls(centre, covariance)
 
 
-class Apart(Record):
+class PlaceShift(Record):
     """How far apart the masses of two visits lie."""
 
     shift_mm: tuple[float, float]  #: From the earlier visit's place to the later one's.
@@ -77,14 +77,14 @@ class Apart(Record):
         return self.probability < LEAST_SAME
 
 
-def apart(earlier: Place, later: Place, *, registration_mm: float = REGISTRATION_MM) -> Apart:
+def place_shift(earlier: PatientPlace, later: PatientPlace, *, registration_mm: float = REGISTRATION_MM) -> PlaceShift:
     """Compare the places of two visits; `registration_mm` is s, the SD each way of one mass's place between two."""
     shift = later.centre_mm - earlier.centre_mm
     spread = earlier.covariance_mm2 + later.covariance_mm2 + registration_mm**2 * np.eye(2)
     length = float(np.hypot(*shift))
     along = shift / length if length > 0 else np.array([1.0, 0.0])
     probability = float(np.exp(-0.5 * shift @ np.linalg.solve(spread, shift)))
-    return Apart((float(shift[0]), float(shift[1])), float(np.sqrt(along @ spread @ along)), probability)
+    return PlaceShift((float(shift[0]), float(shift[1])), float(np.sqrt(along @ spread @ along)), probability)
 
 
 def contradictions(visits: Sequence[Sequence[Mapping[str, str]]]) -> list[str]:
@@ -102,10 +102,10 @@ def contradictions(visits: Sequence[Sequence[Mapping[str, str]]]) -> list[str]:
     return texts
 
 
-def one_place_probability(places: Sequence[Place], *, registration_mm: float = REGISTRATION_MM) -> float:
+def one_place_probability(places: Sequence[PatientPlace], *, registration_mm: float = REGISTRATION_MM) -> float:
     r"""Probability that the places of one mass come out as far apart or farther.
 
-    As `one_size_probability` in the plane, with :math:`S_i = C_i + s^2 I / 2`: for two places it is that of `apart`.
+    As `one_size_probability` in the plane, with :math:`S_i = C_i + s^2 I / 2`; for two places as `place_shift`.
     """
     if len(places) < 2:
         return 1.0
@@ -133,10 +133,10 @@ class SharedBody(Record):
 
     def correlation(self, log_size: FloatArray) -> FloatArray:
         """(v, v) correlation matrix of visits whose maps give these (v,) log sizes."""
-        apart = (log_size[:, None] - log_size) / self.length
-        shared = (1.0 - self.redrawn) * np.exp(-0.5 * apart**2)
-        np.fill_diagonal(shared, 1.0)
-        return np.asarray(shared)
+        growth = (log_size[:, None] - log_size) / self.length
+        correlation = (1.0 - self.redrawn) * np.exp(-0.5 * growth**2)
+        np.fill_diagonal(correlation, 1.0)
+        return np.asarray(correlation)
 
 
 SHARED_BODY: Final = SharedBody(0.11, 0.48)
@@ -172,8 +172,8 @@ class AmplitudeLaw(Record):
         """Values of alpha, equally probable before the maps."""
         return np.geomspace(self.least, self.most, 15)
 
-    def at_one_depth(
-        self, parts: Sequence[Weighted], fitted: Sequence[BodyCalibration]
+    def at_common_depth(
+        self, parts: Sequence[AveragedMaps], fitted: Sequence[BodyCalibration]
     ) -> tuple[FloatArray, FloatArray]:
         """(v, n) ln a corrected to the mean depth of fat, and (v,) variances of what posture and exams leave in it."""
         log_amplitude = np.stack([one.log_amplitude for one in parts])
@@ -290,14 +290,14 @@ def joint_sizes(
     sizes = [one for maps, at in zip(visits, fitted, strict=True) for one in log_sizes(at, maps)]
     oval, _ = lump_shape(fitted[0], flat, sizes, priors.shape)
     half = oval.at(points[:, 2:5])
-    averaged = [one.weighted(tau) for one in parts]
+    averaged = [one.averaged(tau) for one in parts]
     if law is None:
         law = SHARED_WITHOUT_DEPTH if fitted[0].fat_mm is None else SHARED_BODY
     correlation = law.correlation(np.array([float(np.nanmean(one.mean)) for one in averaged]))
     covariance = _covariance(averaged, fitted, correlation, ndtri(points[:, 1]))
     mean = np.stack([one.mean for one in averaged]) + np.hypot(half[:, 0], half[:, 1])
     if amplitudes is not None:
-        left, noise = amplitudes.at_one_depth(averaged, fitted)
+        left, noise = amplitudes.at_common_depth(averaged, fitted)
         mean, covariance = _with_amplitudes(mean, covariance, left, noise, amplitudes, points[:, 5])
     drawn = _drawn(mean, covariance, rng.standard_normal((len(replicates), len(visits))), replicates)
     spread = float(np.sqrt(np.mean(tau**2)))
@@ -317,7 +317,7 @@ def visit_calibrations(visits: Sequence[Sequence[ShapeDraws]], calibration: Body
 
 
 def _covariance(
-    parts: Sequence[Weighted], fitted: Sequence[BodyCalibration], correlation: FloatArray, score: FloatArray
+    parts: Sequence[AveragedMaps], fitted: Sequence[BodyCalibration], correlation: FloatArray, score: FloatArray
 ) -> FloatArray:
     """(n, v, v) covariance of ln d at the visits given each draw of the maps."""
     terms, exams, widths = (
@@ -362,9 +362,9 @@ def _with_amplitudes(
         of_draws = np.cov(mean[:, finite], one)[:, v:]
         spread = of_draws[v:] + alpha**2 * contrasts @ within + left
         gains.append((of_draws[:v] - alpha * within) @ np.linalg.inv(spread))
-        scores.append(log_normal(one.mean(axis=1), spread))
+        scores.append(normal_log_density(one.mean(axis=1), spread))
     changed = (contrasts @ log_amplitude)[:, finite].mean(axis=1)
-    scores.append(log_normal(changed, contrasts @ contrasts.T))
+    scores.append(normal_log_density(changed, contrasts @ contrasts.T))
     prior = np.append(np.full(len(exponents), (1.0 - law.otherwise) / len(exponents)), law.otherwise)
     weight = np.cumsum(prior * np.exp(np.array(scores) - max(scores)))
     index = np.searchsorted(weight[:-1] / weight[-1], points)
@@ -410,13 +410,13 @@ def straight_line(log_size: FloatArray, covariance: FloatArray, days: Sequence[f
     return Trend(float(line[0]), float(line[1]), float(np.sqrt(spread[1, 1])), departure)
 
 
-class Compared(Record, eq=False):
+class VisitComparison(Record, eq=False):
     """Comparison of visits and its sizes."""
 
     status: Literal["compared", "not_one_mass", "no_estimate"]
     reason: str = ""
     advice: str = ""  #: Why there is no comparison, and what would help; empty where there is one.
-    apart: tuple[Apart | None, ...] = ()
+    shifts: tuple[PlaceShift | None, ...] = ()
     """How far the mass of each later visit lies from the first's; None where landmarks do not show it."""
     findings: tuple[Finding, ...] = ()  #: Findings against the comparison.
     joint: JointSizes | None = None

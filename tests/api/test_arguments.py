@@ -11,7 +11,7 @@ import pandas
 import pytest
 
 import tactile_bayes as tb
-from tactile_bayes.api.arguments import in_keywords
+from tactile_bayes.api.arguments import options_as_keywords
 from tactile_bayes.errors import UsageError
 
 DEMO = Path(tb.__file__).parent / "demo"
@@ -159,7 +159,7 @@ def test_a_keyword_that_is_none_is_answered_with_the_one_meant(call: Callable[[]
     ],
 )
 def test_options_become_keywords_and_commands_stay(told: str, wanted: str) -> None:
-    assert in_keywords(told) == wanted
+    assert options_as_keywords(told) == wanted
 
 
 def test_numbers_of_numpy_are_taken_as_numbers(made: tb.Map) -> None:

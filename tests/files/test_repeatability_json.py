@@ -10,7 +10,7 @@ import pytest
 from repeated_exams import write_repeats
 
 from tactile_bayes.actions.show import describe
-from tactile_bayes.api.repeatability import exams_in, learn_from_exams
+from tactile_bayes.api.repeatability import exams_of_campaign, learn_from_exams
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import sha256
@@ -21,13 +21,13 @@ from tactile_bayes.files.size_json import read_repeatability
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A file learned from four masses, and beside it the folder that it is from."""
     folder = tmp_path_factory.mktemp("site")
-    learned = learn_from_exams(exams_in(write_repeats(folder / "out", 4)))
+    learned = learn_from_exams(exams_of_campaign(write_repeats(folder / "out", 4)))
     learned.write(folder / "site.json")
     return folder / "site.json"
 
 
 def test_what_is_written_is_read(written: Path) -> None:
-    learned = learn_from_exams(exams_in(written.parent / "out")).spread()
+    learned = learn_from_exams(exams_of_campaign(written.parent / "out")).spread()
     read = read_repeatability(written)
     assert read.sha256 == sha256(written)
     for name in ("sd", "log_sd", "median", "low", "high"):
@@ -82,4 +82,4 @@ def test_an_estimate_that_does_not_say_its_calibration_is_refused(
     document["provenance"][fault] = value
     path.write_text(json.dumps(document))
     with pytest.raises(BadDataError, match=words):
-        learn_from_exams(exams_in(out))
+        learn_from_exams(exams_of_campaign(out))

@@ -24,7 +24,7 @@ from tactile_bayes.mapping.map import MapRecipe
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import Visit
 from tactile_bayes.report.growth_page import Course, DrawnMap, draw_comparison, growth_page
-from tactile_bayes.size.visits import Compared
+from tactile_bayes.size.visits import VisitComparison
 
 PLACE = np.array([60.0, 90.0])
 BESIDE = np.array([12.0, 6.0])
@@ -49,7 +49,7 @@ def visit(angle_rad: float, *, height: float, landmarks: bool = True) -> DrawnMa
 
 
 def images(*visits: DrawnMap):
-    figure = draw_comparison(Compared("not_one_mass"), REFUSED, [[one] for one in visits], None)
+    figure = draw_comparison(VisitComparison("not_one_mass"), REFUSED, [[one] for one in visits], None)
     return [axes.images[0] for axes in figure.axes if axes.images and axes.get_title(loc="left")]
 
 
@@ -85,7 +85,7 @@ def test_a_visit_without_a_lump_is_left_empty() -> None:
 
 
 def panels(*visits: DrawnMap, **told: object):
-    figure = draw_comparison(Compared("not_one_mass"), replace(REFUSED, **told), [[one] for one in visits], None)
+    figure = draw_comparison(VisitComparison("not_one_mass"), replace(REFUSED, **told), [[one] for one in visits], None)
     figure.canvas.draw()
     return figure, [axes for axes in figure.axes if axes.images and axes.get_title(loc="left")]
 
@@ -205,7 +205,7 @@ def test_one_value_has_one_colour_at_all_visits_of_the_page() -> None:
     """Two visits alike but for the lump's height: what lies beside it has the same pixels."""
     report = replace(REFUSED, visits=VISITS)
     maps = [[visit(0.0, height=0.4)], [visit(0.0, height=0.8)]]
-    page = growth_page(Compared("not_one_mass"), report, maps, Course())
+    page = growth_page(VisitComparison("not_one_mass"), report, maps, Course())
     pixels = [
         np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")).astype(int)
         for data in re.findall(r'<image [^>]*base64,([^"]*)"', page)
@@ -227,7 +227,7 @@ def test_grids_lie_as_their_files_read_and_scans_without_landmarks_as_every_pict
     ):
         first, *_ = images(drawn, drawn)
         assert value_at(first, *place) == pytest.approx(1.3, abs=0.03)
-        page = growth_page(Compared("not_one_mass"), REFUSED, [[drawn]] * 2, Course())
+        page = growth_page(VisitComparison("not_one_mass"), REFUSED, [[drawn]] * 2, Course())
         told = re.findall(r'fill="#fff">([+-][xy])<', page)
         assert told[:4] == edges
 
@@ -235,7 +235,7 @@ def test_grids_lie_as_their_files_read_and_scans_without_landmarks_as_every_pict
 def test_hostile_texts_stay_texts_on_the_page() -> None:
     hostile = '"><script>alert(1)</script>'
     course = Course(hostile, hostile, hostile, hostile, hostile, (hostile, hostile), (hostile, hostile))
-    page = growth_page(Compared("not_one_mass"), REFUSED, [[visit(0.0, height=0.4)]] * 2, course)
+    page = growth_page(VisitComparison("not_one_mass"), REFUSED, [[visit(0.0, height=0.4)]] * 2, course)
     assert "<script" not in page
     assert "&lt;script&gt;" in page
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tactile_bayes.size.draws import EXAM_SD, LEAST_PROBABILITY, BetweenMaps, one_size_probability
-from tactile_bayes.size.visits import Place, apart, one_place_probability
+from tactile_bayes.size.visits import PatientPlace, one_place_probability, place_shift
 
 KNOWN = BetweenMaps(EXAM_SD, 0.0)
 NOISE = np.array([0.03, 0.02]) ** 2
@@ -61,17 +61,17 @@ def test_sizes_that_contradict_each_other_are_refused_and_a_wider_site_takes_the
 
 
 def test_two_places_have_the_probability_that_compare_gives_them() -> None:
-    first = Place(np.array([60.0, 90.0]), np.diag([1.0, 4.0]))
-    second = Place(np.array([72.0, 99.0]), np.array([[2.0, 0.5], [0.5, 1.0]]))
-    assert one_place_probability([first, second]) == pytest.approx(apart(first, second).probability)
+    first = PatientPlace(np.array([60.0, 90.0]), np.diag([1.0, 4.0]))
+    second = PatientPlace(np.array([72.0, 99.0]), np.array([[2.0, 0.5], [0.5, 1.0]]))
+    assert one_place_probability([first, second]) == pytest.approx(place_shift(first, second).probability)
     assert one_place_probability([first]) == 1.0
 
 
 def test_places_of_one_mass_are_refused_at_the_level() -> None:
     rng = np.random.default_rng(33)
     told = [
-        one_place_probability([Place(rng.normal(0, 5 / np.sqrt(2), 2), np.zeros((2, 2))) for _ in range(3)])
+        one_place_probability([PatientPlace(rng.normal(0, 5 / np.sqrt(2), 2), np.zeros((2, 2))) for _ in range(3)])
         for _ in range(4000)
     ]
     assert np.mean(np.array(told) < 0.05) == pytest.approx(0.05, abs=0.011)
-    assert one_place_probability([Place(np.array([x, 0.0]), np.eye(2)) for x in (0.0, 1.0, 30.0)]) < 1e-4
+    assert one_place_probability([PatientPlace(np.array([x, 0.0]), np.eye(2)) for x in (0.0, 1.0, 30.0)]) < 1e-4

@@ -18,9 +18,9 @@ from tactile_bayes.size.draws import (
     ShapeDraws,
     ShapePrior,
     elongation,
+    log_ratio_rotation,
     outlying_maps,
     shown_share,
-    turn_matrix,
 )
 from tactile_bayes.size.pooling import IRREGULAR_SD, SizePriors, pool_maps, pooled_size
 from tactile_bayes.size.terms import HiddenTerms
@@ -181,7 +181,7 @@ def test_an_oval_seen_by_a_turned_head_is_one_oval():
     """Head turned by 60 degrees between two maps: pooled in the patient's axes they agree, in their own they cancel."""
     turn = np.radians(60.0)
     lump = np.array([0.2 * SEEN, 0.0])
-    seen = lump @ turn_matrix(turn)  # in the axes of a head turned by that much
+    seen = lump @ log_ratio_rotation(turn)  # in the axes of a head turned by that much
     maps = [shape(2.7, q=0.05 + lump[0], r=0.0), shape(2.7, q=0.05 + seen[0], r=seen[1], turn=turn, seed=1)]
     assert pooled(maps, priors=KNOWN_0).figures["oval_half_log_ratio"] == pytest.approx(0.2, rel=0.15)
     blind = [maps[0], shape(2.7, q=0.05 + seen[0], r=seen[1], seed=1)]

@@ -14,7 +14,7 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.size_json import read_size_calibration, write_size_calibration
 from tactile_bayes.size.bodies import UNLIKE_SD, BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws
-from tactile_bayes.size.learn.bodies import learn_other_sd, learn_population, sized
+from tactile_bayes.size.learn.bodies import learn_other_sd, learn_population, size_errors
 from tactile_bayes.size.learn.regression import PopulationTable
 from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size
 from tactile_bayes.size.terms import Recipe
@@ -119,7 +119,7 @@ def test_without_a_profile_sizes_are_averaged_over_the_depths_that_go_with_the_m
     own = learned.at_fat([profile(0.0)]).body_sd(*here, np.zeros(1))[0]
     assert bare.body_sd(*here, np.zeros(1))[0] == pytest.approx(np.hypot(own, sizes.std()), rel=0.1)
     new = table(150, seed=8)
-    told, silent = sized(learned, new), sized(learned, replace(new, profile=None))
+    told, silent = size_errors(learned, new), size_errors(learned, replace(new, profile=None))
     assert silent.error.std() > 2 * told.error.std()
     assert np.mean(np.abs(silent.error) < 1.96 * np.sqrt(silent.variance)) == pytest.approx(0.95, abs=0.04)
 
@@ -142,11 +142,11 @@ def test_what_eq6_leaves_is_learned_and_a_law_without_it_has_none() -> None:
         return replace(one, d_mm=one.d_mm * np.exp(0.2 * np.sin(2.0 * one.log_amplitude)))
 
     with_it, alone = (learn_population(rippled(full), recipe=RECIPE, residual=one) for one in (True, False))
-    errors = [sized(one, rippled(new)).error.std() for one in (with_it, alone)]
+    errors = [size_errors(one, rippled(new)).error.std() for one in (with_it, alone)]
     assert errors[0] < 0.7 * errors[1]
     assert with_it.constants() == pytest.approx(alone.constants())
     plain = learn_population(full, recipe=RECIPE)
-    assert sized(plain, new).error.std() == pytest.approx(sized(learn_eq6(full), new).error.std(), rel=0.05)
+    assert size_errors(plain, new).error.std() == pytest.approx(size_errors(learn_eq6(full), new).error.std(), rel=0.05)
     # far from all bodies it is Eq 6 alone
     at = (np.array([-40.0]), np.array([1.5]))
     far = with_it.at_fat([profile(0.0)]), alone.at_fat([profile(0.0)])
@@ -188,8 +188,8 @@ def test_a_map_unlike_the_tables_at_its_depth_is_sized_at_any_depth(learned) -> 
 def test_maps_of_a_mass_share_their_depth_of_fat(learned) -> None:
     between = learned.at_fat([profile(-0.2), profile(0.2), None, (30.0, 0.0, 0.0)])
     assert between.fat_mm == pytest.approx(np.exp(LOG_FAT), rel=0.02)
-    assert learned.depth.apart([profile(0.1), profile(0.1)]) is None
-    assert learned.depth.apart([profile(-0.5), profile(0.5)]) == pytest.approx(np.exp([2.1, 3.1]), rel=0.05)
+    assert learned.depth.disagreement_mm([profile(0.1), profile(0.1)]) is None
+    assert learned.depth.disagreement_mm([profile(-0.5), profile(0.5)]) == pytest.approx(np.exp([2.1, 3.1]), rel=0.05)
 
 
 def test_terms_are_derivatives_by_the_coefficients(learned) -> None:

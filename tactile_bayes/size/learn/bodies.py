@@ -51,7 +51,7 @@ def learn_population(
     fitted = None
     if residual and rows.depth is not None:
         fitted = regression.fit_residual(
-            regression.BodiesLeft(rows.of_bodies(eq6.data), rows.spread_terms(eq6.data), left, noise)
+            regression.BodyResiduals(rows.of_bodies(eq6.data), rows.spread_terms(eq6.data), left, noise)
         )
         steps = np.eye(3)[:2] * _STEP  # along u and v
         slopes = [(fitted.at(rows.values + h) - fitted.at(rows.values - h)) / (2 * _STEP) for h in steps]
@@ -185,11 +185,11 @@ def _calibration(
         eq6=Eq6Law(rows.eq6_powers, eq6.mean, eq6.covariance, _log_amplitude_one_deep(maps)),
         residual=None if fitted is None else fitted.residual,
         spread=Spread(rows.spread_powers, spread, of_spread, *exam, 0.0, ""),
-        round_lumps=regression.learn_round(maps, monomials(list(rows.values.T), rows.spread_powers)),
+        round_lumps=regression.learn_round_lumps(maps, monomials(list(rows.values.T), rows.spread_powers)),
         feature_powers=rows.feature_powers,
         information_inverse=inverse,
         most_leverage=float(np.quantile(leverage, INSIDE)),
-        domain=regression.ranges_of(ranged),
+        domain=regression.value_ranges(ranged),
         recipe=recipe,
         depth=rows.depth,
         hidden=regression.hidden_terms(maps, data, body=left, body_sd=body_sd, features=features),
@@ -260,18 +260,20 @@ def _misfit(data: regression.BodyRegression, theta: FloatArray) -> float:
     return total if np.isfinite(total) else float("inf")
 
 
-class Sized(Record):
+class SizeErrors(Record):
     """Bodies that took no part: (b,) ln of sized over true size, and the variance stated."""
 
     error: FloatArray
     variance: FloatArray
 
 
-def sized(calibration: BodyCalibration, table: regression.PopulationTable, *, known: Sequence[str] = ()) -> Sized:
+def size_errors(
+    calibration: BodyCalibration, table: regression.PopulationTable, *, known: Sequence[str] = ()
+) -> SizeErrors:
     """The bodies of a table, each by all its exams; of the properties in `known` the true value is told."""
     bodies = np.unique(table.body)
     errors = np.array([size_error(calibration, table.rows(table.body == one), known=known) for one in bodies])
-    return Sized(*errors.T)
+    return SizeErrors(*errors.T)
 
 
 def size_error(
@@ -299,7 +301,7 @@ def learn_other_sd(calibration: BodyCalibration, table: regression.PopulationTab
 
     Its fit tells ``other_masses``, ``other_sd_most``, below which tau lies with 95 % probability, and the errors.
     """
-    others = sized(calibration.with_other_sd(0.0), table)
+    others = size_errors(calibration.with_other_sd(0.0), table)
     variance = others.variance + _OTHER_SDS[:, None] ** 2
     log = -0.5 * np.sum(np.log(variance) + others.error**2 / variance, axis=1)
     density = np.exp(log - log.max())

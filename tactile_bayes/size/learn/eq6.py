@@ -16,7 +16,7 @@ from tactile_bayes.inference.modes import mode_and_covariance
 from tactile_bayes.presets import LEAST_HARD_RATIO
 from tactile_bayes.progress import Progress
 from tactile_bayes.size.eq6 import AxisCalibration, LeftOutErrors, SizeCalibration
-from tactile_bayes.size.learn.regression import ranges_of, rows_of
+from tactile_bayes.size.learn.regression import rows_of, value_ranges
 from tactile_bayes.size.terms import Recipe, monomials, powers
 
 # --- Bayesian regression of Eq 6 from a table of known lumps: m, b, e, f and the residual scatter, jointly.
@@ -82,7 +82,7 @@ class AxisRows(Record, eq=False):
     def calibration(self, draws: FloatArray) -> AxisCalibration:
         """Draws of Eq 6's coefficients with the ranges of these rows."""
         values = {"amplitude": self.amplitude, "sigma_mm": self.sigma_mm, "d_mm": self.d_mm}
-        return AxisCalibration(draws, self.centre[0], ranges_of(values))
+        return AxisCalibration(draws, self.centre[0], value_ranges(values))
 
 
 def width_changes(sigma_mm: FloatArray, *, depth_ratio: FloatArray, group: Sequence[tuple[object, ...]]) -> FloatArray:
@@ -358,7 +358,7 @@ FitAxis = Callable[[AxisRows], AxisCalibration]
 """Eq 6 from the rows of one axis: `axis_at_mode` or `axis_in_two_stages`."""
 
 
-def left_out_of_study(
+def cross_validate(
     table: SizeTable, *, least_stiffness_ratio: float = 0.0, fit: FitAxis | None = None
 ) -> LeftOutErrors | None:
     """Cross-validated errors of Eq 6 and of a log-quadratic, leaving out each geometry in turn.

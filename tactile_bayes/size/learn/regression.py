@@ -172,7 +172,7 @@ def check_population(table: PopulationTable) -> None:
         raise BadDataError("a row holds a number that is not finite", way_out="leave it out")
 
 
-def ranges_of(values: Mapping[str, FloatArray]) -> dict[str, tuple[float, float]]:
+def value_ranges(values: Mapping[str, FloatArray]) -> dict[str, tuple[float, float]]:
     """Least and largest of each."""
     return {name: (float(v.min()), float(v.max())) for name, v in values.items()}
 
@@ -207,7 +207,7 @@ def hidden_terms(
     )
 
 
-def learn_round(table: PopulationTable, terms: FloatArray) -> RoundLumps:
+def learn_round_lumps(table: PopulationTable, terms: FloatArray) -> RoundLumps:
     r"""How balls' maps look, by maximum likelihood: :math:`q_i \sim N(q_0(x_i), s^2 + \kappa V_i)`.
 
     :math:`q_0` is linear in (n, c) terms, V the variance of a map's posterior. Deep and faint lumps have a V a hundred
@@ -253,7 +253,7 @@ _MOST_ITERATIONS = 200
 _DIFFERENCE = 1e-4  #: Step of the gradient: below it the rounding of the solutions shows.
 
 
-class BodiesLeft(Record, eq=False):
+class BodyResiduals(Record, eq=False):
     """Residuals of b bodies under Eq 6."""
 
     x: FloatArray  #: (b, 3) means of u, v and w over each body's exams: they differ little.
@@ -287,7 +287,7 @@ class FittedResidual(Record, eq=False):
         return Residual(self.kernel.points, self.kernel.lengths, self.kernel.scale, self.mean, rows)
 
 
-def fit_residual(bodies: BodiesLeft) -> FittedResidual:
+def fit_residual(bodies: BodyResiduals) -> FittedResidual:
     """Kernel and spread with half of the points, then with all, by the better of two starts."""
     count = max(min(POINTS, len(bodies.left) // BODIES_PER_POINT), 1)
     k, slopes = bodies.x.shape[1], np.zeros(bodies.features.shape[1] - 1)
@@ -303,7 +303,7 @@ def fit_residual(bodies: BodiesLeft) -> FittedResidual:
     return given(bodies, points, theta)
 
 
-def given(bodies: BodiesLeft, points: FloatArray, theta: FloatArray) -> FittedResidual:
+def given(bodies: BodyResiduals, points: FloatArray, theta: FloatArray) -> FittedResidual:
     """Posterior of the weights for one kernel and spread, and each body as the others predict it.
 
     `theta` holds the logs of the lengths and of the scale, and the coefficients of ln SD(B).
@@ -341,7 +341,7 @@ def _log_density(features: FloatArray, error: FloatArray, noise: FloatArray, log
     return float(-0.5 * np.sum(np.log(variance) + error**2 / variance))
 
 
-def _best(bodies: BodiesLeft, start: FloatArray, points: FloatArray) -> tuple[FloatArray, float]:
+def _best(bodies: BodyResiduals, start: FloatArray, points: FloatArray) -> tuple[FloatArray, float]:
     """Logs of kernel and spread at the mode next to a start, and the mode's negative log density."""
     k = bodies.x.shape[1]
 

@@ -28,7 +28,7 @@ from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import ShapeDraws, apart_by_chance, restricted_log_likelihood
+from tactile_bayes.size.draws import ShapeDraws, cochran_probability, restricted_log_likelihood
 from tactile_bayes.size.pooling import PROBABILITY, Repeatability, log_sizes
 from tactile_bayes.size.terms import SiteShift
 
@@ -72,7 +72,7 @@ class PhantomMap(Record, eq=False):
     known: Mapping[str, float]  #: The phantom's properties, by the names of `HiddenTerms`.
 
 
-class Residuals(Record, eq=False):
+class PhantomResiduals(Record, eq=False):
     """Residuals of n phantoms under a calibration, each (n,)."""
 
     residual: FloatArray  #: y.
@@ -96,7 +96,7 @@ class ShiftPosterior(Record, eq=False):
     spread_square: float
 
 
-def shift_posterior(data: Residuals, prior: SitePrior = PRIOR) -> ShiftPosterior:
+def shift_posterior(data: PhantomResiduals, prior: SitePrior = PRIOR) -> ShiftPosterior:
     """Posterior of a site's shift given what the calibration leaves of its phantoms."""
     x, y, precision = data.design, data.residual, np.diag(1.0 / np.append(prior.sd, 1.0) ** 2)
     weight = 1.0 / (_GRID[:, None] ** 2 * data.spread_variance + data.map_variance)
@@ -145,7 +145,7 @@ def correct_calibration(
             f"{len(rows)} phantom{'' if len(rows) == 1 else 's'} in the range of {base}{why}",
             way_out=f"a correction needs at least {LEAST_PHANTOMS} distinct phantoms; 5 to 20 are better",
         )
-    data = Residuals(*np.array(list(rows.values())).T)
+    data = PhantomResiduals(*np.array(list(rows.values())).T)
     posterior = shift_posterior(data)
     left = data.residual - data.design[:, :2] @ posterior.mean[:2]
     site = SiteShift(
@@ -178,7 +178,7 @@ def _misfit(used: BodyCalibration, maps: Sequence[PhantomMap]) -> str:
 
 
 def _row(used: BodyCalibration, maps: Sequence[PhantomMap]) -> tuple[float, ...]:
-    """A phantom under the calibration, as the columns of `Residuals`."""
+    """A phantom under the calibration, as the columns of `PhantomResiduals`."""
     log_size = log_sizes(used, [one.shape for one in maps])
     log_a, log_width = (
         np.array([np.nanmean(getattr(m.shape, n)) for m in maps]) for n in ("log_amplitude", "log_width")
@@ -215,11 +215,14 @@ def _known(
     if not stated:
         return 0.0, own, common
     features = calibration.features(np.array(middle[0]), np.array(middle[1]))
-    return explained_sd * float(hidden.expected_body(stated, features)), own, common
+    return explained_sd * float(hidden.expected_departure(stated, features)), own, common
 
 
 def _cautions(
-    calibration: BodyCalibration, known: Mapping[str, Mapping[str, float]], data: Residuals, posterior: ShiftPosterior
+    calibration: BodyCalibration,
+    known: Mapping[str, Mapping[str, float]],
+    data: PhantomResiduals,
+    posterior: ShiftPosterior,
 ) -> tuple[str, ...]:
     """Oddities of a correction by the phantoms of these names, of which these properties are known, in words."""
     lines = []
@@ -246,7 +249,7 @@ def _cautions(
             "check their sizes, depths, seats and stiffness"
         )
     for i, name in enumerate(known):  # those that lie far from what the others predict
-        rest = Residuals(*(np.delete(getattr(data, column), i) for column in names_of(Residuals)))
+        rest = PhantomResiduals(*(np.delete(getattr(data, column), i) for column in names_of(PhantomResiduals)))
         others, x = shift_posterior(rest), data.design[i]
         variance = x @ others.covariance @ x + others.spread_square * data.spread_variance[i] + data.map_variance[i]
         score = float((data.residual[i] - x @ others.mean) / np.sqrt(variance))
@@ -298,7 +301,7 @@ def learn_repeatability(repeats: Sequence[RepeatedExams], *, fewest: int = FEWES
     by_chance = []
     for one in repeats:
         others = [row for row, other in zip(by_exams, repeats, strict=True) if other.mass != one.mass]
-        chances = apart_by_chance(one.centre, one.noise, GRID)
+        chances = cochran_probability(one.centre, one.noise, GRID)
         by_chance.append(float(_density(np.sum(others, axis=0)) @ chances))
     limit = FALSE_ALARMS / len(repeats)
     outlying = tuple(one.name for one, chance in zip(repeats, by_chance, strict=True) if chance < limit)

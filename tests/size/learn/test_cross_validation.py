@@ -21,8 +21,8 @@ from tactile_bayes.size.learn.eq6 import (
     SizeTable,
     StudyCases,
     axis_at_mode,
+    cross_validate,
     geometry_numbers,
-    left_out_of_study,
 )
 from tactile_bayes.size.learn.regression import rows_of
 
@@ -51,8 +51,8 @@ def study(width: Width = by_eq_6, *, along: Width | None = None) -> SizeTable:
 
 
 def test_the_form_that_made_the_table_is_right_and_the_other_is_not() -> None:
-    eq6 = left_out_of_study(study(by_eq_6))
-    quadratic = left_out_of_study(study(by_quadratic))
+    eq6 = cross_validate(study(by_eq_6))
+    quadratic = cross_validate(study(by_quadratic))
     assert eq6 is not None
     assert quadratic is not None
     assert (eq6.cases, eq6.geometries, eq6.least_stiffness_ratio) == (50, 25, 8.0)
@@ -74,7 +74,7 @@ def test_the_quadratic_is_a_plain_fit_to_the_other_geometries() -> None:
         for errors, kept in ((by_geometry, (d != d[i]) | (h != h[i])), (by_row, np.arange(len(d)) != i)):
             solved = np.linalg.solve(terms[kept].T @ terms[kept], terms[kept].T @ np.log(d[kept]))
             errors.append(abs(np.exp(terms[i] @ solved) / d[i] - 1))
-    found = left_out_of_study(table)
+    found = cross_validate(table)
     assert found is not None
     assert found.log_quadratic["both"] == pytest.approx(np.mean(by_geometry), rel=1e-6)
     # the control: leaving out single rows lets another stiffness of the same lump tell its size
@@ -87,26 +87,26 @@ def test_a_geometry_is_one_seat_diameter_and_depth() -> None:
 
 
 def test_each_width_and_both_have_their_errors() -> None:
-    found = left_out_of_study(study(by_quadratic, along=lambda d, a: np.full_like(d, 4.0) + 0.1 * a))
+    found = cross_validate(study(by_quadratic, along=lambda d, a: np.full_like(d, 4.0) + 0.1 * a))
     assert found is not None
     assert list(found.eq6) == list(found.log_quadratic) == ["x", "y", "both"]
     assert found.log_quadratic["x"] < 0.015 < 0.1 < found.log_quadratic["y"]
 
 
 def test_softer_lumps_take_part_only_where_asked() -> None:
-    found = left_out_of_study(study(), least_stiffness_ratio=2.0)
+    found = cross_validate(study(), least_stiffness_ratio=2.0)
     assert found is not None
     assert (found.cases, found.least_stiffness_ratio) == (75, 2.0)
 
 
 def test_tables_that_are_no_study_have_none() -> None:
     table = study()
-    assert left_out_of_study(replace(table, cases=None)) is None
+    assert cross_validate(replace(table, cases=None)) is None
     few = table.d_mm < 8  # five geometries
     assert table.cases is not None
     cut = SizeTable(table.d_mm[few], table.amplitude[few], table.sigma_x_mm[few], None, cases=rows_of(table.cases, few))
-    assert left_out_of_study(cut) is None
-    assert left_out_of_study(study(), least_stiffness_ratio=1000.0) is None
+    assert cross_validate(cut) is None
+    assert cross_validate(study(), least_stiffness_ratio=1000.0) is None
 
 
 @pytest.mark.long
@@ -122,7 +122,7 @@ def test_where_eq_6_has_no_mode_the_report_says_without_which_geometry(
     table = study()
     assert table.cases is not None
     with pytest.raises(NotConvergedError, match=r"no mode without the geometry centred, d 10 mm, h/d 0\.6"):
-        left_out_of_study(table)
+        cross_validate(table)
     columns = (table.d_mm, table.cases.depth_ratio, table.cases.stiffness_ratio, table.amplitude, table.sigma_x_mm)
     rows = ["seat,d_mm,depth_ratio,stiffness_ratio,amplitude,sigma_x_mm"]
     rows += [",".join(["centred", *map(str, case)]) for case in zip(*columns, strict=True)]
@@ -143,7 +143,7 @@ def test_a_left_out_geometry_is_no_reference_for_width_changes(monkeypatch: pyte
         return axis_at_mode(rows)
 
     monkeypatch.setattr(left_out, "axis_at_mode", at_mode)
-    left_out_of_study(study())
+    cross_validate(study())
     assert len(seen) == 25
     for number, rows in enumerate(seen):
         assert len(rows.d_mm) == 48

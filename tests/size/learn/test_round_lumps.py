@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_bayes.size.learn.regression import PopulationTable, learn_round
+from tactile_bayes.size.learn.regression import PopulationTable, learn_round_lumps
 from tactile_bayes.size.terms import RoundLumps, monomials, powers
 
 TRUE = np.array([0.04, -0.02, 0.06, 0.0, -0.05, -0.04])
@@ -26,7 +26,7 @@ def table(bodies: int = 800) -> tuple[PopulationTable, np.ndarray]:
 
 def test_the_curve_and_both_parts_of_the_spread_are_found():
     rows, terms = table()
-    spread = learn_round(rows, terms)
+    spread = learn_round_lumps(rows, terms)
     np.testing.assert_allclose(spread.coefficients, TRUE, atol=0.004)
     assert spread.body_sd == pytest.approx(BODY_SD, rel=0.15)
     assert spread.map_factor == pytest.approx(FACTOR, rel=0.2)

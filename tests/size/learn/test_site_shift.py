@@ -17,7 +17,14 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import BetweenMaps, BumpDraws, ShapeDraws, ShapePrior
-from tactile_bayes.size.learn.site import LACK, PhantomMap, Residuals, SitePrior, correct_calibration, shift_posterior
+from tactile_bayes.size.learn.site import (
+    LACK,
+    PhantomMap,
+    PhantomResiduals,
+    SitePrior,
+    correct_calibration,
+    shift_posterior,
+)
 from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size
 from tactile_bayes.size.terms import HiddenTerms
 
@@ -53,15 +60,15 @@ def phantoms(rng: np.random.Generator, n: int, *, shift: float, slope: float, bo
     return made
 
 
-def some_residuals(n: int = 6) -> Residuals:
+def some_residuals(n: int = 6) -> PhantomResiduals:
     rng = np.random.default_rng(5)
     width = rng.uniform(-0.7, 0.7, n)
     residual = 0.1 + 0.2 * width + 0.12 * rng.standard_normal(n)
     spread, noise = rng.uniform(0.005, 0.02, n), rng.uniform(1e-4, 2e-3, n)
-    return Residuals(residual, width, spread, noise, rng.uniform(0.02, 0.05, n))
+    return PhantomResiduals(residual, width, spread, noise, rng.uniform(0.02, 0.05, n))
 
 
-def covariance_of(data: Residuals, prior: SitePrior, k: float) -> np.ndarray:
+def covariance_of(data: PhantomResiduals, prior: SitePrior, k: float) -> np.ndarray:
     """Of the residuals, everything summed over: the textbook's joint normal, which the module never builds."""
     x, p = data.design, np.diag(np.append(prior.sd, 1.0) ** 2)
     return x @ p @ x.T + np.diag(k**2 * data.spread_variance + data.map_variance)
