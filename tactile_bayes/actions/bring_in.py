@@ -15,7 +15,7 @@ from tactile_bayes.files.arrays_layout import ArrayMap, GridOptions, Stated
 from tactile_bayes.files.atomic import check_suffix, refuse_existing, refuse_same
 from tactile_bayes.files.documents import with_session
 from tactile_bayes.files.grids import import_grid
-from tactile_bayes.files.imports import import_arrays, of_calibration, of_head, of_landmarks, of_poses
+from tactile_bayes.files.imports import calibration_source, head_source, import_arrays, landmark_source, pose_source
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, array_template, read_array_map
 from tactile_bayes.files.provenance import Provenance, hash_inputs
@@ -26,7 +26,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scans import Scan
 from tactile_bayes.shell import progress_bar
 
-_BESIDE: Final = {"head_geometry": of_head, "array_calibration": of_calibration, "landmarks": of_landmarks}
+_BESIDE: Final = {"head_geometry": head_source, "array_calibration": calibration_source, "landmarks": landmark_source}
 
 
 class ImportRequest(Record):
@@ -138,7 +138,7 @@ def _import_scan(source: Path, output: Path, wanted: ImportRequest) -> list[str]
         scan, lost, truth = file.scan, file.lost, file.truth
     else:
         files = wanted.beside.items()
-        beside = [of_poses(path, wanted.arrays) if name == "poses" else _BESIDE[name](path) for name, path in files]
+        beside = [pose_source(path, wanted.arrays) if name == "poses" else _BESIDE[name](path) for name, path in files]
         scan, notes = import_arrays(source, wanted.arrays, beside)
     settings = {"as": "scan", "lost": list(lost), "correct": list(wanted.corrections), **wanted.arrays.given}
     scan = corrected(with_session(scan, wanted.session_file), wanted.corrections)

@@ -18,7 +18,7 @@ from tactile_bayes.batch import BatchInterrupted, Outcome, fault_lines, open_exe
 from tactile_bayes.commands.options import make_settings
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_FAULT, EXIT_NO_ESTIMATE, UsageError
-from tactile_bayes.files.atomic import given_twice
+from tactile_bayes.files.atomic import first_duplicate
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.reports import json_text
 from tactile_bayes.presets import RESEARCH_USE
@@ -85,7 +85,7 @@ def estimate_action(
     if figure is not None and settings.size_calibration == "none":
         raise UsageError("--figure draws sizes and needs a --size-calibration; --map-figure draws the fit")
     outputs = (output, figure, map_figure, fit_figure)
-    if twice := given_twice(maps):
+    if twice := first_duplicate(maps):
         raise UsageError(f"{twice} is given twice; give each map once")
     if any(outputs) and len(maps) > 1 and not pool:
         raise UsageError("--output and the figures take one map at a time; use --json for several")

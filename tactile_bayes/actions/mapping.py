@@ -11,7 +11,7 @@ import click
 
 from tactile_bayes.declarations import EXACT, to_plain
 from tactile_bayes.errors import UsageError
-from tactile_bayes.files.atomic import given_twice, refuse_existing, sha256
+from tactile_bayes.files.atomic import first_duplicate, refuse_existing, sha256
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
 from tactile_bayes.files.scan_mcap import read_scan
@@ -26,7 +26,7 @@ def map_action(
     scans: tuple[Path, ...], output: Path | None, figure: Path | None, force: bool, verbose: bool, **options: Any
 ) -> None:
     """Build a tactile map from one scan, or one common map from several scans of the same examination."""
-    if twice := given_twice(scans):
+    if twice := first_duplicate(scans):
         raise UsageError(f"{twice} is given twice; its frames would count twice: give each scan once")
     if output is None:
         output = default_map_path(scans[0])

@@ -17,7 +17,7 @@ from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.commands.options import make_settings, typed_options
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
-from tactile_bayes.files.atomic import given_twice
+from tactile_bayes.files.atomic import first_duplicate
 from tactile_bayes.files.reports import json_text
 from tactile_bayes.options import CompareOptions
 from tactile_bayes.presets import RESEARCH_USE
@@ -55,7 +55,7 @@ def compare_action(
     )
     settings = make_settings(**asked)
     visits = [first, *(tuple(path for _, path in group) for _, group in groupby(later, itemgetter(0)))]
-    if twice := given_twice(path for maps in visits for path in maps):
+    if twice := first_duplicate(path for maps in visits for path in maps):
         raise UsageError(f"{twice} is given twice; give each map once, at its own visit")
     refuse_checkpoint(settings)
     comparing.check_visits(len(visits))

@@ -277,7 +277,7 @@ def _scan(path: Path) -> dict[str, Any]:
     """
     records = scan_mcap.scan_records(path, keep=())
     with in_file(path):
-        head = scan_mcap.attached(records, HeadGeometry, "head.json")
+        head = scan_mcap.read_attachment(records, HeadGeometry, "head.json")
         time_s = scan_mcap.message_times(records.messages("/pressure", schema="foxglove.Grid"), topic="/pressure")
         pose_s = scan_mcap.message_times(records.messages("/pose", schema="foxglove.PoseInFrame"), topic="/pose")
         touches = {

@@ -19,7 +19,7 @@ from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.commands.options import make_settings, protect_inputs
 from tactile_bayes.declarations import replace, to_plain
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, UsageError, in_file
-from tactile_bayes.files.atomic import given_twice
+from tactile_bayes.files.atomic import first_duplicate
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.instrument import read_scene
 from tactile_bayes.files.map_nc import read_map
@@ -197,7 +197,7 @@ def tradeoff_estimate_action(
     force: bool,
 ) -> int:
     """Measure what each setting of `estimate` costs on a map, and how far its size interval is off."""
-    if twice := given_twice(maps):
+    if twice := first_duplicate(maps):
         raise UsageError(f"{twice} is given twice; give each map once")
     settings = make_settings(
         settings_file=settings_file, size_calibration=size_calibration, centre_mm=centre_mm, seed=seed

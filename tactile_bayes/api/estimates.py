@@ -21,7 +21,7 @@ from tactile_bayes.exports.exam import EstimateFile, MapFile, estimate_of, ident
 from tactile_bayes.exports.run import FORMATS, Outputs, refuse_untaken
 from tactile_bayes.exports.run import ExportFormat as Format
 from tactile_bayes.exports.run import export as exported_files
-from tactile_bayes.files.atomic import given_twice, sha256
+from tactile_bayes.files.atomic import first_duplicate, sha256
 from tactile_bayes.files.documents import load_json
 from tactile_bayes.files.estimate_json import checked_report
 from tactile_bayes.files.map_nc import read_map_and_scans
@@ -165,7 +165,7 @@ def exam_from_files(
     with ``-o``; `given`: makes the settings, of which an estimate takes none; `typed`: those that somebody gave;
     `notice`: called with a line that a user may want to read while waiting.
     """
-    if twice := given_twice(paths):
+    if twice := first_duplicate(paths):
         raise UsageError(f"{twice} is given twice; give each file once")
     estimates = [
         path

@@ -366,7 +366,7 @@ def scan(
         made, notes = imports.import_arrays(path_of(frames), given, beside)
     else:
         times = {} if time is None else {"frame_time_s": _array(time)}
-        made, notes = imports.combined([Source({"frames": _array(frames), **times}), *beside], given)
+        made, notes = imports.combine_sources([Source({"frames": _array(frames), **times}), *beside], given)
     for note in notes:
         if note.startswith("CAUTION"):
             warnings.warn(note, stacklevel=4)
@@ -388,7 +388,7 @@ def _poses(given: Any, stated: ArrayMap) -> Source:
     if given is None:
         return Source({})
     if isinstance(given, str | Path):
-        return imports.of_poses(path_of(given), stated)
+        return imports.pose_source(path_of(given), stated)
     if isinstance(given, TrackerPoses):
         return Source(_named(given.time_s, given.position_mm, given.quaternion_wxyz))
     if isinstance(given, tuple | list) and len(given) == 3:
@@ -412,21 +412,21 @@ def _named(time: Any, position: Any, quaternion: Any) -> Arrays:
 def _head(given: Any) -> Source:
     if isinstance(given, Mapping):
         document = {"schema": _HEAD_SCHEMA, **to_plain(dict(given), digits=EXACT)}
-        return imports.of_head(head_geometry(document, path=Path("head")))
-    return _beside(given, HeadGeometry, imports.of_head, lambda other: other.head)
+        return imports.head_source(head_geometry(document, path=Path("head")))
+    return _beside(given, HeadGeometry, imports.head_source, lambda other: other.head)
 
 
 def _calibration(given: Any) -> Source:
     if isinstance(given, tuple | list) and len(given) == 2:
         return Source({"gain_kpa_per_count": _array(given[0]), "offset_kpa": _array(given[1])})
-    return _beside(given, ElementCalibration, imports.of_calibration, lambda other: other.element_calibration)
+    return _beside(given, ElementCalibration, imports.calibration_source, lambda other: other.element_calibration)
 
 
 def _landmarks(given: Any) -> Source:
     points = None if given is None or isinstance(given, str | Path | Landmarks | Scan) else _array(given)
     if points is not None and points.shape in ((2, 3), (3, 3)):
         return Source({"landmarks_mm": points[:2], **({"nipple_mm": points[2]} if len(points) == 3 else {})})
-    return _beside(given, Landmarks, imports.of_landmarks, lambda other: other.landmarks)
+    return _beside(given, Landmarks, imports.landmark_source, lambda other: other.landmarks)
 
 
 def _beside(given: Any, kind: type, made: Callable[[Any], Source], part: Callable[[Scan], Any]) -> Source:

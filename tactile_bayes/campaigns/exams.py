@@ -20,9 +20,9 @@ from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import Abstention, BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256
-from tactile_bayes.files.manifest_csv import JOURNAL, SAME_IN_SCANS, Exam, natural
+from tactile_bayes.files.manifest_csv import JOURNAL, SAME_IN_SCANS, Exam, natural_key
 from tactile_bayes.files.map_nc import read_map, read_map_and_scans
-from tactile_bayes.files.reading import check_address, fetched, files_below, is_address
+from tactile_bayes.files.reading import check_address, downloaded, files_below, is_address
 from tactile_bayes.files.reports import Place
 from tactile_bayes.files.scan_mcap import provenance_of, scan_records
 from tactile_bayes.findings import Finding, finding
@@ -245,7 +245,7 @@ def find_exams(
         try:
             if name[0] in "=+@-" or name != name.strip() or not name.isprintable() or len(name) > 1000:
                 raise BadDataError("the table takes no such file name: rename it")
-            with nullcontext(paths[name]) if name in paths else fetched(name) as path:
+            with nullcontext(paths[name]) if name in paths else downloaded(name) as path:
                 said[name] = _told(path, name, None if name in known else pattern)
         except BadDataError as error:
             if name not in known:
@@ -256,7 +256,7 @@ def find_exams(
     found.rows.extend({"file": name, **_DEFAULTS, **said[name].facts} for name in new)
     found.spelled.extend(_spell_as(listed, found.rows))
     found.rows.sort(
-        key=lambda row: (natural(row["patient"].casefold()), natural(row["visit"]), row["mass"], row["file"])
+        key=lambda row: (natural_key(row["patient"].casefold()), natural_key(row["visit"]), row["mass"], row["file"])
     )
     _number(found.rows, listed)
     gone = (name for name in known if not is_address(name) and not os.path.lexists(table.parent / name))
@@ -332,7 +332,7 @@ class Breasts:
             return []
         breast = [one for one in self._exams[exam.patient, exam.side] if of is None or one.name in of]
         found: dict[str, Exam] = {}
-        for one in sorted(breast, key=lambda one: (one.visit != exam.visit, natural(one.visit), one.replicate)):
+        for one in sorted(breast, key=lambda one: (one.visit != exam.visit, natural_key(one.visit), one.replicate)):
             if one.centre_mm is not None:
                 found.setdefault(one.mass, one)
         return list(found.values()) if exam.mass in found else []

@@ -32,7 +32,7 @@ from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.map_nc import read_map, read_map_and_scans, write_map
 from tactile_bayes.files.npz import read_shape, write_shape
 from tactile_bayes.files.provenance import Provenance, scan_facts
-from tactile_bayes.files.reading import NETCDF_BYTES, fetched, kind_of, put, read_bytes
+from tactile_bayes.files.reading import NETCDF_BYTES, downloaded, kind_of, put, read_bytes
 from tactile_bayes.files.reports import EstimateReport, json_text
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.findings import by_severity
@@ -201,10 +201,10 @@ def make_map(
     """The exam's map from its scan or its arrays (brought in as `import` does), or the map that its file is.
 
     `expected` is what the table says of the exam, by its columns: what belongs to another exam is refused. `address` is
-    of a file in an object store, fetched for as long as the map is made.
+    of a file in an object store, downloaded for as long as the map is made.
     """
     if address:
-        with fetched(address) as path:
+        with downloaded(address) as path:
             return make_map(path, source_sha256=source_sha256, expected=expected, normalise=normalise)
     if sha256(source) != source_sha256:
         raise BadDataError("changed while the campaign ran", way_out="run the campaign again")

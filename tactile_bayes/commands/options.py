@@ -55,7 +55,7 @@ class FilePath(click.Path):
             seen: list[tuple[Path, bool]] = ctx.meta.setdefault(_SEEN, [])
             for other, other_written in seen:
                 if written and other_written:
-                    refuse_same([path], [other], what="two outputs of this command")
+                    refuse_same([path], [other], role="two outputs of this command")
                 elif written or other_written:
                     refuse_same([path], [other])
             seen.append((path, written))

@@ -52,16 +52,16 @@ def same_file(one: Path, other: Path) -> bool:
 
 
 def refuse_same(
-    outputs: Iterable[Path | None], inputs: Iterable[Path | None], *, what: str = "an input of this command"
+    outputs: Iterable[Path | None], inputs: Iterable[Path | None], *, role: str = "an input of this command"
 ) -> None:
-    """Refuse an output that is the same file as an input, under any name; `what` the file is besides."""
+    """Refuse an output that is the same file as an input, under any name; `role` is what the file is besides."""
     read = [path for path in inputs if path is not None]
     for path in outputs:
         if path is not None and any(same_file(path, one) for one in read):
-            raise UsageError(f"{path} is {what}; choose another name for the output")
+            raise UsageError(f"{path} is {role}; choose another name for the output")
 
 
-def given_twice(paths: Iterable[Path]) -> Path | None:
+def first_duplicate(paths: Iterable[Path]) -> Path | None:
     """The first path that leads to the file of one before it; None where each is another file."""
     seen = set[tuple[int, int] | str]()
     for path in paths:
@@ -74,10 +74,10 @@ def given_twice(paths: Iterable[Path]) -> Path | None:
 def _identity(path: Path) -> tuple[int, int] | str:
     """Identity that all names of a file share; where it does not exist, the name that it would have."""
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError:  # opening it says what is wrong with it
         return os.path.realpath(path)
-    return found.st_dev, found.st_ino
+    return status.st_dev, status.st_ino
 
 
 # --- Atomic writing of files, readable by their owner only; every failure to write is one error line.
@@ -161,8 +161,8 @@ def _sweep(target: Path, stem: str) -> None:
     """Remove temporary files of `target` that ended processes left behind."""
     pattern = re.compile(rf"{re.escape(stem)}-(\d+)-[^.]*{re.escape(_PART)}")
     for name in os.listdir(target.parent):  # noqa: PTH208 (names only: the directory may be large)
-        found = pattern.fullmatch(name)
-        if found and not _alive(int(found[1])):
+        match = pattern.fullmatch(name)
+        if match and not _alive(int(match[1])):
             target.with_name(name).unlink(missing_ok=True)
 
 

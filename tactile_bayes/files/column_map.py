@@ -167,8 +167,8 @@ def _rows(path: Path, mapping: ColumnMap, names: Sequence[str | None]) -> list[_
     header = [composed(name) for name in table.header]
     for name in filter(None, (*mapping.key_columns(), *names)):
         if name not in header:
-            held = ", ".join(repr(one) for one in header)
-            raise table.error(1, name, "is missing", way_out=f"correct the mapping; the table has {held}")
+            column_names = ", ".join(repr(one) for one in header)
+            raise table.error(1, name, "is missing", way_out=f"correct the mapping; the table has {column_names}")
     cells = ({composed(name): composed(cell) for name, cell in row.items()} for row in table.rows)
     return [_Row(table, line, row) for (line, _), row in zip(table.body, cells, strict=True)]
 

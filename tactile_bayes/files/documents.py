@@ -64,10 +64,10 @@ def read_toml_record(path: Path, kind: type[T], *, way_out: str) -> T:
 def parse_record(document: object, kind: type[T], *, path: Path) -> T:
     """A record from a document that was read; for the errors see `read_record`."""
     schema = schema_name(kind)
-    wanted = schema_kind(schema)
-    found = schema_kind(document.get("schema")) if isinstance(document, dict) else ""
-    if wanted and found and found != wanted:
-        raise BadDataError(f"is {found}, not {wanted}", way_out=f"give {wanted}", path=str(path))
+    kind_expected = schema_kind(schema)
+    kind_read = schema_kind(document.get("schema")) if isinstance(document, dict) else ""
+    if kind_expected and kind_read and kind_read != kind_expected:
+        raise BadDataError(f"is {kind_read}, not {kind_expected}", way_out=f"give {kind_expected}", path=str(path))
     if schema and isinstance(document, dict) and document.get("schema", schema) != schema:
         raise BadDataError(f"schema is {short_repr(document['schema'])}", way_out=f"give {schema!r}", path=str(path))
     with in_file(path):
@@ -95,11 +95,11 @@ def parse_json(text: str, *, name: str = "", way_out: str = "copy the file again
 
 def _object(pairs: list[tuple[str, Any]], *, way_out: str) -> dict[str, Any]:
     """A JSON object, in which no key may stand twice: programs differ in which of the values they take."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    members = dict(pairs)
+    if len(members) < len(pairs):
         (twice, _), *_ = Counter(name for name, _ in pairs).most_common(1)
         raise BadDataError(f"holds the key {twice[:40]!a} twice in one object", way_out=way_out)
-    return found
+    return members
 
 
 def load_toml(path: Path, *, way_out: str) -> dict[str, Any]:
@@ -153,8 +153,8 @@ def check_text(where: str, text: str, *, way_out: str) -> None:
     """Refuse a text with surrogates, control characters or marks that turn what follows."""
     if not text.isascii() and any("\ud800" <= letter <= "\udfff" for letter in text):
         raise BadDataError(f"{where or 'a key'} holds a broken character: {text[:40]!a}", way_out=way_out)
-    if not text.isprintable() and (found := _CONTROL.search(text)):
-        code = f"U+{ord(found[0]):04X}"  # a terminal obeys some, a table's reader stumbles over all
+    if not text.isprintable() and (match := _CONTROL.search(text)):
+        code = f"U+{ord(match[0]):04X}"  # a terminal obeys some, a table's reader stumbles over all
         raise BadDataError(f"{where or 'a key'} holds the character {code}: {text[:40]!a}", way_out=way_out)
 
 

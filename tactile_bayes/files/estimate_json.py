@@ -86,9 +86,9 @@ def _from_json(path: Path, number: int | None) -> Quantity | None:
     if isinstance(document, list):
         number = 1 if number is None and len(document) == 1 else number
         if number is None or not 1 <= number <= len(document):
-            wanted = "" if number is None else f" and none with the number {number}"
+            number_words = "" if number is None else f" and none with the number {number}"
             way_out = f"name one as {path.name}#1 to {path.name}#{len(document)}, in the order of the maps"
-            raise BadDataError(f"holds {len(document)} estimates{wanted}", way_out=way_out, path=str(path))
+            raise BadDataError(f"holds {len(document)} estimates{number_words}", way_out=way_out, path=str(path))
         document = document[number - 1]
     elif number is not None:
         raise BadDataError("holds one estimate, no list", way_out=f"leave out #{number}", path=str(path))
@@ -120,22 +120,22 @@ Holder = EstimateReport | PooledReport | MassReport | AnotherExam
 def checked_report(document: object, kind: type[R], *, path: Path) -> R:
     """What ``estimate --json`` printed for one map, or for several: its fields, and its sizes against each other."""
     report = parse_record(document, kind, path=path)
-    if (fault := next(_faults(report), None)) is not None:
+    if (fault := next(_report_faults(report), None)) is not None:
         what, rule = fault
         raise BadDataError(what, way_out=f"{rule}give the JSON as `estimate --json` printed it", path=str(path))
     return report
 
 
-def _faults(report: EstimateReport | PooledReport) -> Iterator[tuple[str, str]]:
+def _report_faults(report: EstimateReport | PooledReport) -> Iterator[tuple[str, str]]:
     """What cannot be so, each with the rule that it breaks where its own words do not say it."""
     if report.status != "estimate" and report.max_size_mm is not None:
         yield f"status is {report.status!r}, and there is a max_size_mm", ""
     masses = report.masses if isinstance(report, EstimateReport) else ()
     holders: list[tuple[str, Holder]] = [("", report), *((f"masses[{i}].", mass) for i, mass in enumerate(masses))]
     for where, holder in holders:
-        yield from _of_sizes(where, holder)
+        yield from _size_faults(where, holder)
         if (another := getattr(holder, "another_exam", None)) is not None:
-            yield from _of_sizes(f"{where}another_exam.", another)
+            yield from _size_faults(f"{where}another_exam.", another)
     numbers = [one.number for one in masses]
     if len(set(numbers)) < len(numbers):
         yield f"masses are numbered {', '.join(map(str, numbers[:9]))}", ""
@@ -150,7 +150,7 @@ def _faults(report: EstimateReport | PooledReport) -> Iterator[tuple[str, str]]:
         yield f"verdict is {report.verdict!r}, and its findings make it {made!r}", ""
 
 
-def _of_sizes(where: str, holder: Holder) -> Iterator[tuple[str, str]]:
+def _size_faults(where: str, holder: Holder) -> Iterator[tuple[str, str]]:
     """Faults of whatever holds sizes, by its place in the document."""
     for name in _SIZES:
         size: Quantity | None = getattr(holder, name, None)

@@ -14,7 +14,7 @@ from tactile_bayes.errors import BadDataError, UsageError, in_file
 from tactile_bayes.files import tables
 from tactile_bayes.files.arrays_layout import GridOptions
 from tactile_bayes.files.images import read_image
-from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, AXES, Grid, read_named, turned_by_axes
+from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, AXES, Grid, orient_by_axes, read_named
 from tactile_bayes.findings import finding
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap, block_sums
@@ -42,9 +42,9 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
     """Read a table of text, NaN where a field is empty or one of the texts of `no_value`."""
     words = [one for one in no_value if not is_number(one)]  # numbers are looked for among the values
     texts = tables.read_lines(path)
-    separator = tables.separator_of(texts, words) or ","
-    rows = [tables.fields_of(one, separator) for one in texts]
-    commas = tables.with_comma(rows, words, way_out="write numbers without commas")
+    separator = tables.detect_separator(texts, words) or ","
+    rows = [tables.split_fields(one, separator) for one in texts]
+    commas = tables.comma_numbers(rows, words, way_out="write numbers without commas")
     decimal = {one for one in commas if one.count(",") == 1}
     rows = [[field.replace(",", ".") if field in decimal else field for field in row] for row in rows]
     first, last = _numbers_within(rows, no_value)
@@ -61,7 +61,7 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
             way_out = "give one grid, such as one frame or a mean of frames, in a file; frames with poses are a scan"
             raise BadDataError(what, way_out=way_out)
     for part, where in ((before, "before"), (after, "after")):
-        if lines := [said for row in part if (said := " ".join(filter(None, row)))]:
+        if lines := [text_of_row for row in part if (text_of_row := " ".join(filter(None, row)))]:
             more = f" and {len(lines) - 1} more" if len(lines) > 1 else ""
             notes.append(f"text {where} the numbers was left out: {lines[0][:40]!r}{more}")
     if len(rows[0]) > 2 and all(row[-1] == "" for row in rows):
@@ -69,8 +69,8 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
         notes.append("every row ends with a separator: it begins no column")
     values = _values(rows, marks, first)
     for mark in dict.fromkeys(marks):
-        if alike := sum(field == mark for row in rows for field in row):
-            notes.append(f"{alike:,} cells hold {mark!r}, which is no value")
+        if count := sum(field == mark for row in rows for field in row):
+            notes.append(f"{count:,} cells hold {mark!r}, which is no value")
     _refuse_labels(values)
     named = _UNITS_LINE.search(text)
     units = "" if named is None else "kPa" if named[1].lower() == "kpa" else named[1]
@@ -95,8 +95,10 @@ def _numbers_within(rows: Sequence[list[str]], no_value: Sequence[str]) -> tuple
     if not plain:
         faulty = next((row for row in rows if any(map(is_number, row))), None)
         if faulty is None:
-            held = next((field for row in rows for field in row if field), "")
-            raise BadDataError(f"holds {held[:30]!r} and no number" if held else "is empty", way_out=_WAY_OUT)
+            first_text = next((field for row in rows for field in row if field), "")
+            raise BadDataError(
+                f"holds {first_text[:30]!r} and no number" if first_text else "is empty", way_out=_WAY_OUT
+            )
         return rows.index(faulty), len(rows)
     first, last = plain[0], plain[-1] + 1
     while last < len(rows) and any(map(is_number, rows[last])):  # a faulty row is told, not left out
@@ -119,9 +121,9 @@ def _is_title(row: Sequence[str]) -> bool:
 
 def _values(rows: Sequence[list[str]], marks: Sequence[str], before: int) -> FloatArray:
     """The numbers of rows of one length, NaN for marks; the way out of anything else is by what it is."""
-    for number, held in enumerate(rows, start=before + 1):
-        if len(held) != len(rows[0]):
-            what = f"row {number} has {len(held)} fields, row {before + 1} has {len(rows[0])}"
+    for number, fields_of_row in enumerate(rows, start=before + 1):
+        if len(fields_of_row) != len(rows[0]):
+            what = f"row {number} has {len(fields_of_row)} fields, row {before + 1} has {len(rows[0])}"
             raise BadDataError(what, way_out="give every row one length")
     none = {"", *marks}
     fields = ((i, j, field) for i, row in enumerate(rows, before + 1) for j, field in enumerate(row, 1))
@@ -129,7 +131,7 @@ def _values(rows: Sequence[list[str]], marks: Sequence[str], before: int) -> Flo
     if not faults:
         return np.array([[np.nan if field in none else float(field) for field in row] for row in rows])
     row, column, field = faults[0]
-    alike = sum(one[2] == field for one in faults) - 1
+    repeats = sum(one[2] == field for one in faults) - 1
     way_out = f"if it means no value, give --no-value {field[:30]}"
     if len(faults) > 1 and all(one[1] == 1 for one in faults) and len(faults) >= len(rows) - 1:
         way_out = "leave out the column of names"
@@ -137,24 +139,24 @@ def _values(rows: Sequence[list[str]], marks: Sequence[str], before: int) -> Flo
         way_out = f"leave out the labels of rows and columns; {way_out}"
     elif re.search(r"\d", field) and "#" not in field:  # 1.#QNAN and #DIV/0! are words
         way_out = "write numbers as 1.5"
-    more = f" (and {alike} more do)" if alike else ""
+    more = f" (and {repeats} more do)" if repeats else ""
     raise BadDataError(f"row {row}, column {column} holds {field[:30]!r}{more}", way_out=way_out)
 
 
 def _refuse_labels(table: FloatArray) -> None:
     """Refuse numbers or places of rows and columns in the first of these, and a list of x, y and value: no readings."""
     row, column = table[0], table[:, 0]
-    both = np.isnan(table[0, 0]) and _evenly(row[1:]) and _evenly(column[1:])
-    for found, line, where in (
+    both = np.isnan(table[0, 0]) and _in_equal_steps(row[1:]) and _in_equal_steps(column[1:])
+    for is_labels, line, where in (
         (both, row[1:], "row 1 and column 1"),
-        (tables.counts_up(row), row, "row 1"),
-        (tables.counts_up(column), column, "column 1"),
+        (tables.is_label_sequence(row), row, "row 1"),
+        (tables.is_label_sequence(column), column, "column 1"),
     ):
-        if found:
+        if is_labels:
             way_out = "save the grid without them (pandas: to_csv(..., header=False, index=False))"
             raise BadDataError(f"{where} count {_first_three(line)}... as labels do", way_out=way_out)
     for name, line, beside in (("column", column, table[:, 1:].T), ("row", row, table[1:])):
-        if len(line) >= tables.FEWEST_LABELS and _evenly(line) and not any(map(_evenly, beside)):
+        if len(line) >= tables.FEWEST_LABELS and _in_equal_steps(line) and not any(map(_in_equal_steps, beside)):
             what = f"{name} 1 runs in equal steps ({_first_three(line)}...)"
             raise BadDataError(what, way_out="leave out times or places; frames that stand one a row are a scan")
     nx, ny = (len(np.unique(line)) for line in (column, table[:, 1 % table.shape[1]]))
@@ -168,7 +170,7 @@ def _first_three(line: FloatArray) -> str:
     return ", ".join(f"{value:g}" for value in line[:3])
 
 
-def _evenly(line: FloatArray) -> bool:
+def _in_equal_steps(line: FloatArray) -> bool:
     """True when three numbers or more run in equal steps."""
     steps = np.diff(line)
     return len(line) > 2 and bool(steps[0] != 0.0) and bool(np.allclose(steps, steps[0], rtol=1e-6, atol=0.0))
@@ -190,7 +192,7 @@ def open_grid(path: Path, *, no_value: Sequence[str] = (), array: str = "") -> G
     """
     suffix = path.suffix.lower()
     if suffix in _ARRAY_SUFFIXES:
-        return _of_arrays(path, array)
+        return _read_arrays(path, array)
     if array:
         raise UsageError(f"--array is for files of arrays; {path} has none")
     if suffix in IMAGE_SUFFIXES:
@@ -202,14 +204,14 @@ def open_grid(path: Path, *, no_value: Sequence[str] = (), array: str = "") -> G
     raise BadDataError(f"has the suffix {suffix or 'none'!r}", way_out=way_out)
 
 
-def _of_arrays(path: Path, array: str) -> Grid:
+def _read_arrays(path: Path, array: str) -> Grid:
     """The array that is named, else ``mean``, else the only one of rows and columns."""
 
-    def wanted(names: Sequence[str]) -> Sequence[str]:
+    def choose(names: Sequence[str]) -> Sequence[str]:
         return [name for name in (*_BESIDE, *AXES) if name in names] if "mean" in names and not array else names
 
-    arrays = read_named(path, wanted)
-    notes = turned_by_axes(arrays)
+    arrays = read_named(path, choose)
+    notes = orient_by_axes(arrays)
     if not array and "mean" in arrays:
         if "spacing_mm" not in arrays:
             return Grid(arrays, notes=notes)
@@ -218,13 +220,15 @@ def _of_arrays(path: Path, array: str) -> Grid:
             what = f"spacing_mm is {sides.dtype} of shape {sides.shape}"
             raise BadDataError(what, way_out="it must be one number")
         return Grid(arrays, (float(sides[0]), float(sides[-1])), notes=notes)
-    named = {name: held for name, held in arrays.items() if array in ("", name)}
-    flat = {name: held for name, held in named.items() if held.ndim == 2 and min(held.shape) > 1}
+    named = {name: array_held for name, array_held in arrays.items() if array in ("", name)}
+    flat = {
+        name: array_held for name, array_held in named.items() if array_held.ndim == 2 and min(array_held.shape) > 1
+    }
     if len(flat) == 1:
         ((name, values),) = flat.items()
-        taken = () if array or len(arrays) == 1 else (f"the array {name!r} was taken",)
-        return Grid({"mean": values}, notes=(*taken, *notes))
-    has = ", ".join(f"{name} {held.shape}" for name, held in sorted(arrays.items())[:12]) or "nothing"
+        choice = () if array or len(arrays) == 1 else (f"the array {name!r} was taken",)
+        return Grid({"mean": values}, notes=(*choice, *notes))
+    has = ", ".join(f"{name} {array_held.shape}" for name, array_held in sorted(arrays.items())[:12]) or "nothing"
     if len(flat) > 1:
         raise BadDataError(f"holds several arrays of rows and columns ({has})", way_out="name one with --array NAME")
     called = f" called {array!r}" if array else ""
@@ -246,24 +250,24 @@ _TIMES_OF_LINES: Final = 10.0
 """A line stands apart where its median step to both sides is so many times the largest of the other lines."""
 
 
-def _refuse_apart(values: FloatArray) -> None:
+def _refuse_outlying(values: FloatArray) -> None:
     """Refuse undeclared numbers that stand apart from all others, as fill values and dead lines do."""
     values = np.where(np.isfinite(values), values, np.nan)
-    if found := _apart(values):
-        number, where, rest = found
+    if outlier := _outlying_number(values):
+        number, where, rest = outlier
         what = f"{number:g} in {where} stands apart from all other values"
         what += f", {rest.min():.4g} to {rest.max():.4g}" if rest.size else ""
         way_out = f"if it means no value, give --no-value {number:.12g}"
         way_out += "" if abs(number) > _BEYOND else f"; if all are values, --no-value {ALL_ARE_VALUES}"
         raise BadDataError(what, way_out=way_out)
     for axis, name in ((1, "column"), (0, "row")):
-        if line := _line_apart(values, axis):
+        if line := _outlying_line(values, axis):
             what = f"{name} {line[0]} differs from those beside it by {line[1]:.3g}, others by up to {line[2]:.3g}"
             way_out = f"leave its cells empty if that line is dead; if all are values, --no-value {ALL_ARE_VALUES}"
             raise BadDataError(what, way_out=way_out)
 
 
-def _apart(values: FloatArray) -> tuple[float, str, FloatArray] | None:
+def _outlying_number(values: FloatArray) -> tuple[float, str, FloatArray] | None:
     """A number that no smooth map holds: the lowest, the highest, or that of a line that is constant.
 
     Its cells differ from their neighbours by several times the largest step between any other neighbours.
@@ -282,15 +286,15 @@ def _apart(values: FloatArray) -> tuple[float, str, FloatArray] | None:
     for number in numbers:
         cells = values == number
         if abs(number) > _BEYOND:
-            return number, _places(cells), rest
+            return number, _where(cells), rest
         border = _steps(values, cells, np.logical_xor)
         times = _TIMES if cells.sum() > 1 else _TIMES_OF_ONE
         if len(largest) >= _FEWEST_STEPS and len(border) and np.median(border) > times * largest.max():
-            return number, _places(cells), rest
+            return number, _where(cells), rest
     return None
 
 
-def _line_apart(values: FloatArray, axis: int) -> tuple[int, float, float] | None:
+def _outlying_line(values: FloatArray, axis: int) -> tuple[int, float, float] | None:
     """A row or column that is dead or stuck and noisy: its number, its step to both sides, and the largest other."""
     steps = np.abs(np.diff(values, axis=axis))
     steps = steps if axis else steps.T
@@ -314,7 +318,7 @@ def _steps(values: FloatArray, cells: BoolArray, which: np.ufunc) -> FloatArray:
     return steps[np.isfinite(steps)]
 
 
-def _places(cells: BoolArray) -> str:
+def _where(cells: BoolArray) -> str:
     """Where cells are, in a few words: whole rows or columns, or how many and the first."""
     number = int(cells.sum())
     for axis, name in ((0, "column"), (1, "row")):
@@ -340,26 +344,26 @@ _LONGEST_MM: Final = 500.0
 """No examined breast is longer; frames that stand one in a row, or one below the other, are."""
 
 
-def import_grid(path: Path, asked: GridOptions, *, progress: Progress = no_progress) -> tuple[TactileMap, list[str]]:
+def import_grid(path: Path, options: GridOptions, *, progress: Progress = no_progress) -> tuple[TactileMap, list[str]]:
     """The map of a file, and what was found on reading it; see `open_grid` and `grid_map`.
 
     Of three steps, reading, the map and what is done with it, `progress` is told the first two.
     """
     with in_file(path):
-        grid = open_grid(path, no_value=asked.no_value, array=asked.array or "")
+        grid = open_grid(path, no_value=options.no_value, array=options.array or "")
         progress(1, 3)
-        made = grid_map(grid, asked)
+        made = grid_map(grid, options)
     progress(2, 3)
     return made
 
 
-def grid_map(grid: Grid, asked: GridOptions) -> tuple[TactileMap, list[str]]:
+def grid_map(grid: Grid, options: GridOptions) -> tuple[TactileMap, list[str]]:
     """The map of a grid, and what was found on the way.
 
     The spacing may be left out where the grid has it. With ``normalise="none"`` values are divided only where a `level`
     is given, which makes it ``"gain"``.
     """
-    spacing, notes = _spacing(grid, given=asked.spacing_mm)
+    spacing, notes = _spacing(grid, stated_mm=options.spacing_mm)
     marked: list[str] = []
     mean = _real(grid.arrays["mean"], name="mean")
     if mean.ndim != 2 or 0 in mean.shape:
@@ -370,27 +374,27 @@ def grid_map(grid: Grid, asked: GridOptions) -> tuple[TactileMap, list[str]]:
         way_out = "one frame a row, or frames below each other? import them as a scan; otherwise check the spacing"
         raise BadDataError(what, way_out=way_out)
     values = mean
-    for number in [float(text) for text in asked.no_value if is_number(text)]:
-        same = (values == number) | (values == np.float64(np.float32(number)))
-        values = np.where(same, np.nan, values)
-        marked.append(f"{int(same.sum()):,} cells hold {number:g}, stated to be no value")
+    for number in [float(text) for text in options.no_value if is_number(text)]:
+        is_no_value = (values == number) | (values == np.float64(np.float32(number)))
+        values = np.where(is_no_value, np.nan, values)
+        marked.append(f"{int(is_no_value.sum()):,} cells hold {number:g}, stated to be no value")
     arrays = {**grid.arrays, "mean": values}
     if "count" in arrays and arrays["count"].shape == mean.shape:
         arrays["count"] = np.where(np.isnan(values) & ~np.isnan(mean), 0, arrays["count"])
         values = np.where(arrays["count"] > 0, values, np.nan)
-    if ALL_ARE_VALUES not in asked.no_value or (np.abs(values) > _BEYOND).any():
-        _refuse_apart(values)
-    units = asked.units or (grid.units if asked.normalise == "none" else "")
-    made = _map(arrays, spacing_mm=spacing, normalise=asked.normalise, units=units)
-    cell = asked.cell_mm or (CELL_MM if spacing < _FINEST_MM * (1 - 1e-6) else spacing)
+    if ALL_ARE_VALUES not in options.no_value or (np.abs(values) > _BEYOND).any():
+        _refuse_outlying(values)
+    units = options.units or (grid.units if options.normalise == "none" else "")
+    tactile_map = _map(arrays, spacing_mm=spacing, normalise=options.normalise, units=units)
+    cell = options.cell_mm or (CELL_MM if spacing < _FINEST_MM * (1 - 1e-6) else spacing)
     if cell < spacing * (1 - 1e-6):
         raise UsageError(f"--cell-mm is {cell:g}, and the grid's cells are {spacing:g} mm; give that or more")
     if (times := int(cell / spacing + 1e-6)) > 1:
-        made = _averaged(made, times)
+        tactile_map = _average_cells(tactile_map, times)
         notes.append(f"{times} x {times} cells of {spacing:g} mm were averaged into one of {times * spacing:g} mm")
-    if asked.level is not None:
-        made = _divided(made, asked.level)
-    return made, [*grid.notes, *notes, *marked]
+    if options.level is not None:
+        tactile_map = _divide_by_level(tactile_map, options.level)
+    return tactile_map, [*grid.notes, *notes, *marked]
 
 
 # --- Cells much finer than any lump, as pixels are: they are averaged before anything is fitted to them.
@@ -399,50 +403,53 @@ _FINEST_MM: Final = 0.5
 """From finer cells with correlated errors the fit took the errors' own grain for lumps, and minutes for it."""
 
 
-def _averaged(made: TactileMap, times: int) -> TactileMap:
+def _average_cells(tactile_map: TactileMap, times: int) -> TactileMap:
     """The map in cells of `times` by `times`, where half of them hold data or more; readings weigh by their number."""
-    weight = np.where(made.covered, made.count, 0).astype(np.float64)
+    weight = np.where(tactile_map.covered, tactile_map.count, 0).astype(np.float64)
     total = block_sums(weight, times)
-    known = block_sums(made.covered.astype(np.float64), times) >= times**2 / 2
+    known = block_sums(tactile_map.covered.astype(np.float64), times) >= times**2 / 2
     each = np.where(known, total, np.nan)
-    mean = block_sums(weight * np.nan_to_num(made.mean), times) / each
-    square = block_sums(weight * (np.nan_to_num(made.variance) + np.nan_to_num(made.mean) ** 2), times) / each
-    variance = np.maximum(square - mean**2, 0.0) if made.counts_known else np.where(known, 0.0, np.nan)
-    count = np.where(known, total if made.counts_known else 1.0, 0.0).astype(np.int64)
-    x_mm, y_mm = (axis[::times] + (times - 1) / 2 * np.ptp(axis[:2]) for axis in (made.x_mm, made.y_mm))
-    recipe = replace(made.recipe, cell_mm=times * made.recipe.cell_mm)
-    return replace(made, mean=mean, variance=variance, count=count, x_mm=x_mm, y_mm=y_mm, recipe=recipe)
+    mean = block_sums(weight * np.nan_to_num(tactile_map.mean), times) / each
+    square = (
+        block_sums(weight * (np.nan_to_num(tactile_map.variance) + np.nan_to_num(tactile_map.mean) ** 2), times) / each
+    )
+    variance = np.maximum(square - mean**2, 0.0) if tactile_map.counts_known else np.where(known, 0.0, np.nan)
+    count = np.where(known, total if tactile_map.counts_known else 1.0, 0.0).astype(np.int64)
+    x_mm, y_mm = (axis[::times] + (times - 1) / 2 * np.ptp(axis[:2]) for axis in (tactile_map.x_mm, tactile_map.y_mm))
+    recipe = replace(tactile_map.recipe, cell_mm=times * tactile_map.recipe.cell_mm)
+    return replace(tactile_map, mean=mean, variance=variance, count=count, x_mm=x_mm, y_mm=y_mm, recipe=recipe)
 
 
-def _divided(made: TactileMap, level: float | str) -> TactileMap:
+def _divide_by_level(tactile_map: TactileMap, level: float | str) -> TactileMap:
     """The map divided by its level, which makes it one by gains; a level that was fitted is a finding."""
     if isinstance(level, str):  # of a fit about the highest bump; the median where nothing rises
         options = SamplerSettings(method="optimise", background="free")
-        fit = estimate_map(made, calibration=None, options=options, rng=np.random.default_rng(1)).fit
-        by = float(np.median(made.mean[made.covered]) if fit is None else fit.bump.level(fit.theta))
+        fit = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1)).fit
+        divisor = float(np.median(tactile_map.mean[tactile_map.covered]) if fit is None else fit.bump.level(fit.theta))
     else:
-        by = level
-    if not by > 0:
-        raise BadDataError(f"the level is {by:.4g}", way_out="subtract the offset of the readings first")
-    unit = made.recipe.units
-    text = f"values were divided by {by:.4g}{f' {unit}' if unit else ''}, the level beside the highest bump of the map"
-    found = finding("level_fitted", f"{text}; what the hand's pressure changed between frames is still in them")
+        divisor = level
+    if not divisor > 0:
+        raise BadDataError(f"the level is {divisor:.4g}", way_out="subtract the offset of the readings first")
+    unit = tactile_map.recipe.units
+    by = f"{divisor:.4g}{f' {unit}' if unit else ''}, the level beside the highest bump of the map"
+    text = f"values were divided by {by}; what the hand's pressure changed between frames is still in them"
+    fitted = (finding("level_fitted", text),) if isinstance(level, str) else ()
     divided = replace(
-        made,
-        mean=made.mean / by,
-        variance=made.variance / by**2,
-        recipe=replace(made.recipe, normalise="gain", units=""),
+        tactile_map,
+        mean=tactile_map.mean / divisor,
+        variance=tactile_map.variance / divisor**2,
+        recipe=replace(tactile_map.recipe, normalise="gain", units=""),
         background=1.0,
-        findings=(*made.findings, *([found] if isinstance(level, str) else [])),
+        findings=(*tactile_map.findings, *fitted),
     )
     median = float(np.median(divided.mean[divided.covered]))
     if not _NORMALISED_MEDIAN[0] <= median <= _NORMALISED_MEDIAN[1]:
-        what = f"the median value is {by * median:.4g}, not near the level of {by:.4g}"
+        what = f"the median value is {divisor * median:.4g}, not near the level of {divisor:.4g}"
         raise BadDataError(what, way_out="give the level in the values' own unit, or --level fit")
     return divided
 
 
-def _spacing(grid: Grid, *, given: float | None) -> tuple[float, list[str]]:
+def _spacing(grid: Grid, *, stated_mm: float | None) -> tuple[float, list[str]]:
     """Side of the cells, and what an image's resolution says otherwise."""
     for sides in (grid.spacing_mm, grid.resolution_mm):
         if sides is not None and not np.isclose(*sides, rtol=1e-3, atol=0.0):
@@ -450,16 +457,18 @@ def _spacing(grid: Grid, *, given: float | None) -> tuple[float, list[str]]:
             raise BadDataError(what, way_out="resample to square cells first")
     if grid.spacing_mm is not None:
         value, notes = grid.spacing_mm[0], []
-        if given is not None and not np.isclose(given, value, rtol=1e-9, atol=0.0):
-            raise UsageError(f"--spacing-mm is {given:g}, but the file says {value:g}; leave the option out")
+        if stated_mm is not None and not np.isclose(stated_mm, value, rtol=1e-9, atol=0.0):
+            raise UsageError(f"--spacing-mm is {stated_mm:g}, but the file says {value:g}; leave the option out")
     else:
         mm = grid.resolution_mm[0] if grid.resolution_mm else None
-        told = f"its resolution says {mm:.4g} mm a pixel ({25.4 / mm:.4g} dpi, often of a print)" if mm else ""
-        if given is None:
-            told = told and f"; {told}"
-            raise UsageError(f"a grid needs --spacing-mm, the side of its square cells in mm{told}")
-        value, agrees = float(given), mm is None or np.isclose(given, mm, rtol=1e-2, atol=0.0)
-        notes = [] if agrees else [f"{told}; {given:g} mm was taken, as stated"]
+        resolution_words = (
+            f"its resolution says {mm:.4g} mm a pixel ({25.4 / mm:.4g} dpi, often of a print)" if mm else ""
+        )
+        if stated_mm is None:
+            resolution_words = resolution_words and f"; {resolution_words}"
+            raise UsageError(f"a grid needs --spacing-mm, the side of its square cells in mm{resolution_words}")
+        value, agrees = float(stated_mm), mm is None or np.isclose(stated_mm, mm, rtol=1e-2, atol=0.0)
+        notes = [] if agrees else [f"{resolution_words}; {stated_mm:g} mm was taken, as stated"]
     if not _LEAST_SPACING_MM <= value < 1000:
         way_out = "looks like metres, give mm" if 0 < value < 1000 else "it must be positive, in mm"
         raise BadDataError(f"the spacing is {value:g} mm", way_out=way_out)
@@ -473,10 +482,10 @@ def _map(arrays: dict[str, np.ndarray[Any, Any]], *, spacing_mm: float, normalis
     cell has a single reading: a sample variance, numpy's with ddof=1, does not exist there.
     """
     mean = _numbers(arrays, "mean")
-    held = _numbers(arrays, "count") if "count" in arrays else np.isfinite(mean).astype(np.float64)
-    if index := _first((held < 0) | (held != np.floor(held)) | np.isnan(held)):
-        raise BadDataError(f"count is {held[index]:g} at {index}", way_out="give whole numbers from 0 up")
-    count = held.astype(np.int64)
+    count_values = _numbers(arrays, "count") if "count" in arrays else np.isfinite(mean).astype(np.float64)
+    if index := _first((count_values < 0) | (count_values != np.floor(count_values)) | np.isnan(count_values)):
+        raise BadDataError(f"count is {count_values[index]:g} at {index}", way_out="give whole numbers from 0 up")
+    count = count_values.astype(np.int64)
     if index := _first((count > 0) & np.isnan(mean)):
         raise BadDataError(f"mean is NaN at {index}, where count is {count[index]}", way_out="set count to 0 there")
     if not count.any():

@@ -39,10 +39,10 @@ def read_image(path: Path) -> Grid:
     Colours, several images and samples that would be changed are refused; what a viewer would not show is noted.
     """
     data = read_bytes(path, most=IMAGE_BYTES)  # from memory: a chunk cannot claim more than there is
-    return _graymap(data) if data[:1] == b"P" else _decoded(data)
+    return _decode_graymap(data) if data[:1] == b"P" else _decode_tiff_or_png(data)
 
 
-def _graymap(data: bytes) -> Grid:
+def _decode_graymap(data: bytes) -> Grid:
     """PGM by netpbm's description, ``P2`` or ``P5``: values lie between 0 and a maximum that scales nothing here."""
     header = _GREY_HEADER.match(data)
     if header is None:
@@ -67,7 +67,7 @@ def _graymap(data: bytes) -> Grid:
     return Grid({"mean": values.reshape(height, width).astype(np.float64)})
 
 
-def _decoded(data: bytes) -> Grid:
+def _decode_tiff_or_png(data: bytes) -> Grid:
     """TIFF or PNG by Pillow, which scales, inverts and cuts samples here and there: see the branches."""
     from PIL import Image, ImageOps, TiffImagePlugin, UnidentifiedImageError
 
@@ -87,7 +87,7 @@ def _decoded(data: bytes) -> Grid:
                 stream = io.BytesIO(data)
                 stream.seek(directory.next)
                 directory.load(stream)
-                what = f"holds {_samples(directory)}, which cannot be read" if _BITS in directory else what
+                what = f"holds {_describe_samples(directory)}, which cannot be read" if _BITS in directory else what
             raise BadDataError(what, way_out=_WAY_OUT) from None
         check_limit(image.width * image.height, CELLS, what="it has {} pixels")
         _choose_page(image)
@@ -100,7 +100,7 @@ def _decoded(data: bytes) -> Grid:
         ImageOps.exif_transpose(image, in_place=True)  # what its own reader has not done already
         mode, pixels = image.mode, np.asarray(image.convert("RGBA") if image.mode == "P" else image)
     notes += [f"turned as its orientation ({turned}) says"] if turned != 1 else []
-    return _numbered(*_grey(pixels, mode), described, notes)
+    return _values_of_file(*_grey_channel(pixels, mode), described, notes)
 
 
 def _choose_page(image: Any) -> None:
@@ -108,17 +108,17 @@ def _choose_page(image: Any) -> None:
     pages = getattr(image, "n_frames", 1)
     if pages == 1:
         return
-    whole = []
+    full_size_pages = []
     for page in range(pages if hasattr(image, "tag_v2") else 0):
         image.seek(page)
         if not int(image.tag_v2.get(_SUBFILE, 0)) & 1:
-            whole.append(page)
-    if len(whole) != 1:
-        raise BadDataError(f"holds {len(whole) or pages} images", way_out="give one")
-    image.seek(whole[0])
+            full_size_pages.append(page)
+    if len(full_size_pages) != 1:
+        raise BadDataError(f"holds {len(full_size_pages) or pages} images", way_out="give one")
+    image.seek(full_size_pages[0])
 
 
-def _grey(pixels: np.ndarray[Any, Any], mode: str) -> tuple[np.ndarray[Any, Any], BoolArray]:
+def _grey_channel(pixels: np.ndarray[Any, Any], mode: str) -> tuple[np.ndarray[Any, Any], BoolArray]:
     """The grey channel of an image, and where its alpha says that nothing is there."""
     if mode == "1":
         raise BadDataError("has 1 bit a pixel: black or white", way_out=_WAY_OUT)
@@ -139,7 +139,7 @@ def _grey(pixels: np.ndarray[Any, Any], mode: str) -> tuple[np.ndarray[Any, Any]
     return colours[..., 0], without
 
 
-class _Facts(Record):
+class _SampleFacts(Record):
     """What a file says of its samples."""
 
     bits: int = 8
@@ -149,7 +149,7 @@ class _Facts(Record):
     spacing_mm: tuple[float, float] | None = None
 
 
-def _numbered(values: np.ndarray[Any, Any], without: BoolArray, facts: _Facts, notes: list[str]) -> Grid:
+def _values_of_file(values: np.ndarray[Any, Any], without: BoolArray, facts: _SampleFacts, notes: list[str]) -> Grid:
     """The numbers in the file from what Pillow makes of them, NaN where there are none."""
     top = 2.0**facts.bits - 1
     if facts.kind == 2 and facts.bits == 8:
@@ -170,7 +170,7 @@ def _numbered(values: np.ndarray[Any, Any], without: BoolArray, facts: _Facts, n
     return Grid({"mean": values}, resolution_mm=facts.spacing_mm, notes=tuple(notes))
 
 
-def _png_facts(data: bytes, info: Mapping[Any, Any]) -> _Facts:
+def _png_facts(data: bytes, info: Mapping[Any, Any]) -> _SampleFacts:
     """Facts of a PNG: IHDR has bits and colour type (ISO/IEC 15948, 11.2.2). gAMA and sBIT change no stored value."""
     bits, colour = data[24], data[25]
     if bits == 16 and colour != 0:
@@ -182,25 +182,25 @@ def _png_facts(data: bytes, info: Mapping[Any, Any]) -> _Facts:
     if aspect and all(aspect):
         _check_square(float(aspect[1]), float(aspect[0]))
     if colour == 3:
-        return _Facts(spacing_mm=spacing)
-    return _Facts(bits, no_value=float(no_value) if isinstance(no_value, int) else None, spacing_mm=spacing)
+        return _SampleFacts(spacing_mm=spacing)
+    return _SampleFacts(bits, no_value=float(no_value) if isinstance(no_value, int) else None, spacing_mm=spacing)
 
 
-def _tiff_facts(tags: Mapping[int, Any]) -> _Facts:
+def _tiff_facts(tags: Mapping[int, Any]) -> _SampleFacts:
     """Facts of a TIFF that can be read as it is; any other is refused with what it holds."""
     bits, kind, samples = _sample(tags)
     photometric = int(tags.get(_PHOTOMETRIC, _BLACK_IS_ZERO))
     grey = (_BLACK_IS_ZERO, _PALETTE, *([_WHITE_IS_ZERO] if kind == 1 else []))
     one = (samples, bits, kind) in _DECODED and photometric in grey
     if not (one or (samples, bits, kind) in _DECODED_OF_MANY or (samples, bits) == (1, 1)):
-        raise BadDataError(f"holds {_samples(tags)}, which cannot be read as they are", way_out=_WAY_OUT)
+        raise BadDataError(f"holds {_describe_samples(tags)}, which cannot be read as they are", way_out=_WAY_OUT)
     try:
         no_value = float(str(tags[_NO_DATA]).strip("\x00 ")) if _NO_DATA in tags else None
     except ValueError:
         raise BadDataError(f"GDAL_NODATA is {str(tags[_NO_DATA])[:20]!r}", way_out="it must be a number") from None
     if samples > 1 or photometric == _PALETTE:
-        return _Facts(spacing_mm=_tiff_spacing(tags))
-    return _Facts(bits, kind, photometric == _WHITE_IS_ZERO, no_value, _tiff_spacing(tags))
+        return _SampleFacts(spacing_mm=_tiff_spacing(tags))
+    return _SampleFacts(bits, kind, photometric == _WHITE_IS_ZERO, no_value, _tiff_spacing(tags))
 
 
 def _sample(tags: Mapping[int, Any]) -> tuple[int, int, int]:
@@ -209,7 +209,7 @@ def _sample(tags: Mapping[int, Any]) -> tuple[int, int, int]:
     return (bits.pop() if len(bits) == 1 else 0), (kinds.pop() if len(kinds) == 1 else 0), int(tags.get(_SAMPLES, 1))
 
 
-def _samples(tags: Mapping[int, Any]) -> str:
+def _describe_samples(tags: Mapping[int, Any]) -> str:
     """What a TIFF holds, in words."""
     bits, kind, samples = _sample(tags)
     words = f"{_KINDS.get(kind, 'other')} samples of {bits} bits" if bits else "samples of several lengths"
@@ -220,16 +220,16 @@ def _samples(tags: Mapping[int, Any]) -> str:
 
 def _tiff_spacing(tags: Mapping[int, Any]) -> tuple[float, float] | None:
     """Sides of a pixel by the resolution: in inches, in cm, or in the unit that ImageJ writes into the description."""
-    given = [float(tags.get(tag, 0) or 0) for tag in (_X_RESOLUTION, _Y_RESOLUTION)]
-    if not all(np.isfinite(given)) or min(given) <= 0:
+    pixels_per_unit = [float(tags.get(tag, 0) or 0) for tag in (_X_RESOLUTION, _Y_RESOLUTION)]
+    if not all(np.isfinite(pixels_per_unit)) or min(pixels_per_unit) <= 0:
         return None
     unit = {2: "inch", 3: "cm"}.get(int(tags.get(_RESOLUTION_UNIT, 2)))
     if named := re.search(r"^unit=(\S+)", str(tags.get(_DESCRIPTION, "")), re.MULTILINE):
         unit = named[1].replace("\\u00B5", "\u00b5")
     if unit not in _MM:
-        _check_square(1 / given[0], 1 / given[1])
+        _check_square(1 / pixels_per_unit[0], 1 / pixels_per_unit[1])
         return None
-    return _MM[unit] / given[0], _MM[unit] / given[1]
+    return _MM[unit] / pixels_per_unit[0], _MM[unit] / pixels_per_unit[1]
 
 
 def _check_square(width: float, height: float) -> None:

@@ -1,13 +1,13 @@
-"""Scans from the arrays of other programs: what is missing, in other units or of another shape is said.
+"""Scans from the arrays of other programs; an error names each that is missing, in other units or of another shape.
 
-Arrays in mm, kPa and s, read without pickle; `arrays_layout.LAYOUT` says what each is.
+Arrays are in mm, kPa and s and read without pickle; `arrays_layout.LAYOUT` describes each.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 from unicodedata import normalize
 
 import numpy as np
@@ -21,7 +21,7 @@ from tactile_bayes.files.named_arrays import Source, is_text, plain_names, read_
 from tactile_bayes.files.npz import Arrays
 from tactile_bayes.files.reading import kind_of
 from tactile_bayes.files.scan_mcap import read_scan
-from tactile_bayes.files.scan_text import is_identity, read_frames, read_poses, seen
+from tactile_bayes.files.scan_text import is_identity, read_frames, read_poses, visible_poses
 from tactile_bayes.files.sequence_mha import is_sequence, read_sequence
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.select import other_units
@@ -43,79 +43,84 @@ _BESIDE: Final = {
     "--unit or --array-calibration CAL.json": ("gain_kpa_per_count", "offset_kpa"),
     "--rate-hz": ("frame_time_s",),
 }
-"""Options that give what a file of arrays may lack."""
+"""Options that give the arrays which a file may lack."""
 _TEMPLATE: Final = "`tactile-bayes import SRC --template` prints a MAP.toml for --columns, which says what is what"
 _HELP: Final = "`tactile-bayes import --help` says what they are"
 
 
 def read_arrays(path: Path) -> Scan:
-    """Read a scan from a file of arrays that are called as in the layout."""
+    """Read a scan from a file of arrays with the layout's names."""
     return import_arrays(path, ArrayMap())[0]
 
 
-def import_arrays(path: Path, given: ArrayMap, beside: Sequence[Source] = ()) -> tuple[Scan, list[str]]:
-    """A scan from a file of arrays and what stands beside it, and a line for each guess; errors name file and array."""
+def import_arrays(path: Path, options: ArrayMap, others: Sequence[Source] = ()) -> tuple[Scan, list[str]]:
+    """A scan from a file of arrays and `others`, and a note for each guess; errors name file and array."""
     with in_file(path):
-        own = replace(_read(path, given, beside), path=str(path))
+        source = replace(_read_source(path, options, others), path=str(path))
     try:
-        return combined([own, *beside], given)
-    except BadDataError as error:  # its first word is an array at fault, of whose file it is
-        name = {"counts": "frames"}.get(error.what.split()[0], error.what.split()[0])
-        same = {name, "pose_matrix"} if name in ("position_mm", "quaternion_wxyz") else {name}
-        of_it = (one.path for one in reversed(beside) if one.path and same & set(one.arrays))
-        raise error.with_path(next(of_it, path)) from None
+        return combine_sources([source, *others], options)
+    except BadDataError as error:  # its first word is the array at fault
+        name = error.what.split()[0]
+        names = {"frames" if name == "counts" else name}
+        if name in ("position_mm", "quaternion_wxyz"):
+            names.add("pose_matrix")
+        with_array = (one.path for one in reversed(others) if one.path and names & set(one.arrays))
+        raise error.with_path(next(with_array, path)) from None
 
 
-def _read(path: Path, given: ArrayMap, beside: Sequence[Source]) -> Source:
+def _read_source(path: Path, options: ArrayMap, others: Sequence[Source]) -> Source:
     if is_sequence(path):
-        return read_sequence(path, given, frames=True)
+        return read_sequence(path, options, frames=True)
     if is_text(path):
-        heads = (one.arrays["head_surface_mm"].shape[:2] for one in reversed(beside) if "head_surface_mm" in one.arrays)
-        shape = next(heads, None)
-        return read_frames(path, given if given.frame_shape else replace(given, frame_shape=shape))
-    for name in (*given.arrays, *given.values):
+        heads = (one.arrays["head_surface_mm"].shape[:2] for one in reversed(others) if "head_surface_mm" in one.arrays)
+        return read_frames(path, replace(options, frame_shape=options.frame_shape or next(heads, None)))
+    for name in (*options.arrays, *options.values):
         if name not in KNOWN:
             raise BadDataError(f"--columns: {name!r} is no array of a scan", way_out=suggestion(name, KNOWN))
-    there: dict[str, str] = {}
-    others: set[str] = set()
+    names_in_file: dict[str, str] = {}
+    unknown: set[str] = set()
 
     def choose(names: Sequence[str]) -> list[str]:
-        held = ", ".join(sorted(names)[:_MOST_NAMES]) or "nothing"
-        spelled = {normalize("NFC", name): name for name in names}  # a letter and its mark may be one sign or two
-        for here, said in given.arrays.items():
-            there[here] = said if said in names else spelled.get(normalize("NFC", said), "")
-            if not there[here]:
-                raise BadDataError(f"has no array {said!r} for {here}", way_out=f"it has {held}")
-        there.update({name: name for name in KNOWN if name in names and name not in there})
-        there.update(plain_names(names, there, given.values))
-        if not there:
-            needed = ", ".join(f"{name} ({in_words(LAYOUT[name].shape)})" for name in LAYOUT if name not in OPTIONAL)
+        contents = ", ".join(sorted(names)[:_MOST_NAMES]) or "nothing"
+        by_nfc = {normalize("NFC", name): name for name in names}  # a letter and its mark may be one sign or two
+        for layout_name, stated in options.arrays.items():
+            name = stated if stated in names else by_nfc.get(normalize("NFC", stated), "")
+            if not name:
+                raise BadDataError(f"has no array {stated!r} for {layout_name}", way_out=f"it has {contents}")
+            names_in_file[layout_name] = name
+        names_in_file.update({name: name for name in KNOWN if name in names and name not in names_in_file})
+        names_in_file.update(plain_names(names, names_in_file, options.values))
+        if not names_in_file:
+            needed = _described(name for name in LAYOUT if name not in OPTIONAL)
             more = " (for a grid of values give --as map)" if "mean" in names else ""
-            raise BadDataError(f"lacks {needed} (it has {held})", way_out=f"{_TEMPLATE}{more}; {_HELP}")
-        others.update(set(names) - set(there.values()))
-        return list(dict.fromkeys(there.values()))
+            raise BadDataError(f"lacks {needed} (it has {contents})", way_out=f"{_TEMPLATE}{more}; {_HELP}")
+        unknown.update(set(names) - set(names_in_file.values()))
+        return list(dict.fromkeys(names_in_file.values()))
 
-    held = read_named(path, choose)
-    arrays = {here: held[name] for here, name in there.items()}
-    guessed = {here: name for here, name in there.items() if name not in (here, given.arrays.get(here))}
-    arrays |= {name: np.asarray(value) for name, value in given.values.items()}
-    notes = tuple(f"{name} is taken for {here}" for here, name in guessed.items())
-    return Source(arrays, notes=notes, others=tuple(sorted(others)))
+    by_name = read_named(path, choose)
+    arrays = {layout_name: by_name[name] for layout_name, name in names_in_file.items()}
+    arrays |= {name: np.asarray(value) for name, value in options.values.items()}
+    notes = tuple(
+        f"{name} is taken for {layout_name}"
+        for layout_name, name in names_in_file.items()
+        if name not in (layout_name, options.arrays.get(layout_name))
+    )
+    return Source(arrays, notes=notes, others=tuple(sorted(unknown)))
 
 
-def of_poses(path: Path, given: Stated) -> Source:
-    """Poses of a file of their own: a table, or a sequence metafile."""
+def pose_source(path: Path, stated: Stated) -> Source:
+    """Arrays of the poses, from a table or a sequence metafile of their own."""
     if not is_sequence(path) and not is_text(path):
         what = f"is {kind_of(path) or 'a file of arrays'}, and poses that stand apart are a table of text"
         way_out = "save them as .csv, or in the frames' file as pose_matrix and pose_time_s"
         raise BadDataError(what, way_out=way_out, path=str(path))
-    found = read_sequence(path, given, frames=False) if is_sequence(path) else read_poses(path, given)
-    return replace(found, path=str(path))
+    poses = read_sequence(path, stated, frames=False) if is_sequence(path) else read_poses(path, stated)
+    return replace(poses, path=str(path))
 
 
-def of_head(given: Path | HeadGeometry) -> Source:
-    """Arrays of a scan that are the head's."""
-    head = given if isinstance(given, HeadGeometry) else read_head_geometry(given)
+def head_source(head: Path | HeadGeometry) -> Source:
+    """Arrays of the head."""
+    head = read_head_geometry(head) if isinstance(head, Path) else head
     arrays = {
         "pitch_mm": np.asarray(head.pitch_mm),
         "array_from_tracker": head.scanhead_from_tracker,
@@ -124,122 +129,126 @@ def of_head(given: Path | HeadGeometry) -> Source:
     return Source(arrays, checked_on=head.checked_on)
 
 
-def of_calibration(given: Path | ElementCalibration) -> Source:
-    """Arrays of a scan that are the calibration of its array."""
-    found = given if isinstance(given, ElementCalibration) else read_array_calibration(given).calibration
-    return Source({name: np.asarray(getattr(found, name)) for name in names_of(found)})
+def calibration_source(calibration: Path | ElementCalibration) -> Source:
+    """Arrays of the pressure array's calibration."""
+    calibration = read_array_calibration(calibration).calibration if isinstance(calibration, Path) else calibration
+    return Source({name: np.asarray(getattr(calibration, name)) for name in names_of(calibration)})
 
 
-def of_landmarks(given: Path | Landmarks) -> Source:
-    """Arrays of a scan that are its landmarks: of a JSON file or another scan."""
-    found: Landmarks | None = given if isinstance(given, Landmarks) else None
-    if isinstance(given, Path):
-        found = read_scan(given).landmarks if given.suffix.lower() == ".mcap" else read_landmarks(given)
-    if found is None:
-        raise BadDataError("holds no landmarks", way_out="give another scan, or a JSON file", path=str(given))
-    nipple = {} if found.nipple_mm is None else {"nipple_mm": found.nipple_mm}
-    return Source({"landmarks_mm": np.stack([found.sternal_notch_mm, found.xiphoid_mm]), **nipple})
+def landmark_source(landmarks: Path | Landmarks) -> Source:
+    """Arrays of the landmarks, also from a JSON file or another scan."""
+    if isinstance(landmarks, Path):
+        path = landmarks
+        touched = read_scan(path).landmarks if path.suffix.lower() == ".mcap" else read_landmarks(path)
+        if touched is None:
+            raise BadDataError("holds no landmarks", way_out="give another scan, or a JSON file", path=str(path))
+        landmarks = touched
+    nipple = {} if landmarks.nipple_mm is None else {"nipple_mm": landmarks.nipple_mm}
+    return Source({"landmarks_mm": np.stack([landmarks.sternal_notch_mm, landmarks.xiphoid_mm]), **nipple})
 
 
-# --- From arrays as people have them to those of the layout: axes, clocks, units.
+# --- Arrays of other axes, clocks and units, made those of the layout.
 
 
-def combined(sources: Sequence[Source], given: Stated) -> tuple[Scan, list[str]]:
-    """A scan of arrays by the names in `KNOWN`, of which the last source's stands, and the notes."""
-    stated = given
-    told: list[str] = []
-    held: Arrays = {}
+def combine_sources(sources: Sequence[Source], options: Stated) -> tuple[Scan, list[str]]:
+    """A scan of the sources' arrays, of which a later one stands for an earlier, and the notes on what was guessed."""
+    stated = options
+    notes: list[str] = []
+    arrays: Arrays = {}
     checked_on = ""
     for source in sources:
         if "head_surface_mm" in source.arrays:
             checked_on = source.checked_on
-        said = source.stated.given
-        for name, theirs in said.items():
-            if (ours := getattr(given, name)) not in (None, theirs):
-                told.append(f"{name.replace('_', '-')} {ours} as stated, where the file says {theirs}")
-        told += source.notes
+        file_states = source.stated.given
+        for name, file_value in file_states.items():
+            if (option_value := getattr(options, name)) not in (None, file_value):
+                notes.append(f"{name.replace('_', '-')} {option_value} as stated, where the file says {file_value}")
+        notes += source.notes
         if stated.unit not in (None, source.stated.unit):
-            said.pop("saturation", None)  # in the file's unit
-        stated = replace(stated, **{name: value for name, value in said.items() if getattr(stated, name) is None})
-        held |= {name: np.asarray(one) for name, one in source.arrays.items()}
-    _leave_out_gaps(held, stated, told)
-    _check_numbers(held)
-    if "frames" in held:
-        held["counts"] = held.pop("frames")
-    _poses(held, stated, told)
-    _frames(held, stated, told)
-    _clocks(held, stated)
-    _check_largest(held)
+            file_states.pop("saturation", None)  # in the file's unit
+        open_fields = {name: value for name, value in file_states.items() if getattr(stated, name) is None}
+        stated = replace(stated, **open_fields)
+        arrays |= {name: np.asarray(one) for name, one in source.arrays.items()}
+    _leave_out_gaps(arrays, stated, notes)
+    _check_numbers(arrays)
+    if "frames" in arrays:
+        arrays["counts"] = arrays.pop("frames")
+    _arrange_poses(arrays, stated, notes)
+    _arrange_frames(arrays, stated, notes)
+    _arrange_times(arrays, stated)
+    _check_largest(arrays)
     pressure = stated.unit not in (None, "counts")
     if pressure:
-        _as_counts(held, stated, told)
+        _as_counts(arrays, stated, notes)
     elif stated.saturation is not None:
-        held["saturation_count"] = np.asarray(int(np.ceil(stated.saturation)))
-    held = {name: held[name] for name in LAYOUT if name in held}
-    for name, array in held.items():  # without axes of length 1 that MATLAB adds
+        arrays["saturation_count"] = np.asarray(int(np.ceil(stated.saturation)))
+    arrays = {name: arrays[name] for name in LAYOUT if name in arrays}
+    for name, array in arrays.items():  # without axes of length 1 that MATLAB adds
         axes = len(LAYOUT[name].shape)
         if axes < 2 and array.ndim > axes and array.size == max(array.shape):
-            held[name] = array.reshape(-1) if axes else array.reshape(())
+            arrays[name] = array.reshape(-1) if axes else array.reshape(())
     for name in ("gain_kpa_per_count", "offset_kpa"):
-        if name in held and held[name].size == 1 and held.get("counts", np.empty(0)).ndim == 3:
-            held[name] = np.full(held["counts"].shape[1:], float(held[name].item()))  # one for all taxels
-    _refuse_missing(held, [name for source in sources for name in source.others])
-    _check_layout(held)
-    _check_units(held, calibrated=pressure)
+        if name in arrays and arrays[name].size == 1 and arrays.get("counts", np.empty(0)).ndim == 3:
+            arrays[name] = np.full(arrays["counts"].shape[1:], float(arrays[name].item()))  # one for all taxels
+    _refuse_missing(arrays, [name for source in sources for name in source.others])
+    _check_layout(arrays)
+    _check_units(arrays, calibrated=pressure)
     facts = {"frames_unit": str(stated.unit)} if pressure else {}
-    if told:
-        facts["imported_as"] = "; ".join(told)[:2000]
-    return _scan(held, facts, checked_on), told
+    if notes:
+        facts["imported_as"] = "; ".join(notes)[:2000]
+    return _scan_of_arrays(arrays, facts, checked_on), notes
 
 
-def _refuse_missing(held: Arrays, others: Sequence[str]) -> None:
-    missing = [name for name in LAYOUT if name not in held and name not in OPTIONAL]
+def _refuse_missing(arrays: Arrays, unknown: Sequence[str]) -> None:
+    missing = [name for name in LAYOUT if name not in arrays and name not in OPTIONAL]
     if not missing:
         return
-    lacks = ", ".join(f"{name} ({in_words(LAYOUT[name].shape)})" for name in missing)
+    lacks = f"lacks {_described(missing)}"
     options = [option for option, gives in _BESIDE.items() if set(gives) & set(missing)]
     way_out = f"add them, or give {', '.join(options)}" if options else "add them"
-    if others:
-        raise BadDataError(
-            f"lacks {lacks}; not known: {', '.join(others[:_MOST_NAMES])}", way_out=f"{_TEMPLATE}; or {way_out}"
-        )
-    raise BadDataError(f"lacks {lacks} (it has {', '.join(sorted(held))})", way_out=f"{way_out}; {_HELP}")
+    if unknown:
+        what = f"{lacks}; not known: {', '.join(unknown[:_MOST_NAMES])}"
+        raise BadDataError(what, way_out=f"{_TEMPLATE}; or {way_out}")
+    raise BadDataError(f"{lacks} (it has {', '.join(sorted(arrays))})", way_out=f"{way_out}; {_HELP}")
 
 
-def _leave_out_gaps(held: Arrays, stated: Stated, told: list[str]) -> None:
-    """Leave out poses of arrays that are not finite or the identity: the tool was not seen."""
-    layout = "matrix" if "pose_matrix" in held else stated.pose_layout or "wxyz"
-    parts = [held[name] for name in ("pose_matrix", "position_mm", "quaternion_wxyz") if name in held]
-    time = held.get("pose_time_s", np.empty(0)).reshape(-1)
+def _described(names: Iterable[str]) -> str:
+    return ", ".join(f"{name} ({in_words(LAYOUT[name].shape)})" for name in names)
+
+
+def _leave_out_gaps(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
+    """Leave out poses that are not finite or the identity: the tool was not seen."""
+    layout = "matrix" if "pose_matrix" in arrays else stated.pose_layout or "wxyz"
+    parts = [arrays[name] for name in ("pose_matrix", "position_mm", "quaternion_wxyz") if name in arrays]
+    time = arrays.get("pose_time_s", np.empty(0)).reshape(-1)
     if not parts or any(one.dtype.kind not in "iuf" or one.ndim < 2 or len(one) != len(time) for one in parts):
-        return  # whatever is wrong is told later
+        return  # a later check names what is wrong
     numbers = np.hstack([one.reshape(len(time), -1) for one in parts]).astype(np.float64)
     if np.isfinite(numbers).all() and not is_identity(numbers, layout).any():
         return
-    found = seen(time, numbers, [""] * len(time), layout=layout)
-    held.update(found.arrays)
-    told += found.notes
+    poses = visible_poses(time, numbers, [""] * len(time), layout=layout)
+    arrays.update(poses.arrays)
+    notes += poses.notes
 
 
-def _poses(held: Arrays, stated: Stated, told: list[str]) -> None:
-    """Places in mm and quaternions with the scalar first, whatever they are given as."""
-    if "pose_matrix" in held:
-        if "position_mm" in held or "quaternion_wxyz" in held:
+def _arrange_poses(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
+    """Make positions in mm, and quaternions with the scalar first, of the poses in any layout and unit."""
+    if "pose_matrix" in arrays:
+        if "position_mm" in arrays or "quaternion_wxyz" in arrays:
             raise BadDataError("pose_matrix is given beside position_mm or quaternion_wxyz", way_out="leave one out")
-        held["position_mm"], held["quaternion_wxyz"] = _of_matrices(held.pop("pose_matrix"))
-    number = held["pose_time_s"].size if "pose_time_s" in held else 0
+        arrays["position_mm"], arrays["quaternion_wxyz"] = _poses_of_matrices(arrays.pop("pose_matrix"))
+    pose_count = arrays["pose_time_s"].size if "pose_time_s" in arrays else 0
     for name, width in (("position_mm", 3), ("quaternion_wxyz", 4)):
-        if name in held and held[name].shape == (width, number) and number != width:
-            held[name] = held[name].T
-            told.append(f"{name} of shape {(width, number)} read along its columns")
-    if "quaternion_wxyz" in held and stated.pose_layout in ("xyzw", "euler"):
-        if stated.pose_layout == "euler" and np.abs(held["quaternion_wxyz"]).max() <= _TURN:
-            told.append(
-                f"angles lie within {_TURN:.1f} and are read as degrees: radians are to be multiplied by 57.296"
-            )
-        held["quaternion_wxyz"] = quaternions(held["quaternion_wxyz"], stated.pose_layout)
-    if "position_mm" in held:
-        held["position_mm"] = held["position_mm"] * MM_PER_UNIT[stated.length_unit or "mm"]
+        if name in arrays and arrays[name].shape == (width, pose_count) and pose_count != width:
+            arrays[name] = arrays[name].T
+            notes.append(f"{name} of shape {(width, pose_count)} read along its columns")
+    if "quaternion_wxyz" in arrays and stated.pose_layout in ("xyzw", "euler"):
+        if stated.pose_layout == "euler" and np.abs(arrays["quaternion_wxyz"]).max() <= _TURN:
+            caution = f"angles lie within {_TURN:.1f} and are read as degrees"
+            notes.append(f"{caution}: radians are to be multiplied by 57.296")
+        arrays["quaternion_wxyz"] = quaternions(arrays["quaternion_wxyz"], stated.pose_layout)
+    if "position_mm" in arrays:
+        arrays["position_mm"] = arrays["position_mm"] * MM_PER_UNIT[stated.length_unit or "mm"]
 
 
 def quaternions(rotations: FloatArray, layout: str) -> FloatArray:
@@ -254,37 +263,38 @@ def quaternions(rotations: FloatArray, layout: str) -> FloatArray:
     return rotations[:, [3, 0, 1, 2]] if layout == "xyzw" else rotations
 
 
-def _of_matrices(given: np.ndarray[Any, Any]) -> tuple[FloatArray, FloatArray]:
-    """Places and quaternions of homogeneous matrices, of which each is (4, 4), (3, 4) or one row."""
-    if given.ndim == 3 and given.shape[:2] in ((4, 4), (3, 4)) and given.shape[1:] != given.shape[:2]:
-        given = np.moveaxis(given, 2, 0)
-    if given.ndim == 2 and given.shape[1] in (12, 16):
-        given = given.reshape(len(given), -1, 4)
-    if given.ndim != 3 or given.shape[1:] not in ((4, 4), (3, 4)):
-        raise BadDataError(f"pose_matrix has shape {given.shape}", way_out="it must be (m, 4, 4)")
-    matrices = given.astype(np.float64)
-    turned = matrices[:, :3, :3]
-    departure = np.abs(turned @ turned.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
-    wrong = (departure > _NOT_RIGID) | (np.linalg.det(turned) < 0)
+def _poses_of_matrices(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Positions and quaternions of homogeneous matrices, each (4, 4), (3, 4) or one row of 12 or 16 numbers."""
+    shape, sides = matrices.shape, ((4, 4), (3, 4))
+    if matrices.ndim == 3 and shape[:2] in sides and shape[1:] != shape[:2]:
+        matrices = np.moveaxis(matrices, 2, 0)
+    elif matrices.ndim == 2 and shape[1] in (12, 16):
+        matrices = matrices.reshape(len(matrices), -1, 4)
+    if matrices.ndim != 3 or matrices.shape[1:] not in sides:
+        raise BadDataError(f"pose_matrix has shape {matrices.shape}", way_out="it must be (m, 4, 4)")
+    matrices = matrices.astype(np.float64)
+    rotations = matrices[:, :3, :3]
+    departure = np.abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+    wrong = (departure > _NOT_RIGID) | (np.linalg.det(rotations) < 0)
     if wrong.any() or (matrices[:, 3:] != [0, 0, 0, 1]).any():
         first = int(wrong.argmax())
         what = f"pose_matrix is not rigid at index {first} (R R^T departs from 1 by {departure[first]:.1e})"
         raise BadDataError(what, way_out="give the 16 numbers row by row, translation last in each row")
-    return matrices[:, :3, 3], np.asarray(Rotation.from_matrix(turned).as_quat(scalar_first=True))
+    return matrices[:, :3, 3], np.asarray(Rotation.from_matrix(rotations).as_quat(scalar_first=True))
 
 
-def _frames(held: Arrays, stated: Stated, told: list[str]) -> None:
-    """Counts as (n, rows, columns)."""
-    if "counts" not in held:
+def _arrange_frames(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
+    """Make the counts (n, rows, columns)."""
+    if "counts" not in arrays:
         return
-    counts = held["counts"]
-    n = held["frame_time_s"].size if "frame_time_s" in held else counts.shape[0]
+    counts = arrays["counts"]
+    n = arrays["frame_time_s"].size if "frame_time_s" in arrays else counts.shape[0]
     if counts.ndim in (2, 3) and counts.shape[0] != n and counts.shape[-1] == n:
-        told.append(f"frames of shape {counts.shape} read along the last axis, which is as long as their times")
+        notes.append(f"frames of shape {counts.shape} read along the last axis, which is as long as their times")
         counts = np.moveaxis(counts, -1, 0)
     if counts.ndim == 2:
-        beside = (held[name] for name in ("head_surface_mm", "gain_kpa_per_count") if name in held)
-        shape = stated.frame_shape or next((one.shape[:2] for one in beside if one.ndim > 1), None)
+        shape_arrays = (arrays[name] for name in ("head_surface_mm", "gain_kpa_per_count") if name in arrays)
+        shape = stated.frame_shape or next((one.shape[:2] for one in shape_arrays if one.ndim > 1), None)
         each = f"frames of {counts.shape[1]} numbers (counts has shape {counts.shape})"
         if shape is None:
             raise BadDataError(each, way_out="give --frame-shape ROWS COLUMNS, or --head-geometry HEAD.json")
@@ -292,80 +302,82 @@ def _frames(held: Arrays, stated: Stated, told: list[str]) -> None:
             what = f"{each}, and {_sides(shape)} taxels are {shape[0] * shape[1]}"
             way_out = "give --frame-shape ROWS COLUMNS, or --skip-columns for those before the readings"
             raise BadDataError(what, way_out=way_out)
-        along = stated.frame_order or "rows"
+        order = stated.frame_order or "rows"
         if stated.frame_order is None or stated.frame_shape is None:
-            told.append(f"each {counts.shape[1]} numbers read as {_sides(shape)}, along the array's {along}")
+            notes.append(f"each {counts.shape[1]} numbers read as {_sides(shape)}, along the array's {order}")
         by_columns = counts.reshape(-1, shape[1], shape[0]).swapaxes(1, 2)
-        counts = by_columns if along == "columns" else counts.reshape(-1, *shape)
+        counts = by_columns if order == "columns" else counts.reshape(-1, *shape)
     elif stated.frame_shape is not None and counts.shape[1:] != stated.frame_shape:
         what = f"frames have {_sides(counts.shape[1:])} taxels, not {_sides(stated.frame_shape)}"
         raise BadDataError(what, way_out="leave --frame-shape out")
-    head = held["head_surface_mm"].shape[:2] if "head_surface_mm" in held else counts.shape[1:]
+    head = arrays["head_surface_mm"].shape[:2] if "head_surface_mm" in arrays else counts.shape[1:]
     if counts.ndim == 3 and counts.shape[1:] != head:
         what = f"counts has frames of {_sides(counts.shape[1:])} taxels, and the head {_sides(head)}"
         turned = counts.shape[1:] == head[::-1]
         way_out = "swap their last two axes" if turned else "give the head of this array, or the frames of this head"
         raise BadDataError(what, way_out=way_out)
-    held["counts"] = counts
+    arrays["counts"] = counts
 
 
 def _sides(shape: Sequence[int]) -> str:
     return " x ".join(map(str, shape))
 
 
-def _clocks(held: Arrays, stated: Stated) -> None:
-    """Times in s, on the frames' clock."""
-    for time, each, unit, rate in (
+def _arrange_times(arrays: Arrays, stated: Stated) -> None:
+    """Make the times s, on the frames' clock."""
+    for time, timed, unit, rate in (
         ("frame_time_s", "counts", stated.time_unit, stated.rate_hz),
         ("pose_time_s", "position_mm", stated.pose_time_unit, stated.pose_rate_hz),
     ):
-        if time in held:
-            held[time] = held[time] * _SECONDS[unit or "s"]
-        elif rate is not None and each in held:
-            held[time] = np.arange(len(held[each])) / rate
-    if "pose_time_s" in held and stated.pose_offset_s:
-        held["pose_time_s"] = held["pose_time_s"] + stated.pose_offset_s
+        if time in arrays:
+            arrays[time] = arrays[time] * _SECONDS[unit or "s"]
+        elif rate is not None and timed in arrays:
+            arrays[time] = np.arange(len(arrays[timed])) / rate
+    if "pose_time_s" in arrays and stated.pose_offset_s:
+        arrays["pose_time_s"] = arrays["pose_time_s"] + stated.pose_offset_s
 
 
-def _as_counts(held: Arrays, stated: Stated, told: list[str]) -> None:
-    """Frames of pressures as counts, with the gain and offset that give the pressures back."""
+def _as_counts(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
+    """Make counts of frames of pressures, with the gain and offset that give the pressures back."""
     unit = str(stated.unit)
     for name in ("gain_kpa_per_count", "offset_kpa"):
-        if name in held:
+        if name in arrays:
             raise BadDataError(f"{name} is for counts, and frames are in {unit}", way_out="leave it or --unit out")
-    if "counts" not in held:
+    if "counts" not in arrays:
         return
-    frames, factor = held["counts"], KPA_PER_UNIT[unit]
+    frames, factor = arrays["counts"], KPA_PER_UNIT[unit]
     whole = frames.dtype.kind in "iu" and frames.min() >= 0 and frames.max() <= _MOST_COUNTS
     kpa = frames.astype(np.float64) * factor
     gain, offset = (factor, 0.0) if whole else (_STEP_KPA, min(0.0, float(np.floor(kpa.min() / _STEP_KPA)) * _STEP_KPA))
-    told.append(_told_pressure(kpa, unit, kept="" if whole else f", kept to {1000 * _STEP_KPA:g} Pa"))
+    notes.append(_pressure_note(kpa, unit, rounding="" if whole else f", kept to {1000 * _STEP_KPA:g} Pa"))
     if offset + gain * _MOST_COUNTS < min(kpa.max(), PRESSURE_RANGE_KPA[1]):  # the others would be cut off
         at = tuple(map(int, np.unravel_index(kpa.argmin(), kpa.shape)))
         what = f"frames in {unit} hold {frames.min():g} (first at {at}), and an array reads no such pressure"
         raise BadDataError(
             what, way_out="write 0 in all frames of an element that does not work, or repair the reading"
         )
-    held["counts"] = np.clip(np.rint((kpa - offset) / gain), 0, _MOST_COUNTS).astype(np.uint16)
+    arrays["counts"] = np.clip(np.rint((kpa - offset) / gain), 0, _MOST_COUNTS).astype(np.uint16)
     full = _MOST_COUNTS if stated.saturation is None else round((stated.saturation * factor - offset) / gain)
-    held |= {"gain_kpa_per_count": np.asarray(gain), "offset_kpa": np.asarray(offset)}
-    held["saturation_count"] = np.asarray(min(max(full, 1), _MOST_COUNTS))
+    arrays |= {"gain_kpa_per_count": np.asarray(gain), "offset_kpa": np.asarray(offset)}
+    arrays["saturation_count"] = np.asarray(min(max(full, 1), _MOST_COUNTS))
 
 
-def _told_pressure(kpa: FloatArray, unit: str, *, kept: str) -> str:
-    """What the frames' means are, with a question for their unit where no examination presses so."""
+def _pressure_note(kpa: FloatArray, unit: str, *, rounding: str) -> str:
+    """Note on the frames' means; it asks for another unit where no examination presses so."""
     means = kpa.reshape(len(kpa), -1).mean(axis=1)
     if means.max() < 0:
         raise BadDataError(f"frames in {unit} are below 0 throughout", way_out="give pressures that rise when pressed")
     pressed = means[means >= means.max() / 2]
     low, high = np.quantile(pressed, [0.05, 0.95]) / KPA_PER_UNIT[unit]
     middle = float(np.median(pressed))
-    asked = other_units(middle, unit, PRESSURE_WINDOW_KPA)
+    question = other_units(middle, unit, PRESSURE_WINDOW_KPA)
     means_of = f"pressed ones have means of {low:.3g} to {high:.3g} {unit}"
     if middle >= PRESSURE_RANGE_KPA[1]:
         what = f"frames in {unit}: {means_of}, and an array's range ends at {PRESSURE_RANGE_KPA[1]:g} kPa"
-        raise BadDataError(what, way_out=asked or "give their unit, --unit")
-    return f"{'CAUTION: ' if asked else ''}frames in {unit}{kept}; {means_of}{f': {asked}' if asked else ''}"
+        raise BadDataError(what, way_out=question or "give their unit, --unit")
+    return (
+        f"{'CAUTION: ' if question else ''}frames in {unit}{rounding}; {means_of}{f': {question}' if question else ''}"
+    )
 
 
 # --- Checks of arrays in the layout.
@@ -468,7 +480,7 @@ def _check_clocks(arrays: Arrays) -> None:
         raise BadDataError(what, way_out="give both on one clock: --pose-offset-s is added to the poses' times")
 
 
-def _scan(arrays: Arrays, facts: Mapping[str, str], checked_on: str) -> Scan:
+def _scan_of_arrays(arrays: Arrays, facts: Mapping[str, str], checked_on: str) -> Scan:
     values = {name: np.asarray(array, dtype=np.float64) for name, array in arrays.items() if name != "counts"}
     marks = values.get("landmarks_mm")
     surface, transform = values["head_surface_mm"], values["array_from_tracker"]

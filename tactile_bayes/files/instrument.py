@@ -105,11 +105,11 @@ def read_simulated_head(path: Path) -> scenes.Head:
 
 def _head_file(document: object, path: Path) -> HeadFile:
     file = parse_record(document, HeadFile, path=path)
-    given = [name for name in ("rows", "columns", "radius_mm") if isinstance(document, dict) and name in document]
-    if file.surface_mm is not None and given:
-        what = f"gives both surface_mm and {given[0]}"
+    keys_given = [name for name in ("rows", "columns", "radius_mm") if isinstance(document, dict) and name in document]
+    if file.surface_mm is not None and keys_given:
+        what = f"gives both surface_mm and {keys_given[0]}"
         raise BadDataError(what, way_out="leave out one of the two descriptions", path=str(path))
-    if file.surface_mm is None and (missing := {"rows", "columns", "radius_mm"} - set(given)):
+    if file.surface_mm is None and (missing := {"rows", "columns", "radius_mm"} - set(keys_given)):
         raise BadDataError(f"lacks {min(missing)}", way_out=_WAY_OUT, path=str(path))
     return file
 
@@ -182,9 +182,9 @@ def read_array_calibration(path: Path) -> ArrayCalibrationFile:
 
 def read_landmarks(path: Path) -> Landmarks:
     """Read sternal notch and xiphoid in `base`, and the nipple where the file has it."""
-    found = read_record(path, LandmarksFile, way_out="give sternal_notch_mm and xiphoid_mm, three numbers each")
-    nipple = None if found.nipple_mm is None else np.array(found.nipple_mm)
-    return Landmarks(np.array(found.sternal_notch_mm), np.array(found.xiphoid_mm), nipple_mm=nipple)
+    file = read_record(path, LandmarksFile, way_out="give sternal_notch_mm and xiphoid_mm, three numbers each")
+    nipple = None if file.nipple_mm is None else np.array(file.nipple_mm)
+    return Landmarks(np.array(file.sternal_notch_mm), np.array(file.xiphoid_mm), nipple_mm=nipple)
 
 
 # --- Scenes of simulated scans, as TOML.
@@ -242,17 +242,19 @@ def read_scene(path: Path) -> scenes.Scene:
 def scene_of(document: Mapping[str, Any]) -> scenes.Scene:
     """A scene from plain data as its TOML holds; for the errors see `read_scene`."""
     file = from_plain(SceneFile, document)
-    given = {name: getattr(file, name) for name in names_of(file)}
-    bumps, tissue = _lumps(given.pop("lump"), document.get("lump", ()))
-    return scenes.Scene(**as_dict(given.pop("scene")), lumps=bumps, solid_lumps=tissue, ribs=given.pop("rib"), **given)
+    tables = {name: getattr(file, name) for name in names_of(file)}
+    bumps, tissue = _lumps(tables.pop("lump"), document.get("lump", ()))
+    return scenes.Scene(
+        **as_dict(tables.pop("scene")), lumps=bumps, solid_lumps=tissue, ribs=tables.pop("rib"), **tables
+    )
 
 
 def _lumps(
-    tables: Sequence[LumpTable], given: Sequence[Mapping[str, Any]]
+    tables: Sequence[LumpTable], keys_of_lumps: Sequence[Mapping[str, Any]]
 ) -> tuple[tuple[scenes.Lump, ...], tuple[SolidLump, ...]]:
     """Lumps that are bumps, and lumps that are tissue, by the keys that the file gives."""
     bumps, tissue = [], []
-    for i, (table, keys) in enumerate(zip(tables, given, strict=True)):
+    for i, (table, keys) in enumerate(zip(tables, keys_of_lumps, strict=True)):
         values = {key: getattr(table, key) for key in keys}
         solid = [key for key in _OF_TISSUE if key in keys]
         both = [key for key in _OF_BUMPS if key in keys]

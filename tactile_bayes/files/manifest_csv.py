@@ -106,10 +106,10 @@ class Exam(Record):
     @property
     def order(self) -> tuple[Any, ...]:
         """Sort key: patient, mass, visit and replicate, numbers by their value."""
-        return (*map(natural, (self.patient, self.mass, self.visit)), self.replicate)
+        return (*map(natural_key, (self.patient, self.mass, self.visit)), self.replicate)
 
 
-def natural(code: str) -> tuple[int, str]:
+def natural_key(code: str) -> tuple[int, str]:
     """Sort key of a code: whole numbers by their value, words before them."""
     return (int(code) if code.isascii() and code.isdigit() else -1, code)
 
@@ -137,9 +137,9 @@ def _exam(table: Table, row: int) -> Exam:
         raise table.error(row, blank, "is blank while the other coordinate is not", way_out="give both, or neither")
     calibration = cells["calibration"]
     if calibration is not None and calibration not in (*SHIPPED, NONE):
-        calibration = str(_inside(table, row, "calibration", calibration))
+        calibration = str(_path_inside(table, row, "calibration", calibration))
     return Exam(
-        path=_path(table, row, cells["file"]),
+        path=_exam_path(table, row, cells["file"]),
         centre_mm=None if x is None else (x, y),
         known=tuple((name, cells[f"known_{name}"]) for name in KNOWN if cells[f"known_{name}"] is not None),
         calibration=calibration,
@@ -149,9 +149,9 @@ def _exam(table: Table, row: int) -> Exam:
     )
 
 
-def _path(table: Table, row: int, name: str) -> Path:
+def _exam_path(table: Table, row: int, name: str) -> Path:
     if not is_address(name):
-        path = Path(os.path.abspath(_inside(table, row, "file", name)))  # noqa: PTH100 (links stay links)
+        path = Path(os.path.abspath(_path_inside(table, row, "file", name)))  # noqa: PTH100 (links stay links)
         if "\\" in name and not os.path.lexists(path):
             way_out = "write the path from the table's folder with / between folders"
             raise table.error(row, "file", f"{_shown(name)} has backslashes, and no file is called so", way_out=way_out)
@@ -162,7 +162,7 @@ def _path(table: Table, row: int, name: str) -> Path:
         raise table.error(row, "file", str(error), way_out="correct the address") from None
 
 
-def _inside(table: Table, row: int, column: str, name: str) -> Path:
+def _path_inside(table: Table, row: int, column: str, name: str) -> Path:
     """Path of a file that the table names; it must lie in the table's folder, links followed."""
     folder = Path(os.path.realpath(table.path.parent))
     path = table.path.parent / name
@@ -182,29 +182,33 @@ def _check_spelling(table: Table, exams: Sequence[Exam]) -> None:
     """Refuse codes that differ by capitals alone: one may be mistyped, and on some disks their folders are one."""
     first: dict[tuple[str, str, str], tuple[str, int]] = {}
     for row, exam in enumerate(exams):
-        of = exam.patient
-        for column, code, patient in (("patient", of, ""), ("visit", exam.visit, of), ("mass", exam.mass, of)):
+        patient_code = exam.patient
+        for column, code, patient in (
+            ("patient", patient_code, ""),
+            ("visit", exam.visit, patient_code),
+            ("mass", exam.mass, patient_code),
+        ):
             spelled, line = first.setdefault((column, patient, code.casefold()), (code, exam.line))
             if code != spelled:
-                told = f"{code!r} differs from {spelled!r} on line {line} by capitals alone"
+                fault = f"{code!r} differs from {spelled!r} on line {line} by capitals alone"
                 way_out = f"write it one way, or give the other {column} another code"
-                raise table.error(row, column, told, way_out=way_out)
+                raise table.error(row, column, fault, way_out=way_out)
 
 
 def _check_masses(table: Table, exams: Sequence[Exam]) -> None:
     """Refuse rows of one mass that differ in what belongs to the mass or its body."""
-    first: dict[tuple[str, str], int] = {}
+    first_row: dict[tuple[str, str], int] = {}
     for row, exam in enumerate(exams):
-        other = exams[first.setdefault((exam.patient, exam.mass), row)]
-        for column, what, here, there in (
-            ("side", "side", exam.side, other.side),
-            ("calibration", "calibration", exam.calibration, other.calibration),
-            ("mass", "known values", dict(exam.known), dict(other.known)),
+        first_exam = exams[first_row.setdefault((exam.patient, exam.mass), row)]
+        for column, name, value, first_value in (
+            ("side", "side", exam.side, first_exam.side),
+            ("calibration", "calibration", exam.calibration, first_exam.calibration),
+            ("mass", "known values", dict(exam.known), dict(first_exam.known)),
         ):
-            if here != there:
-                told = f"the {what} {here or 'blank'} differs from {there or 'blank'} on line {other.line}"
+            if value != first_value:
+                fault = f"the {name} {value or 'blank'} differs from {first_value or 'blank'} on line {first_exam.line}"
                 way_out = f"rows of patient {exam.patient}, mass {exam.mass} must agree: correct one"
-                raise table.error(row, column, f"{told}, of the same mass", way_out=way_out)
+                raise table.error(row, column, f"{fault}, of the same mass", way_out=way_out)
 
 
 def write_manifest(path: Path, rows: Sequence[Mapping[str, object]], *, force: bool = False) -> None:

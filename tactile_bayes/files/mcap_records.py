@@ -19,7 +19,7 @@ from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError, in_file
-from tactile_bayes.files.reading import MCAP_MAGIC, check_limit, not_a, open_input, readable, unpacked_limit
+from tactile_bayes.files.reading import MCAP_MAGIC, check_limit, open_input, readable, unpacked_limit, wrong_kind
 
 # --- Decompression of MCAP chunks within the declared and the total size limit.
 
@@ -29,7 +29,7 @@ _MOST_WINDOW: Final = 2**27
 def unpacked(chunk: Any, *, count: Callable[[int], None]) -> bytes:
     """The records of a chunk, never more than it declares and one byte, which are counted before.
 
-    A damaged one raises exceptions of many kinds, which `damage` says in words.
+    A damaged one raises exceptions of many kinds, which `describe_damage` says in words.
     """
     packing, data, most = chunk.compression, bytes(chunk.data), chunk.uncompressed_size
     if packing == "zstd":
@@ -53,7 +53,7 @@ def unpacked(chunk: Any, *, count: Callable[[int], None]) -> bytes:
     return data
 
 
-def damage(error: Exception) -> str:
+def describe_damage(error: Exception) -> str:
     """Describe what is wrong with a chunk or a record, in a few words."""
     if type(error) is ValueError:
         return str(error)
@@ -145,23 +145,23 @@ class McapRecords:
 
     def messages(self, topic: str, *, schema: str, name: str | None = None) -> Messages:
         """Messages of a topic, and of channels with that `name` in their metadata; another type is an error."""
-        found = Messages()
+        messages = Messages()
         for number, channel in self.channels.items():
             if channel.topic != topic or (name is not None and channel.metadata.get("name") != name):
                 continue
             kind = self.schemas.get(channel.schema_id, "messages without a schema")
             if kind != schema:
                 raise BadDataError(f"{topic} holds {kind}", way_out=f"its channel must have the schema {schema}")
-            held = self.by_channel.get(number, Messages())
-            if not len(found):
-                found = held
-            elif len(held):
-                (a, b), (c, d) = ((min(one.logged), max(one.logged)) for one in (found, held))
+            more = self.by_channel.get(number, Messages())
+            if not len(messages):
+                messages = more
+            elif len(more):
+                (a, b), (c, d) = ((min(one.logged), max(one.logged)) for one in (messages, more))
                 if name is None and a <= d and c <= b:  # one after the other they are one recording
                     what = f"{topic} has messages on two channels at the same time, as of two heads or two trackers"
                     raise BadDataError(what, way_out="keep one of the channels, or one topic for each")
-                found.extend(held)
-        return found
+                messages.extend(more)
+        return messages
 
     def count(self, unpacked_bytes: int) -> None:
         """Refuse what unpacks to more than the limit in all."""
@@ -173,7 +173,7 @@ class McapRecords:
         self.damaged |= damaged
 
     def take(self, record: Any, data: memoryview) -> None:
-        """Keep a description, or a message whose place in the data `_parsed` gave."""
+        """Keep a description, or a message whose place in the data `_parse_record` gave."""
         match record:
             case number, published_ns, logged_ns, start, end:
                 if number not in self.by_channel:  # bodies of an unknown channel are kept until it is defined
@@ -210,7 +210,7 @@ def _check_magic(stream: IO[bytes], path: Path) -> None:
         what = "is empty" if not start else f"is cut off in its header ({len(start)} bytes)"
     else:
         what = f"is not an MCAP file (it starts with {start!r})"
-    raise not_a(path, "a scan", what=what, way_out="give a scan from `record`, `import` or `simulate`")
+    raise wrong_kind(path, "a scan", what=what, way_out="give a scan from `record`, `import` or `simulate`")
 
 
 def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:
@@ -227,24 +227,24 @@ def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:
                 records.lose(f"unreadable from byte {start} of {size} on (no record begins there)")
             return
         body = stream.read(length)
-        whole = len(head) == _RECORD.size and len(body) == length
-        if whole and opcode == Opcode.DATA_END:
+        complete = len(head) == _RECORD.size and len(body) == length
+        if complete and opcode == Opcode.DATA_END:
             _end_data(records, body, checksum)
-        if whole and opcode == Opcode.FOOTER:
-            whole = records.finished = stream.read(len(MCAP_MAGIC)) == MCAP_MAGIC
-            if whole:
+        if complete and opcode == Opcode.FOOTER:
+            complete = records.finished = stream.read(len(MCAP_MAGIC)) == MCAP_MAGIC
+            if complete:
                 return
-        if not whole:
-            cut = f"cut off at byte {size}: everything after {records.last_ns / 1e9:.3f} s is lost"
-            missing = "the end of the file is missing; all messages are there"
-            records.lose(missing if records.all_data else cut, damaged=False)
+        if not complete:
+            loss = f"cut off at byte {size}: everything after {records.last_ns / 1e9:.3f} s is lost"
+            loss_of_end = "the end of the file is missing; all messages are there"
+            records.lose(loss_of_end if records.all_data else loss, damaged=False)
             return
         if not records.all_data:
             checksum = zlib.crc32(body, zlib.crc32(head, checksum))
         try:
-            record = _parsed(opcode, body)
+            record = _parse_record(opcode, body)
         except Exception as error:  # struct.error, EndOfFile, UnicodeDecodeError...
-            records.lose(f"the record at byte {start} makes no sense ({damage(error)})")
+            records.lose(f"the record at byte {start} makes no sense ({describe_damage(error)})")
             continue
         if isinstance(record, Chunk):
             records.chunks += 1
@@ -263,7 +263,7 @@ def _end_data(records: McapRecords, body: bytes, checksum: int) -> None:
     records.all_data = True
 
 
-def _parsed(opcode: int, data: bytes, start: int = 0, end: int | None = None) -> Any:
+def _parse_record(opcode: int, data: bytes, start: int = 0, end: int | None = None) -> Any:
     """A record; of a message channel, publish and log time, and where its body starts and ends; None for others."""
     end = len(data) if end is None else end
     if opcode == Opcode.MESSAGE:
@@ -278,20 +278,20 @@ def _take_chunk(records: McapRecords, chunk: Any) -> None:
     """Keep all messages of a chunk; none when it is damaged."""
     try:
         data = unpacked(chunk, count=records.count)
-        held = list(_split(data, records))
+        contents = list(_split(data, records))
     except BadDataError:  # over a limit
         raise
     except Exception as error:  # each decompressor has an error class of its own, and so have records
         start, end = chunk.message_start_time / 1e9, chunk.message_end_time / 1e9
-        records.lose(f"chunk {records.chunks}, {start:.3f} to {end:.3f} s: {damage(error)}")
+        records.lose(f"chunk {records.chunks}, {start:.3f} to {end:.3f} s: {describe_damage(error)}")
         return
     records.last_ns = max(records.last_ns, chunk.message_end_time)
-    for record in held:
+    for record in contents:
         records.take(record, memoryview(data))
 
 
 def _split(data: bytes, records: McapRecords) -> Iterator[Any]:
-    """Schemas, channels and messages of a chunk, see `_parsed`."""
+    """Schemas, channels and messages of a chunk, see `_parse_record`."""
     offset = 0
     while offset < len(data):
         opcode, size = _RECORD.unpack_from(data, offset)
@@ -302,4 +302,4 @@ def _split(data: bytes, records: McapRecords) -> Iterator[Any]:
         if opcode in _DESCRIPTIONS:
             records.count(_DESCRIPTION_BYTES)
         if opcode == Opcode.MESSAGE or opcode in _DESCRIPTIONS:
-            yield _parsed(opcode, data, start, offset)
+            yield _parse_record(opcode, data, start, offset)

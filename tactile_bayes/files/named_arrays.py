@@ -97,7 +97,7 @@ def is_text(path: Path) -> bool:
 AXES: Final = ("x", "y")  #: Places of the columns and rows of a grid, or of each of its cells.
 
 
-def turned_by_axes(arrays: Arrays) -> tuple[str, ...]:
+def orient_by_axes(arrays: Arrays) -> tuple[str, ...]:
     """Turn grids in place so that x rises along their rows and y from row to row, by `AXES`, which are taken out."""
     x, y = (arrays.get(name, np.empty(0)) for name in AXES)
     if x.ndim == y.ndim == 2 and x.size and x.shape == y.shape and len(arrays) > len(AXES):
@@ -141,8 +141,8 @@ def _netcdf_3(path: Path) -> Arrays:
 def _hdf5(path: Path, choose: Choose, *, begins_at: int = 0) -> Arrays:
     """Arrays of an HDF5 file, which MATLAB's of version 7.3 is, too."""
     with open_netcdf(path, way_out=_COPY_AGAIN, begins_at=begins_at) as root:
-        held = dict(_members(root, "", levels=_MOST_LEVELS))
-        return {name: np.asarray(held[name].numbers(name.rpartition(".")[2])) for name in choose(list(held))}
+        members = dict(_members(root, "", levels=_MOST_LEVELS))
+        return {name: np.asarray(members[name].numbers(name.rpartition(".")[2])) for name in choose(list(members))}
 
 
 def _members(group: Group, prefix: str, *, levels: int) -> Iterator[tuple[str, Group]]:
@@ -177,7 +177,7 @@ def _mat_5(path: Path) -> Arrays:
     data = reading.read_bytes(path, most=reading.NETCDF_BYTES)
     order = "<" if data[126:128] == b"IM" else ">"
     most = reading.unpacked_limit(len(data))
-    found: Arrays = {}
+    arrays: Arrays = {}
     with reading.decoding("is not a whole .mat file", way_out=_COPY_AGAIN):
         for kind, element in _elements(data[_HEADER:], order):
             parts = [(kind, element)]
@@ -188,8 +188,8 @@ def _mat_5(path: Path) -> Arrays:
                 parts = list(_elements(unpacked, order))
             for inner, content in parts:
                 if inner == _MATRIX:
-                    found |= dict(_arrays(content, order, "", _MOST_LEVELS))
-    return found
+                    arrays |= dict(_matrix_arrays(content, order, "", _MOST_LEVELS))
+    return arrays
 
 
 def _elements(data: bytes, order: str) -> Iterator[Element]:
@@ -208,21 +208,21 @@ def _elements(data: bytes, order: str) -> Iterator[Element]:
         at = end
 
 
-def _arrays(matrix: bytes, order: str, name: str, levels: int) -> Iterator[tuple[str, np.ndarray]]:
+def _matrix_arrays(matrix: bytes, order: str, name: str, levels: int) -> Iterator[tuple[str, np.ndarray]]:
     """The arrays of a matrix by their names; `name` is a field's, whose own is empty."""
     elements = _elements(matrix, order)
     flags = int(_numbers(next(elements), order)[0])
     kind = flags & 0xFF
     shape = () if kind == _OPAQUE else tuple(int(one) for one in _numbers(next(elements), order))
-    own = next(elements)[1].decode("ascii")
-    name = name or own
+    name_in_file = next(elements)[1].decode("ascii")
+    name = name or name_in_file
     if kind == _STRUCT and math.prod(shape) == 1 and levels:
         width = int(_numbers(next(elements), order)[0])
         texts = next(elements)[1]
         names = [texts[i : i + width].split(b"\0")[0].decode("ascii") for i in range(0, len(texts), max(width, 1))]
         for field, (of_field, content) in zip(names, elements, strict=False):
             if of_field == _MATRIX and content:
-                yield from _arrays(content, order, f"{name}.{field}", levels - 1)
+                yield from _matrix_arrays(content, order, f"{name}.{field}", levels - 1)
     elif kind in _NUMERIC and not flags & _COMPLEX:
         values = _numbers(next(elements), order)
         if min(shape, default=0) < 0 or math.prod(shape) != len(values):
@@ -266,20 +266,24 @@ def read_array_map(path: Path) -> ArrayMap:
 def array_template(path: Path | None) -> str:
     """TOML for `read_array_map` to fill in: of a file, with its arrays and those that their shapes tell."""
     shapes = {} if path is None else {name: one.shape for name, one in read_named(path, list).items()}
-    held = [f"#   {name}: {' x '.join(map(str, shape)) or 'one value'}" for name, shape in shapes.items()]
-    lines = [_HEADING.format(path=path or "a file"), *(["# The file has:", *held, ""] if held else []), "[arrays]"]
+    shape_lines = [f"#   {name}: {' x '.join(map(str, shape)) or 'one value'}" for name, shape in shapes.items()]
+    lines = [
+        _HEADING.format(path=path or "a file"),
+        *(["# The file has:", *shape_lines, ""] if shape_lines else []),
+        "[arrays]",
+    ]
     words = {name: f"{in_words(one.shape)}: {one.meaning}" for name, one in LAYOUT.items()}
     words |= {name: f"may be left out; {words[name]}" for name in OPTIONAL}
     words["pose_matrix"] = "m, 4, 4: in place of position_mm and quaternion_wxyz"
-    guessed = _guessed(shapes)
+    guesses = _guess_names(shapes)
     for name, meaning in words.items():
         if name in shapes:
             lines.append(f"# {name}: found under this name")
         elif name == "counts" and "frames" in shapes:
             lines.append("# counts: found as frames")
         else:
-            said = f"{name} = {dump_json(guessed[name]).strip()}  # guessed" if name in guessed else f'# {name} = ""'
-            lines.append(said)
+            entry = f"{name} = {dump_json(guesses[name]).strip()}  # guessed" if name in guesses else f'# {name} = ""'
+            lines.append(entry)
         lines += textwrap.wrap(meaning, _COLUMNS, initial_indent="#   ", subsequent_indent="#   ")
     return "\n".join([*lines, _VALUES])
 
@@ -302,35 +306,39 @@ _TIMES_BESIDE: Final = {"frame_time_s": ("counts", "frames"), "pose_time_s": ("p
 def plain_names(
     names: Sequence[str], known: Mapping[str, str], values: Mapping[str, Any] | None = None
 ) -> dict[str, str]:
-    """A file's plain words for arrays neither `known` in it nor `values` given elsewhere, by the names here."""
-    found: dict[str, str] = {}
-    for here, words in _PLAIN_WORDS.items():
-        same = {here, "frames"} if here == "counts" else {here}
-        if same & {*known, *(values or {})}:
+    """Layout's name -> the file's, for arrays that the file calls by a plain word, beside `known` ones and `values`."""
+    matches: dict[str, str] = {}
+    for layout_name, words in _PLAIN_WORDS.items():
+        equivalents = {layout_name, "frames"} if layout_name == "counts" else {layout_name}
+        if equivalents & {*known, *(values or {})}:
             continue
-        taken = {*known.values(), *found.values()}
-        words = (*words, *same)  # within a group
-        alike = [name for name in names if name.rpartition(".")[2].lower() in words and name not in taken]
-        alike = [name for name in alike if name.rpartition(".")[2] in words] or alike  # t, where there is a T too
-        if here in _TIMES_BESIDE:
-            both = {**known, **found}
-            group = next((both[one].rpartition(".")[0] for one in _TIMES_BESIDE[here] if one in both), "")
-            alike = [name for name in alike if name.rpartition(".")[0] == group] or alike
-            if here == "pose_time_s" and not group:  # beside the frames, `time` is theirs
-                alike = [name for name in alike if name.lower() not in _PLAIN_WORDS["frame_time_s"]]
-        if len(alike) == 1:
-            found[here] = alike[0]
-    return found
+        names_used = {*known.values(), *matches.values()}
+        words = (*words, *equivalents)  # within a group
+        candidates = [name for name in names if name.rpartition(".")[2].lower() in words and name not in names_used]
+        exact = [name for name in candidates if name.rpartition(".")[2] in words]
+        candidates = exact or candidates  # t, where there is a T too
+        if layout_name in _TIMES_BESIDE:
+            by_layout = {**known, **matches}
+            timed = (by_layout[name] for name in _TIMES_BESIDE[layout_name] if name in by_layout)
+            group = next(timed, "").rpartition(".")[0]
+            candidates = [name for name in candidates if name.rpartition(".")[0] == group] or candidates
+            if layout_name == "pose_time_s" and not group:  # beside the frames, `time` is theirs
+                candidates = [name for name in candidates if name.lower() not in _PLAIN_WORDS["frame_time_s"]]
+        if len(candidates) == 1:
+            matches[layout_name] = candidates[0]
+    return matches
 
 
-def _guessed(shapes: Mapping[str, Shape]) -> dict[str, str]:
-    """Arrays that are the only ones of their shape, or called by a plain word, where none has the layout's name."""
-    free = {name: tuple(one for one in shape if one != 1) for name, shape in shapes.items() if name not in KNOWN}
+def _guess_names(shapes: Mapping[str, Shape]) -> dict[str, str]:
+    """Layout's name -> the file's, for arrays called by a plain word or the only ones of their shape."""
+    shapes_unclaimed = {
+        name: tuple(one for one in shape if one != 1) for name, shape in shapes.items() if name not in KNOWN
+    }
 
     def of(fits: Callable[[Shape], bool]) -> list[str]:
-        return [name for name, shape in free.items() if fits(shape)]
+        return [name for name, shape in shapes_unclaimed.items() if fits(shape)]
 
-    found = {
+    candidates = {
         "array_from_tracker": of(lambda s: s == (4, 4)),
         "head_surface_mm": of(lambda s: len(s) == 3 and s[-1] == 3),
         "pose_matrix": of(lambda s: len(s) == 3 and (4, 4) in (s[:2], s[1:])),
@@ -338,10 +346,14 @@ def _guessed(shapes: Mapping[str, Shape]) -> dict[str, str]:
         "position_mm": of(lambda s: len(s) == 2 and s[1] == 3),
         "quaternion_wxyz": of(lambda s: len(s) == 2 and s[1] == 4 and s[0] != 4),
     }
-    for here, places in _TIMES_BESIDE.items():
-        only = [free[found[name][0]] for name in places if len(found.get(name, ())) == 1]
+    for layout_name, places in _TIMES_BESIDE.items():
+        only = [shapes_unclaimed[candidates[name][0]] for name in places if len(candidates.get(name, ())) == 1]
         only += [shapes[name] for name in places if shapes.get(name)]
         ends = {max(shape[0], shape[-1], key=int) for shape in only}  # either may be that of time
-        found[here] = of(lambda s, ends=ends: len(s) == 1 and s[0] in ends)  # type: ignore[misc]
-    by_shape = {here: names[0] for here, names in found.items() if here not in shapes and len(names) == 1}
+        candidates[layout_name] = of(lambda s, ends=ends: len(s) == 1 and s[0] in ends)  # type: ignore[misc]
+    by_shape = {
+        layout_name: names[0]
+        for layout_name, names in candidates.items()
+        if layout_name not in shapes and len(names) == 1
+    }
     return by_shape | plain_names(list(shapes), {name: name for name in KNOWN if name in shapes})

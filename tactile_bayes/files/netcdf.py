@@ -140,10 +140,10 @@ class Group:
 
     def group(self, name: str) -> Group | None:
         """Subgroup by name; None where there is none."""
-        found = self._own(name)
-        if not isinstance(found, h5py.Group):
+        member = self._member(name)
+        if not isinstance(member, h5py.Group):
             return None
-        return Group(found, most_bytes=self._most_bytes, way_out=self._way_out)
+        return Group(member, most_bytes=self._most_bytes, way_out=self._way_out)
 
     def attributes(self) -> dict[str, str]:
         """Text attributes by name."""
@@ -157,8 +157,8 @@ class Group:
 
     def dimension(self, name: str) -> int | None:
         """The length of a dimension; None where there is none."""
-        found = self._dataset(name)
-        return None if found is None or len(found.shape) != 1 else int(found.shape[0])
+        dataset = self._dataset(name)
+        return None if dataset is None or len(dataset.shape) != 1 else int(dataset.shape[0])
 
     def variables(self) -> list[str]:
         """Names of the arrays in alphabetical order, without dimensions that have no values."""
@@ -166,15 +166,15 @@ class Group:
 
     def array(self, name: str, *, kind: str, dimensions: tuple[str, ...]) -> Any:
         """Values of a variable of this type (``f8``, ``i8``, ``u2``) and dimensions; None where there is none."""
-        found = self._array(name)
-        if found is None:
+        dataset = self._array(name)
+        if dataset is None:
             return None
-        if found.dtype.newbyteorder("=") != np.dtype(kind):
-            raise BadDataError(f"variable {name} is {found.dtype}, not {np.dtype(kind)}", way_out=self._way_out)
-        has = _dimensions(found)
-        if has != dimensions:
-            raise BadDataError(f"variable {name} has dimensions {has}, not {dimensions}", way_out=self._way_out)
-        values = np.asarray(self._values(name, found), dtype=np.dtype(kind))
+        if dataset.dtype.newbyteorder("=") != np.dtype(kind):
+            raise BadDataError(f"variable {name} is {dataset.dtype}, not {np.dtype(kind)}", way_out=self._way_out)
+        axes = _dimensions(dataset)
+        if axes != dimensions:
+            raise BadDataError(f"variable {name} has dimensions {axes}, not {dimensions}", way_out=self._way_out)
+        values = np.asarray(self._values(name, dataset), dtype=np.dtype(kind))
         # beyond any quantity here, and sums overflow; whoever reads a variable judges its infinities
         if values.dtype.kind == "f" and (np.abs(values[np.isfinite(values)]) > MOST).any():
             raise BadDataError(f"variable {name} holds values beyond {MOST:g}", way_out=self._way_out)
@@ -185,41 +185,41 @@ class Group:
 
         See `as_declared`.
         """
-        found = self._dataset(name)
-        return as_declared(self._values(name, found), found.attrs) if found.dtype.kind in "iuf" else None
+        dataset = self._dataset(name)
+        return as_declared(self._values(name, dataset), dataset.attrs) if dataset.dtype.kind in "iuf" else None
 
     def groups(self) -> list[str]:
         """Names of the groups in this one."""
-        return sorted(name for name in map(str, self._place) if isinstance(self._own(name), h5py.Group))
+        return sorted(name for name in map(str, self._place) if isinstance(self._member(name), h5py.Group))
 
-    def _values(self, name: str, found: Any) -> Any:
+    def _values(self, name: str, dataset: Any) -> Any:
         """Values of a dataset, of whose chunks each unpacks to its declared size.
 
         HDF5 unpacks more for as long as there is memory, takes what is missing from whatever lies in memory, and ends
         the process where a checksum has less than its four bytes.
         """
-        created = found.id.get_create_plist()
+        created = dataset.id.get_create_plist()
         filters = [created.get_filter(number)[0] for number in range(created.get_nfilters())]
         if len(set(filters)) < len(filters) or not set(filters) <= {_DEFLATE, _SHUFFLE, _CHECKSUM}:
             way_out = "pack it by gzip, with shuffle and checksum or without: h5repack -f GZIP=4"
             raise BadDataError(f"variable {name} is packed by filters {filters}", way_out=way_out)
-        chunks = [found.id.get_chunk_info(n) for n in range(found.id.get_num_chunks())] if found.chunks else []
-        declared = int(np.prod(found.chunks or (0,), dtype=object)) * found.dtype.itemsize
+        chunks = [dataset.id.get_chunk_info(n) for n in range(dataset.id.get_num_chunks())] if dataset.chunks else []
+        declared = int(np.prod(dataset.chunks or (0,), dtype=object)) * dataset.dtype.itemsize
         sizes = {
-            f"variable {name} unpacks to {{}} bytes": found.size * found.dtype.itemsize,
+            f"variable {name} unpacks to {{}} bytes": dataset.size * dataset.dtype.itemsize,
             f"a chunk of variable {name} unpacks to {{}} bytes": declared,
             f"a chunk of variable {name} takes {{}} bytes": max((stored.size for stored in chunks), default=0),
         }
         largest = max(sizes, key=lambda what: sizes[what])
         reading.check_limit(sizes[largest], self._most_bytes, what=largest)
         for stored in chunks:
-            over = _unpacked_bytes(found, stored, filters, most=declared + 1) - declared
+            over = _unpacked_bytes(dataset, stored, filters, most=declared + 1) - declared
             if over:
                 what = f"a chunk of variable {name} unpacks to {'more' if over > 0 else 'less'} than it declares"
                 raise BadDataError(what, way_out=self._way_out)
-        return found[...]
+        return dataset[...]
 
-    def _own(self, name: str) -> Any:
+    def _member(self, name: str) -> Any:
         """Member of this file by name; links to other places and files are not followed."""
         if not isinstance(self._place.get(name, getlink=True), h5py.HardLink):
             return None
@@ -227,27 +227,27 @@ class Group:
 
     def _dataset(self, name: str) -> Any:
         """Dataset whose values are in this file; None where there is none."""
-        found = self._own(name)
-        if not isinstance(found, h5py.Dataset):
+        member = self._member(name)
+        if not isinstance(member, h5py.Dataset):
             return None
-        if found.shape is None or found.external or found.is_virtual:
+        if member.shape is None or member.external or member.is_virtual:
             raise BadDataError(f"variable {name} has its values in another file", way_out=self._way_out)
-        return found
+        return member
 
     def _array(self, name: str) -> Any:
         """Dataset that does not merely stand for a dimension without values; None where there is none."""
-        found = self._dataset(name)
-        scale = b"" if found is None else found.attrs.get("NAME", b"")
+        dataset = self._dataset(name)
+        scale = b"" if dataset is None else dataset.attrs.get("NAME", b"")
         text = scale.decode("utf-8", "replace") if isinstance(scale, bytes) else str(scale)
-        return None if text.startswith(_NO_VARIABLE.partition("{")[0]) else found
+        return None if text.startswith(_NO_VARIABLE.partition("{")[0]) else dataset
 
 
-def _unpacked_bytes(found: Any, stored: Any, filters: list[int], *, most: int) -> int:
+def _unpacked_bytes(dataset: Any, stored: Any, filters: list[int], *, most: int) -> int:
     """Bytes that a chunk unpacks to, up to `most`; negative where the checksum is cut off."""
     applied = [one for number, one in enumerate(filters) if not stored.filter_mask >> number & 1]
     if _DEFLATE not in applied:
         return int(stored.size) - _CHECKSUM_BYTES * (_CHECKSUM in applied)
-    _, packed = found.id.read_direct_chunk(stored.chunk_offset)
+    _, packed = dataset.id.read_direct_chunk(stored.chunk_offset)
     before, after = applied[: applied.index(_DEFLATE)], applied[applied.index(_DEFLATE) :]
     if _CHECKSUM in after:
         packed = packed[:-_CHECKSUM_BYTES]
@@ -260,12 +260,14 @@ def as_declared(values: Any, attributes: Mapping[str, Any]) -> Any:
     ``scale_factor`` and ``add_offset`` (CF conventions 1.11, sections 2.5.1 and 8.1).
     """
     names = ("_FillValue", "missing_value", "scale_factor", "add_offset")
-    given = {name: np.atleast_1d(np.asarray(attributes[name])) for name in names if name in attributes}
-    held = {name: array for name, array in given.items() if array.dtype.kind in "iuf" and array.size}
+    declared = {name: np.atleast_1d(np.asarray(attributes[name])) for name in names if name in attributes}
+    numeric = {name: array for name, array in declared.items() if array.dtype.kind in "iuf" and array.size}
     missing = np.zeros(np.shape(values), dtype=bool)
     for name in names[:2]:
-        missing |= np.isin(values, held.get(name, np.array([], values.dtype)))
-    scale, offset = (float(held.get(name, [plain])[0]) for name, plain in (("scale_factor", 1), ("add_offset", 0)))
+        missing |= np.isin(values, numeric.get(name, np.array([], values.dtype)))
+    scale, offset = (
+        float(numeric.get(name, [default])[0]) for name, default in (("scale_factor", 1), ("add_offset", 0))
+    )
     if not missing.any() and (scale, offset) == (1, 0):
         return values
     return np.where(missing, np.nan, values * scale + offset)
@@ -285,8 +287,8 @@ def _has_scales(dataset: Any) -> bool:
     if "DIMENSION_LIST" not in dataset.attrs:
         return False
     listed = dataset.attrs.get_id("DIMENSION_LIST")
-    held = h5py.check_vlen_dtype(listed.dtype)
-    is_reference = held is not None and h5py.check_ref_dtype(held) is h5py.Reference
+    element = h5py.check_vlen_dtype(listed.dtype)
+    is_reference = element is not None and h5py.check_ref_dtype(element) is h5py.Reference
     return bool(is_reference and listed.shape == (len(dataset.shape),))
 
 
@@ -297,7 +299,7 @@ def open_netcdf(path: Path, *, way_out: str, begins_at: int = 0) -> Iterator[Gro
     with in_file(path), reading.open_input(path) as stream, reading.decoding(_DAMAGED, way_out=way_out):
         stream.seek(begins_at)
         if stream.read(len(reading.HDF5_MAGIC)) != reading.HDF5_MAGIC:
-            raise reading.not_a(path, "a map or posterior (netCDF)", what=_DAMAGED, way_out=way_out)
+            raise reading.wrong_kind(path, "a map or posterior (netCDF)", what=_DAMAGED, way_out=way_out)
         reading.check_limit(stream.seek(0, io.SEEK_END), reading.NETCDF_BYTES, what="it has {} bytes")
         stream.seek(0)
         data = stream.read()

@@ -32,13 +32,13 @@ _HEADERS: Final = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.f
 def load_npz(path: Path, *, required: Sequence[str], optional: Sequence[str]) -> Arrays:
     """Read the named arrays of an .npz file; errors, also of a file that is encrypted or too large, name no path."""
 
-    def wanted(names: Sequence[str]) -> Sequence[str]:
+    def choose(names: Sequence[str]) -> Sequence[str]:
         if missing := [name for name in required if name not in names]:
             has = ", ".join(sorted(names)[:12]) or "nothing"
             raise BadDataError(f"lacks {', '.join(missing)} (it has {has})", way_out="add the missing arrays")
         return [name for name in (*required, *optional) if name in names]
 
-    return choose_npz(path, wanted)
+    return choose_npz(path, choose)
 
 
 def choose_npz(path: Path, choose: Callable[[Sequence[str]], Iterable[str]]) -> Arrays:
@@ -46,23 +46,23 @@ def choose_npz(path: Path, choose: Callable[[Sequence[str]], Iterable[str]]) -> 
     with reading.open_input(path) as stream:
         start = stream.read(6)
         if not zipfile.is_zipfile(stream):
-            what, way_out = f"is not an .npz file (it starts with {start!r})", "save it with numpy.savez_compressed"
+            fault, way_out = f"is not an .npz file (it starts with {start!r})", "save it with numpy.savez_compressed"
             if start.startswith(reading.ZIP_MAGIC[:2]):
-                what, way_out = "is a zip archive that is cut off (no directory at its end)", "copy it again"
+                fault, way_out = "is a zip archive that is cut off (no directory at its end)", "copy it again"
             elif start == np.lib.format.MAGIC_PREFIX:
-                what, way_out = "is a single .npy array", "save all arrays in one file with numpy.savez_compressed"
-            raise BadDataError(what, way_out=way_out)
+                fault, way_out = "is a single .npy array", "save all arrays in one file with numpy.savez_compressed"
+            raise BadDataError(fault, way_out=way_out)
         with reading.decoding("is not a whole .npz file", way_out="copy it again"), zipfile.ZipFile(stream) as archive:
             members = {name.removesuffix(".npy"): archive.getinfo(name) for name in archive.namelist()}
             if members and not any(name.endswith(".npy") for name in archive.namelist()):
-                what = f"is a zip archive without arrays (it has {', '.join(sorted(members)[:3])})"
-                raise BadDataError(what, way_out="save the sheet of a spreadsheet as .csv, arrays with numpy.savez")
-            wanted = {name: members[name] for name in choose(list(members))}
-            unpacked = sum(member.file_size for member in wanted.values())
+                fault = f"is a zip archive without arrays (it has {', '.join(sorted(members)[:3])})"
+                raise BadDataError(fault, way_out="save the sheet of a spreadsheet as .csv, arrays with numpy.savez")
+            chosen = {name: members[name] for name in choose(list(members))}
+            unpacked = sum(member.file_size for member in chosen.values())
             most = reading.unpacked_limit(os.fstat(stream.fileno()).st_size)
             reading.check_limit(unpacked, most, what="its arrays unpack to {} bytes")
             arrays = {}
-            for name, member in wanted.items():
+            for name, member in chosen.items():
                 if member.flag_bits & _ENCRYPTED:
                     raise BadDataError(f"{name} is encrypted", way_out="save the file without a password")
                 with archive.open(member) as packed:
@@ -85,9 +85,9 @@ def _array(stream: IO[bytes], length: int, name: str) -> np.ndarray[Any, np.dtyp
         if dtype.hasobject:
             what = f"{name} holds Python objects, which are never unpickled"
             raise BadDataError(what, way_out="save it as an array of plain numbers")
-        size, held = math.prod(shape) * dtype.itemsize, length - stream.tell()
-        if held != size:
-            what = f"{name} declares {size:,} bytes (shape {shape}, {dtype}) and holds {held:,}"
+        size, bytes_held = math.prod(shape) * dtype.itemsize, length - stream.tell()
+        if bytes_held != size:
+            what = f"{name} declares {size:,} bytes (shape {shape}, {dtype}) and holds {bytes_held:,}"
             raise BadDataError(what, way_out=_COPY_AGAIN)
         data = bytearray(stream.read())  # up to the end of the member, so that its checksum is looked at
         flat: np.ndarray[Any, np.dtype[Any]] = np.frombuffer(data, dtype=dtype)
@@ -115,18 +115,18 @@ class CheckpointFile:
             return None
         with in_file(self.path):
             try:
-                found = load_npz(self.path, required=["schema", "key", "sha256", *SHAPES], optional=())
+                arrays = load_npz(self.path, required=["schema", "key", "sha256", *SHAPES], optional=())
             except BadDataError as error:
                 raise BadDataError(f"is no checkpoint: {error.what}", way_out="name another file") from None
-            if str(found["schema"]) != SCHEMA or any(found[name].ndim != n for name, n in SHAPES.items()):
+            if str(arrays["schema"]) != SCHEMA or any(arrays[name].ndim != n for name, n in SHAPES.items()):
                 raise BadDataError(f"is no checkpoint of schema {SCHEMA}", way_out="name another file")
-            if str(found["sha256"]) != _digest(found):
+            if str(arrays["sha256"]) != _digest(arrays):
                 raise BadDataError("is damaged: its checksum does not match", way_out="remove it")
-            if str(found["key"]) != f"{key}:{self.context}":
+            if str(arrays["key"]) != f"{key}:{self.context}":
                 what = "is a checkpoint of another map, calibration or setting"
                 way_out = "give the same map and options (only max_steps may differ), or name another file"
                 raise BadDataError(what, way_out=way_out)
-        return ChainState(**{name: found[name] for name in SHAPES})
+        return ChainState(**{name: arrays[name] for name in SHAPES})
 
     def save(self, key: str, state: ChainState) -> None:
         """Write the state atomically."""

@@ -32,7 +32,7 @@ _OF_A_SIZE: Final = ("d_x_mm", "d_y_mm", "max_size_mm", "min_size_mm")
 
 def write_posterior(
     path: Path,
-    found: Estimate | SizePosterior,
+    result: Estimate | SizePosterior,
     *,
     provenance: Provenance,
     report: EstimateReport | PooledReport,
@@ -45,7 +45,7 @@ def write_posterior(
     `inference_groups`; `report` is the estimate's, which `read_estimate` gives back. A map without an estimate has no
     draws: a ValueError.
     """
-    method, draws, figures = _draws_of(found)
+    method, draws, figures = _draws_of(result)
     finite = {name: v for name, v in figures.items() if not isinstance(v, float) or math.isfinite(v)}
     attributes = {
         "schema": POSTERIOR_SCHEMA,
@@ -55,22 +55,22 @@ def write_posterior(
         "diagnostics": json.dumps(finite),
         "estimate": json.dumps(report.document),
     }
-    on_axes = {name: (("chain", "draw"), np.asarray(values, dtype=np.float64)) for name, values in draws.items()}
-    held = {"posterior": Contents(_with_coordinates(on_axes), attributes)}
-    held |= {name: Contents(_with_coordinates(group.arrays), group.notes) for name, group in (groups or {}).items()}
-    write_bytes(path, grouped_netcdf_bytes(held), force=force)
+    variables = {name: (("chain", "draw"), np.asarray(values, dtype=np.float64)) for name, values in draws.items()}
+    contents = {"posterior": Contents(_with_coordinates(variables), attributes)}
+    contents |= {name: Contents(_with_coordinates(group.arrays), group.notes) for name, group in (groups or {}).items()}
+    write_bytes(path, grouped_netcdf_bytes(contents), force=force)
 
 
-def _draws_of(found: Estimate | SizePosterior) -> tuple[str, dict[str, FloatArray], Mapping[str, Any]]:
+def _draws_of(result: Estimate | SizePosterior) -> tuple[str, dict[str, FloatArray], Mapping[str, Any]]:
     """The method, the (chain, draw) arrays by name, and the figures of the method."""
-    if isinstance(found, SizePosterior):
-        return "pooled", {name: np.atleast_2d(getattr(found, name)) for name in _OF_A_SIZE}, found.figures
-    if found.map_posterior is None or found.draws is None:
+    if isinstance(result, SizePosterior):
+        return "pooled", {name: np.atleast_2d(getattr(result, name)) for name in _OF_A_SIZE}, result.figures
+    if result.map_posterior is None or result.draws is None:
         raise ValueError("no estimate, so no posterior to write")
-    draws = {name: getattr(found.map_posterior, name) for name in OF_A_MAP}
-    if found.size is not None:
-        draws |= {name: getattr(found.size, name) for name in _OF_A_SIZE}
-    return found.draws.method, draws, found.diagnostics
+    draws = {name: getattr(result.map_posterior, name) for name in OF_A_MAP}
+    if result.size is not None:
+        draws |= {name: getattr(result.size, name) for name in _OF_A_SIZE}
+    return result.draws.method, draws, result.diagnostics
 
 
 def _with_coordinates(arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]) -> dict[str, Variable]:
@@ -78,8 +78,8 @@ def _with_coordinates(arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]) 
     lengths: dict[str, int] = {}
     for axes, values in arrays.values():
         lengths |= dict(zip(axes, np.shape(values), strict=True))
-    held = {name: Variable(np.arange(length), (name,), {}) for name, length in lengths.items()}
-    return held | {name: Variable(values, axes, {}) for name, (axes, values) in arrays.items()}
+    coordinates = {name: Variable(np.arange(length), (name,), {}) for name, length in lengths.items()}
+    return coordinates | {name: Variable(values, axes, {}) for name, (axes, values) in arrays.items()}
 
 
 class PosteriorDraws(Record, eq=False):

@@ -74,10 +74,10 @@ def recordings(scans: Sequence[Mapping[str, str]]) -> Iterator[str]:
 
 def repeated_scans(exams: Sequence[Sequence[Mapping[str, str]]]) -> dict[int, int]:
     """Which exams share a recording with an earlier one: index of the exam, and of the earlier one."""
-    seen: dict[str, int] = {}
-    found: dict[int, int] = {}
+    first_exam: dict[str, int] = {}
+    repeats: dict[int, int] = {}
     for index, scans in enumerate(exams):
         for recording in recordings(scans):
-            if seen.setdefault(recording, index) != index:
-                found.setdefault(index, seen[recording])
-    return found
+            if first_exam.setdefault(recording, index) != index:
+                repeats.setdefault(index, first_exam[recording])
+    return repeats

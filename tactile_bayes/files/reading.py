@@ -227,17 +227,17 @@ def schema_kind(schema: object) -> str:
     return _DOCUMENTS.get(parts[1], f"a {parts[1].replace('-', ' ')} (JSON)")
 
 
-def not_a(path: Path, wanted: str, *, what: str, way_out: str) -> BadDataError:
+def wrong_kind(path: Path, expected: str, *, what: str, way_out: str) -> BadDataError:
     """Error for a file of another kind than `wanted` (in the words of `kind_of`); names the kind where it is known.
 
     `what` and `way_out` are the fault and the remedy where it is not, or where the file is of the wanted kind and
     damaged.
     """
-    found = kind_of(path)
-    if not found or found == wanted:
+    kind = kind_of(path)
+    if not kind or kind == expected:
         return BadDataError(what, way_out=way_out, path=str(path))
-    remedy = _WAYS.get((found, wanted), way_out).format(path=path)
-    return BadDataError(f"is {found}, not {wanted}", way_out=remedy, path=str(path))
+    remedy = _WAYS.get((kind, expected), way_out).format(path=path)
+    return BadDataError(f"is {kind}, not {expected}", way_out=remedy, path=str(path))
 
 
 # --- Files in object stores by their addresses, through fsspec; who may read and write is the environment's matter.
@@ -266,7 +266,7 @@ def check_address(address: str) -> str:
 
 def version_of(address: str) -> str:
     """Size, time and tag that the store gives of a file's content without reading it."""
-    with _of_store(address) as store:
+    with _reading_store(address) as store:
         known = store.info(address)
     named = {key.lower(): known[key] for key in known}
     tag = named.get("etag") or named.get("md5hash") or named.get("content_md5")
@@ -275,16 +275,16 @@ def version_of(address: str) -> str:
 
 def sha256_of(address: str) -> str:
     """Hex digest of a file's bytes, read as a stream; see `version_of` for the errors."""
-    with _of_store(address) as store, store.open(address, "rb") as file:
+    with _reading_store(address) as store, store.open(address, "rb") as file:
         return str(hashlib.file_digest(file, "sha256").hexdigest())
 
 
 @contextlib.contextmanager
-def fetched(address: str) -> Iterator[Path]:
+def downloaded(address: str) -> Iterator[Path]:
     """Copy of a file of a store on this computer, for as long as the block lasts; see `version_of` for the errors."""
     with tempfile.TemporaryDirectory(prefix="tactile-bayes-") as folder:
         path = Path(folder) / PurePosixPath(address).name
-        with _of_store(address) as store:
+        with _reading_store(address) as store:
             store.get_file(address, str(path))
         yield path
 
@@ -294,13 +294,13 @@ def put(path: Path, address: str) -> None:
     try:
         _store(address).put_file(str(path), address)
     except Exception as error:
-        raise UsageError(f"{address} cannot be written ({_why(error)}); check address and credentials") from None
+        raise UsageError(f"{address} cannot be written ({_reason(error)}); check address and credentials") from None
 
 
 def files_below(address: str, *endings: str) -> Iterator[str]:
     """Addresses of all files below a folder that end in one of some ways, sorted; see `version_of` for the errors."""
     scheme = address.split("://", 1)[0]
-    with _of_store(address) as store:
+    with _reading_store(address) as store:
         names = sorted(store.find(address))
     for name in names:
         if name.lower().endswith(endings):
@@ -323,7 +323,7 @@ def _store(address: str) -> Any:
 
 
 @contextlib.contextmanager
-def _of_store(address: str) -> Iterator[Any]:
+def _reading_store(address: str) -> Iterator[Any]:
     """The store of an address, and faults of reading: a file's own where it is missing or closed; otherwise the
     store's, which spares the exam."""
     try:
@@ -332,13 +332,13 @@ def _of_store(address: str) -> Iterator[Any]:
         raise
     except (FileNotFoundError, PermissionError, IsADirectoryError) as error:
         way_out = "check address and credentials"
-        raise BadDataError(f"cannot be read ({_why(error)})", way_out=way_out, path=address) from None
+        raise BadDataError(f"cannot be read ({_reason(error)})", way_out=way_out, path=address) from None
     except Exception as error:
         way_out = "check network and credentials, then run again"
-        raise UsageError(f"{address} cannot be read ({_why(error)}); {way_out}") from None
+        raise UsageError(f"{address} cannot be read ({_reason(error)}); {way_out}") from None
 
 
-def _why(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     """First line of an error of a store's library, without what may be a signed address."""
     if isinstance(error, FileNotFoundError):
         return "there is no such file"

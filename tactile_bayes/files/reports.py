@@ -65,8 +65,8 @@ class Report(Sized, kw_only=True):
     @property
     def document(self) -> dict[str, Any]:
         """Plain data, as the file has them."""
-        found: dict[str, Any] = to_plain(self, digits=EXACT)
-        return found
+        document: dict[str, Any] = to_plain(self, digits=EXACT)
+        return document
 
     @property
     def origin(self) -> Origin:
@@ -82,8 +82,10 @@ class Report(Sized, kw_only=True):
     @property
     def rounded(self) -> Self:
         """The same with nine significant digits, but for what it was made with and what the method says of itself."""
-        kept = {name: getattr(self, name) for name in ("diagnostics", "prior", "provenance") if hasattr(self, name)}
-        return replace(rounded(self), **kept)
+        unrounded = {
+            name: getattr(self, name) for name in ("diagnostics", "prior", "provenance") if hasattr(self, name)
+        }
+        return replace(rounded(self), **unrounded)
 
     def checked(self) -> Self:
         """Itself, held against its declaration as a file would be."""

@@ -79,7 +79,7 @@ class ScanWriter:
             enable_data_crcs=True,
         )
         self._writer.start(profile="", library=f"tactile-bayes/{__version__}")
-        told = {
+        documents = {
             "provenance": provenance.as_dict(),
             "truth": truth,
             "findings": [as_dict(one) for one in findings] or None,
@@ -87,7 +87,7 @@ class ScanWriter:
         units = {"length_unit": "mm", "time_unit": "ns", "pressure": "raw counts"}
         self._writer.add_metadata("tactile-bayes", {"schema": SCAN_SCHEMA, **units})
         self._writer.add_metadata("session", dict(sorted(session.items())))
-        for name, document in told.items():
+        for name, document in documents.items():
             if document is not None:
                 self._writer.add_metadata(name, {"json": _compact(document)})
         parts = {"head.json": head_document(head), _CALIBRATION: calibration_document(element_calibration)}
@@ -250,8 +250,8 @@ def read_scan_report(path: Path) -> ScanFile:
     """Read a scan, and what its file holds and lost; one cut off before its first complete chunk is an error."""
     records = scan_records(path, keep=TOPICS)
     with in_file(path):
-        head = attached(records, scans.HeadGeometry, "head.json")
-        calibration = attached(records, scans.ElementCalibration, _CALIBRATION)
+        head = read_attachment(records, scans.HeadGeometry, "head.json")
+        calibration = read_attachment(records, scans.ElementCalibration, _CALIBRATION)
         session = records.metadata.get("session", {})
         check_session(session, path=path)
         frames = _frames(records, head)
@@ -288,10 +288,10 @@ def scan_records(path: Path, *, keep: Collection[str]) -> McapRecords:
 
 def file_findings(records: McapRecords) -> tuple[Finding, ...]:
     """Losses of a scan's file, notes of its recorder, and findings of the file that it is a copy of."""
-    kept = parse_json(records.metadata.get("findings", {}).get("json", "[]"), name="findings")
+    copied = parse_json(records.metadata.get("findings", {}).get("json", "[]"), name="findings")
     noted = records.metadata.get("recording", {}).get("cautions", "").splitlines()
     lost = [finding("data_lost", text) for text in records.lost]
-    return (*findings_in(kept), *lost, *(finding("recorder_noted", text) for text in noted))
+    return (*findings_in(copied), *lost, *(finding("recorder_noted", text) for text in noted))
 
 
 def provenance_of(records: McapRecords) -> dict[str, Any]:
@@ -299,7 +299,7 @@ def provenance_of(records: McapRecords) -> dict[str, Any]:
     return _json_object(records.metadata.get("provenance", {}).get("json", "{}"), name="provenance")
 
 
-def attached(records: McapRecords, kind: type[T], name: str) -> T:
+def read_attachment(records: McapRecords, kind: type[T], name: str) -> T:
     """A record from its JSON among the attachments."""
     if name not in records.attachments:
         way_out = "copy it again: it was cut off in its header"

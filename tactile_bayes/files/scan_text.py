@@ -30,9 +30,9 @@ import numpy as np
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, in_file
-from tactile_bayes.files.arrays_layout import Stated
+from tactile_bayes.files.arrays_layout import PoseLayout, Stated
 from tactile_bayes.files.named_arrays import Source
-from tactile_bayes.files.tables import NO_SENSEL, Line, counts_up, number, read_text_table, unit_of_time
+from tactile_bayes.files.tables import NO_SENSEL, Line, is_label_sequence, number, read_text_table, unit_of_time
 from tactile_bayes.geometry import BoolArray, FloatArray
 
 # --- Poses: columns by their names, or numbers in a stated layout.
@@ -72,17 +72,17 @@ _IDENTITY: Final = {"matrix": np.eye(4).ravel()[:12], "wxyz": np.eye(7)[3], "xyz
 _LARGEST_MM: Final = 1e7  # NDI writes -3.697314e28 where a tool is not seen
 
 
-def read_poses(path: Path, given: Stated) -> Source:
+def read_poses(path: Path, stated: Stated) -> Source:
     """Read times, places and rotations; rows in which the tool is not seen are left out and counted."""
     with in_file(path):
-        lines, words = read_text_table(path, given.decimal)
+        lines, words = read_text_table(path, stated.decimal)
         header = next((line for line in lines if is_header_of_poses(line)), None)
-        found = _bare(lines, given) if header is None else _named(lines, header, given)
-        return replace(found, notes=(f"poses: {words}", *found.notes))
+        poses = _poses_without_names(lines, stated) if header is None else _poses_by_names(lines, header, stated)
+        return replace(poses, notes=(f"poses: {words}", *poses.notes))
 
 
 def kind_of_column(name: str) -> str:
-    """What a column of a tracker's table holds, by its name; empty for one of anything else."""
+    """Kind of a column of a tracker's table by its name, such as ``qw``; empty for any other column."""
     plain = re.sub(r"[^a-z0-9]", "", re.sub(r"[\[(].*?[\])]", "", name.lower()))
     return _NAMES.get(plain) or _NAMES.get(re.sub(r"(mm|cm|inch|in|deg|rad|ms|us|s)$", "", plain), "")
 
@@ -93,13 +93,13 @@ def is_header_of_poses(line: Line) -> bool:
     return kinds.issuperset(_PLACE) or len(kinds & {"qw", "qx", "azimuth", "elevation"}) > 1
 
 
-def seen(
-    time: FloatArray, numbers: FloatArray, why: Sequence[str], *told: str, layout: str, stated: Mapping[str, Any] = {}
+def visible_poses(
+    time: FloatArray, numbers: FloatArray, reasons: Sequence[str], *notes: str, layout: PoseLayout, **stated: Any
 ) -> Source:
-    """Poses of the rows in which the tool is seen; the others are counted by their reasons, after what is `told`.
+    """Poses of the rows in which the tool is seen; a note after `notes` counts the others by their reasons.
 
-    `numbers` are (m, k) places and then rotations in the layout, or (m, 16) matrices; `why` says why a row has no pose,
-    by its status, and is empty where it has one.
+    `numbers` are (m, k) places and then rotations in the layout, or (m, 16) matrices. `reasons` tell by the status why
+    a row has no pose; empty where the tool is seen. `stated` are fields of `Stated`.
     """
     faults = {
         "without numbers": ~np.isfinite(numbers).all(axis=1),
@@ -107,43 +107,50 @@ def seen(
         "with the identity": is_identity(numbers, layout),
         "without a rotation": ~numbers[:, 3:].any(axis=1) & (layout in ("wxyz", "xyzw")),
     }
-    read = np.select(list(faults.values()), list(faults), "")
-    reasons = [said or str(found) for said, found in zip(why, read, strict=True)]
+    by_numbers = np.select(list(faults.values()), list(faults), "")
+    reasons = [reason or str(fault) for reason, fault in zip(reasons, by_numbers, strict=True)]
     keep = np.array([not reason for reason in reasons], dtype=bool)
     counted = ", ".join(f"{number} {reason}" for reason, number in Counter(filter(None, reasons)).most_common())
     if not keep.any():
         raise BadDataError(f"has no pose in which the tool is seen ({counted})", way_out="give another file")
-    notes = (*told, f"{(~keep).sum()} of {len(keep)} poses left out as gaps: {counted}") if counted else told
+    if counted:
+        notes = (*notes, f"{(~keep).sum()} of {len(keep)} poses left out as gaps: {counted}")
     arrays = {"pose_time_s": time[keep]}
     if layout == "matrix":
         arrays["pose_matrix"] = numbers[keep]
     else:
         arrays |= {"position_mm": numbers[keep, :3], "quaternion_wxyz": numbers[keep, 3:]}
-    return Source(arrays, Stated(**{"pose_layout": layout, **stated}), notes)
+    return Source(arrays, Stated(pose_layout=layout, **stated), notes)
 
 
 def is_identity(numbers: FloatArray, layout: str) -> BoolArray:
-    """Rows that hold what a server goes on sending while a tool is out of sight."""
-    held, same = numbers[:, :12], _IDENTITY[layout]
-    return (held == same).all(axis=1) if held.shape[1] == len(same) else np.zeros(len(held), dtype=bool)
+    """True for rows of the identity, which a server goes on sending while a tool is out of sight."""
+    first_numbers, identity = numbers[:, :12], _IDENTITY[layout]
+    return (
+        (first_numbers == identity).all(axis=1)
+        if first_numbers.shape[1] == len(identity)
+        else np.zeros(len(first_numbers), dtype=bool)
+    )
 
 
-def chosen(names: Sequence[str], given: Stated, *, what: str) -> str:
+def choose_tool(names: Sequence[str], stated: Stated, *, place: str) -> str:
     """The tool that is stated, or the only one."""
-    if given.tool is not None:
-        alike = [name for name in names if given.tool in (name, name.split()[0], name.split("To")[0])]
-        if len(alike) == 1:
-            return alike[0]
-        raise BadDataError(f"has no one tool {given.tool!r} in {what}", way_out=f"--tool is one of {', '.join(names)}")
+    if stated.tool is not None:
+        matches = [name for name in names if stated.tool in (name, name.split()[0], name.split("To")[0])]
+        if len(matches) == 1:
+            return matches[0]
+        raise BadDataError(
+            f"has no one tool {stated.tool!r} in {place}", way_out=f"--tool is one of {', '.join(names)}"
+        )
     if len(names) > 1:
-        raise BadDataError(f"has {len(names)} tools in {what}: {', '.join(names)}", way_out="choose one, --tool NAME")
+        raise BadDataError(f"has {len(names)} tools in {place}: {', '.join(names)}", way_out="choose one, --tool NAME")
     return names[0]
 
 
 # --- Columns by their names.
 
 
-def _named(lines: Sequence[Line], header: Line, given: Stated) -> Source:
+def _poses_by_names(lines: Sequence[Line], header: Line, stated: Stated) -> Source:
     kinds = [kind_of_column(name) for name in header.fields]
     if "qx" not in kinds:
         for i, kind in enumerate(kinds):
@@ -151,61 +158,63 @@ def _named(lines: Sequence[Line], header: Line, given: Stated) -> Source:
                 kinds[i - 3 : i] = ["qx", "qy", "qz"]
     lower = [name.lower() for name in header.fields]
     rotations = (tuple(f"r{i}{j}" for i in range(k, k + 3) for j in range(k, k + 3)) for k in (0, 1))  # row by row
-    turned = next((names for names in rotations if set(names) <= set(lower)), ())
-    kinds = [name if name in turned else kind for name, kind in zip(lower, kinds, strict=True)]
-    layout = "matrix" if turned else "wxyz" if {"qw", "qx", "qy"} & set(kinds) else "euler"
-    names = (*_PLACE, *(turned or _ROTATIONS[layout]))
+    matrix_names = next((names for names in rotations if set(names) <= set(lower)), ())
+    kinds = [name if name in matrix_names else kind for name, kind in zip(lower, kinds, strict=True)]
+    layout: PoseLayout = "matrix" if matrix_names else "wxyz" if {"qw", "qx", "qy"} & set(kinds) else "euler"
+    names = (*_PLACE, *(matrix_names or _ROTATIONS[layout]))
     if not set(names) <= set(kinds):
         what = f"line {header.number} names no {', '.join(sorted(set(names) - set(kinds)))}"
         way_out = "name columns Tx, Ty, Tz and Q0, Qx, Qy, Qz or R00 to R22, or x, y, z and azimuth, elevation, roll"
         raise BadDataError(what, way_out=way_out)
-    if given.pose_layout not in (None, layout):
+    if stated.pose_layout not in (None, layout):
         raise BadDataError(f"line {header.number} names its rotations ({layout})", way_out="leave --pose-layout out")
     rows = [line for line in lines if line.number > header.number]
     if not rows:
         raise BadDataError(f"line {header.number} names columns, and no row stands below it", way_out="give the poses")
-    columns, rows = _of_one_tool(header, kinds, rows, names, given)
-    order = (3, 4, 5, 0, 6, 7, 8, 1, 9, 10, 11, 2) if turned else range(len(names))  # rows of a matrix: R, then place
-    numbers = np.column_stack([_values(rows, columns[names[i]]) for i in order])
+    columns, rows = _columns_and_rows_of_tool(header, kinds, rows, names, stated)
+    order = (
+        (3, 4, 5, 0, 6, 7, 8, 1, 9, 10, 11, 2) if matrix_names else range(len(names))
+    )  # rows of a matrix: R, then place
+    numbers = np.column_stack([_column_values(rows, columns[names[i]]) for i in order])
     if layout == "euler" and _RADIANS.search(header.fields[columns["azimuth"]]):
         numbers[:, 3:] *= 180 / np.pi
-    status = [_field(line, columns["status"]) for line in rows] if "status" in columns else [""] * len(rows)
-    time, unit = _times(rows, columns, header, given)
-    stated: dict[str, Any] = {"pose_time_unit": unit} if unit else {}
+    status = [_cell(line, columns["status"]) for line in rows] if "status" in columns else [""] * len(rows)
+    time, unit = _pose_times(rows, columns, header, stated)
+    header_stated: dict[str, Any] = {"pose_time_unit": unit} if unit else {}
     above = [line.text for line in lines if line.number < header.number]
     lengths = [_UNIT.search(header.fields[columns["x"]].strip()), *map(_LENGTH_LINE.search, above)]
-    if length := next((found[1].lower() for found in lengths if found), ""):
-        stated["length_unit"] = _LENGTHS.get(length, length)
-    elif layout == "euler" and given.length_unit is None:
+    if length := next((match[1].lower() for match in lengths if match), ""):
+        header_stated["length_unit"] = _LENGTHS.get(length, length)
+    elif layout == "euler" and stated.length_unit is None:
         raise BadDataError("does not say the unit of x, y and z", way_out="give --length-unit cm, inch or mm")
-    why = _unseen(status, given) if "status" in columns else status
-    named = f"poses by the names of line {header.number}: {', '.join(header.fields[columns[one]] for one in names)}"
-    return seen(time, numbers, why, named, layout=layout, stated=stated)
+    reasons = _reasons_by_status(status, stated) if "status" in columns else status
+    note = f"poses by the names of line {header.number}: {', '.join(header.fields[columns[one]] for one in names)}"
+    return visible_poses(time, numbers, reasons, note, layout=layout, **header_stated)
 
 
-def _of_one_tool(
-    header: Line, kinds: Sequence[str], rows: Sequence[Line], names: Sequence[str], given: Stated
+def _columns_and_rows_of_tool(
+    header: Line, kinds: Sequence[str], rows: Sequence[Line], names: Sequence[str], stated: Stated
 ) -> tuple[dict[str, int], list[Line]]:
-    """Columns of one tool, which may stand beside others (as NDI writes them) or in rows between theirs."""
+    """Columns and rows of one tool, which may stand beside others (as NDI writes them) or in rows between theirs."""
     sets = [i for i, kind in enumerate(kinds) if kind == names[3]]
     at = sets[0]
     if len(sets) > 1:
         numbered = []
-        for i, one in enumerate(sets, start=1):  # NDI's ToolBox names the tool before its columns
-            ports = [name for name in header.fields[:one] if name.lower().startswith("port ")]
+        for i, column in enumerate(sets, start=1):  # NDI's ToolBox names the tool before its columns
+            ports = [name for name in header.fields[:column] if name.lower().startswith("port ")]
             numbered.append(f"{i} ({' '.join(ports[-1].split())})" if ports else f"{i}")
-        at = sets[numbered.index(chosen(numbered, given, what=f"{len(sets)} groups of columns"))]
+        at = sets[numbered.index(choose_tool(numbered, stated, place=f"{len(sets)} groups of columns"))]
     ahead = not set(_PLACE) & set(kinds[: sets[0]])  # a tool's place stands behind its rotation, not before it
-    columns = {kind: _nearest(kinds, kind, at, pose=kind in names, ahead=ahead) for kind in set(kinds) if kind}
-    held = list(rows)
+    columns = {kind: _nearest_column(kinds, kind, at, pose=kind in names, ahead=ahead) for kind in set(kinds) if kind}
+    tool_rows = list(rows)
     if len(sets) == 1 and "tool" in columns:
-        tool = chosen(list(dict.fromkeys(_field(line, columns["tool"]) for line in rows)), given, what="its rows")
-        held = [line for line in rows if _field(line, columns["tool"]) == tool]
-    return columns, held
+        tool = choose_tool(list(dict.fromkeys(_cell(line, columns["tool"]) for line in rows)), stated, place="its rows")
+        tool_rows = [line for line in rows if _cell(line, columns["tool"]) == tool]
+    return columns, tool_rows
 
 
-def _nearest(kinds: Sequence[str], kind: str, at: int, *, pose: bool, ahead: bool) -> int:
-    """The column of a kind beside another; what is said of a tool stands before its pose."""
+def _nearest_column(kinds: Sequence[str], kind: str, at: int, *, pose: bool, ahead: bool) -> int:
+    """The column of a kind nearest to column `at`; columns about a tool stand before its pose."""
     places = [i for i, one in enumerate(kinds) if one == kind]
     beside = [i for i in places if (i > at) == (ahead and pose)]
     if kind in _PLACE or not pose:
@@ -213,48 +222,52 @@ def _nearest(kinds: Sequence[str], kind: str, at: int, *, pose: bool, ahead: boo
     return min(places, key=lambda i: abs(i - at))
 
 
-def _field(line: Line, column: int) -> str:
+def _cell(line: Line, column: int) -> str:
     return line.fields[column] if column < len(line.fields) else ""
 
 
-def _values(rows: Sequence[Line], column: int) -> FloatArray:
+def _column_values(rows: Sequence[Line], column: int) -> FloatArray:
     """Numbers of a column, NaN where there is none."""
     return np.array([line.values[column] if column < len(line.values) else None for line in rows], dtype=np.float64)
 
 
-def _unseen(status: Sequence[str], given: Stated) -> list[str]:
-    """Why a row has no pose, by its status; empty where the tool is seen."""
+def _reasons_by_status(status: Sequence[str], stated: Stated) -> list[str]:
+    """Reason, by its status, why each row has no pose; empty where the tool is seen."""
     values = Counter(status)
-    good = _SEEN if given.pose_good is None else (given.pose_good.lower(),)
+    good = _SEEN if stated.pose_good is None else (stated.pose_good.lower(),)
     if not any(value.lower() in good for value in values):
-        if given.pose_good is None and len(values) == 1:
+        if stated.pose_good is None and len(values) == 1:
             return [""] * len(status)
-        told = ", ".join(f"{value or 'blank'} ({number} rows)" for value, number in values.most_common(6))
-        raise BadDataError(f"its status is {told}", way_out="give the one in which the tool is seen, --pose-good VALUE")
+        counts_of_status = ", ".join(f"{value or 'blank'} ({number} rows)" for value, number in values.most_common(6))
+        raise BadDataError(
+            f"its status is {counts_of_status}", way_out="give the one in which the tool is seen, --pose-good VALUE"
+        )
     return ["" if value.lower() in good else f"with status {value or 'blank'}" for value in status]
 
 
-def _times(rows: Sequence[Line], columns: Mapping[str, int], header: Line, given: Stated) -> tuple[FloatArray, str]:
+def _pose_times(
+    rows: Sequence[Line], columns: Mapping[str, int], header: Line, stated: Stated
+) -> tuple[FloatArray, str]:
     """Times of all rows and their unit where the header says it."""
     named = ("time", "seconds", "nanoseconds", "frame")
-    held = {name: _values(rows, columns[name]) for name in named if name in columns}
-    if "time" in held and not np.isfinite(held["time"]).any():
-        what = f"its column of times holds {_field(rows[0], columns['time'])!r}, which is no time that is known"
+    columns_read = {name: _column_values(rows, columns[name]) for name in named if name in columns}
+    if "time" in columns_read and not np.isfinite(columns_read["time"]).any():
+        what = f"its column of times holds {_cell(rows[0], columns['time'])!r}, which is no time that is known"
         way_out = "write s, HH:MM:SS.s or YYYY-MM-DD HH:MM:SS.s, or leave it out and give --pose-rate-hz"
         raise BadDataError(what, way_out=way_out)
-    if "time" in held:
-        return _settled(held["time"]), unit_of_time(header.fields[columns["time"]])
-    if "seconds" in held:
-        return _settled(held["seconds"] + 1e-9 * held.get("nanoseconds", 0.0)), "s"
-    if given.pose_rate_hz is None:
-        counted = "frame numbers but no times" if "frame" in held else "no column of times"
-        raise BadDataError(f"has {counted}", way_out="give the tracker's rate, --pose-rate-hz HZ")
-    number = _settled(held["frame"]) if "frame" in held else np.arange(len(rows), dtype=np.float64)
-    return (number - number[0]) / given.pose_rate_hz, "s"
+    if "time" in columns_read:
+        return _interpolated(columns_read["time"]), unit_of_time(header.fields[columns["time"]])
+    if "seconds" in columns_read:
+        return _interpolated(columns_read["seconds"] + 1e-9 * columns_read.get("nanoseconds", 0.0)), "s"
+    if stated.pose_rate_hz is None:
+        lacking = "frame numbers but no times" if "frame" in columns_read else "no column of times"
+        raise BadDataError(f"has {lacking}", way_out="give the tracker's rate, --pose-rate-hz HZ")
+    number = _interpolated(columns_read["frame"]) if "frame" in columns_read else np.arange(len(rows), dtype=np.float64)
+    return (number - number[0]) / stated.pose_rate_hz, "s"
 
 
-def _settled(values: FloatArray) -> FloatArray:
-    """Times of which those of rows without one lie between their neighbours'; such a row has no pose either."""
+def _interpolated(values: FloatArray) -> FloatArray:
+    """Times with those that are missing interpolated; a row without a time has no pose either."""
     known = np.isfinite(values)
     if not known.any():
         raise BadDataError("its column of times has no number", way_out="give --pose-rate-hz in its place")
@@ -265,13 +278,13 @@ def _settled(values: FloatArray) -> FloatArray:
 # --- Numbers without names.
 
 
-def _bare(lines: Sequence[Line], given: Stated) -> Source:
+def _poses_without_names(lines: Sequence[Line], stated: Stated) -> Source:
     rows = [line for line in lines if line.is_numbers and len(line.fields) > 1]
     width = max(Counter(len(line.fields) for line in rows).items(), key=lambda one: one[1])[0] if rows else 0
     values = np.array([line.values for line in rows if len(line.fields) == width], dtype=np.float64)
     if width > _MOST_NUMBERS:
         raise BadDataError(f"has {width} numbers a row, which is no pose", way_out="give a table of poses")
-    layout = given.pose_layout
+    layout = stated.pose_layout
     of_matrix = next((n for n in (16, 12) if width - n in (0, 1)), 0)
     if layout is None and not of_matrix:
         what = f"has {width} numbers a row and no names"
@@ -280,30 +293,30 @@ def _bare(lines: Sequence[Line], given: Stated) -> Source:
     size = of_matrix or 16 if layout == "matrix" else _BARE[layout]
     if not 0 <= width - size <= 3:
         raise BadDataError(f"has {width} numbers a row, and a pose as {layout} has {size}", way_out="correct one")
-    if layout == "euler" and given.length_unit is None:
+    if layout == "euler" and stated.length_unit is None:
         raise BadDataError("does not say the unit of x, y and z", way_out="give --length-unit cm, inch or mm")
     before, numbers = values[:, : width - size], values[:, width - size :]
     keep = np.ones(len(values), dtype=bool)
     for column in before.T:
         stations = [f"{one:g}" for one in np.unique(column)]
         if len(stations) <= _MOST_STATIONS < len(values):
-            keep &= column == float(chosen(stations, given, what="its rows (stations)"))
+            keep &= column == float(choose_tool(stations, stated, place="its rows (stations)"))
     # with a rate stated, a column of whole numbers that rises counts the poses
-    before, rate_hz = before[keep], given.pose_rate_hz
+    before, rate_hz = before[keep], stated.pose_rate_hz
     rising = [i for i, one in enumerate(np.diff(before, axis=0).T) if (one >= 0).all() and one.any()]
     counting = [i for i in rising if rate_hz and (before[:, i] == np.rint(before[:, i])).all()]
     if rate_hz and (counting or not rising):
         number = before[:, counting[-1]] if counting else np.arange(len(before), dtype=np.float64)
         time, unit = (number - number[0]) / rate_hz, {"pose_time_unit": "s"}
-        told = f"counted in column {counting[-1] + 1}" if counting else "counted by rows"
+        time_words = f"counted in column {counting[-1] + 1}" if counting else "counted by rows"
     elif rising:
-        time, unit, told = before[:, rising[-1]], {}, f"in column {rising[-1] + 1}"
+        time, unit, time_words = before[:, rising[-1]], {}, f"in column {rising[-1] + 1}"
     else:
         raise BadDataError(f"has {width} numbers a row, of which none is a time", way_out="give --pose-rate-hz HZ")
-    notes = [f"poses as {layout} from column {width - size + 1} on, times {told}"]
+    notes = [f"poses as {layout} from column {width - size + 1} on, times {time_words}"]
     if lost := sum(line.number > rows[0].number for line in lines) + 1 - len(values):
         notes.append(f"{lost} lines of other than {width} numbers left out as gaps")
-    return seen(time, numbers[keep], [""] * len(time), *notes, layout=layout, stated=unit)
+    return visible_poses(time, numbers[keep], [""] * len(time), *notes, layout=layout, **unit)
 
 
 # --- Frames: one row a frame, or blocks of rows, behind what their program writes first.
@@ -342,39 +355,39 @@ _MOST_OF_POSES: Final = 24  # columns: a table of more holds readings, too
 _SAMPLED: Final = 50
 
 
-def read_frames(path: Path, given: Stated) -> Source:
+def read_frames(path: Path, stated: Stated) -> Source:
     """Read frames and, where the text has them, times, unit and rate; the frames' shape is stated where it is known."""
-    held, words = read_text_table(path, given.decimal)
-    lines = _without_words(held)
+    all_lines, words = read_text_table(path, stated.decimal)
+    lines = _without_word_columns(all_lines)
     if header := next((line for line in lines if is_header_of_poses(line) and len(line.fields) < _MOST_OF_POSES), None):
         what = f"is a table of poses by line {header.number}"
         raise BadDataError(what, way_out="give the frames, and it as --poses")
-    blocks = _blocks(lines, math.prod(given.frame_shape) if given.frame_shape else None)
-    if beside := sum(one == NO_SENSEL for line in blocks[0] for one in line.fields):
-        cells = f"{beside} cells {NO_SENSEL!r} from line {blocks[0][0].number} on"
+    blocks = _blocks(lines, math.prod(stated.frame_shape) if stated.frame_shape else None)
+    if blank_cells := sum(one == NO_SENSEL for line in blocks[0] for one in line.fields):
+        cells = f"{blank_cells} cells {NO_SENSEL!r} from line {blocks[0][0].number} on"
         what = f"has {cells}, which Tekscan writes beside a sensor"
         raise BadDataError(what, way_out="export the rows and columns without them, and give a head of these")
     before = [line for line in lines if line.number < blocks[0][0].number]
-    stated, told = _said(before)
-    notes = [f"frames: {words}", *told]
+    header_stated, header_notes = _stated_by_lines(before)
+    notes = [f"frames: {words}", *header_notes]
     for line in before:
         if len({name[:2].lower() for name in line.fields if _FIELD_NAME.fullmatch(name)}) == 3:
             what = f"is a log of magnetic fields by line {line.number} ({', '.join(line.fields[:4])})"
             raise BadDataError(what, way_out="make pressures of them by your calibration, and give those")
     if len(blocks) > 1 and len(blocks[0]) > 1:
-        return _of_blocks(lines, blocks, stated, notes)
+        return _frames_of_blocks(lines, blocks, header_stated, notes)
     rows = [line for block in blocks for line in block]
     names = before[-1].fields if before and len(before[-1].fields) == len(rows[0].fields) else []
-    return _of_rows(rows, names, given, stated, notes)
+    return _frames_of_rows(rows, names, stated, header_stated, notes)
 
 
-def _without_words(lines: Sequence[Line]) -> Sequence[Line]:
+def _without_word_columns(lines: Sequence[Line]) -> Sequence[Line]:
     """The lines without the words in their columns of words, such as a status beside the readings."""
     several = [line for line in lines if len(line.fields) > 1]
     widths = Counter(len(line.fields) for line in several)
     width = max(widths.items(), key=lambda one: one[0] * one[1], default=(0, 0))[0]
-    held = [line for line in several if len(line.fields) == width]
-    sample = held[:: max(1, len(held) // _SAMPLED)]
+    table_lines = [line for line in several if len(line.fields) == width]
+    sample = table_lines[:: max(1, len(table_lines) // _SAMPLED)]
     words = [i for i in range(width) if 2 * sum(one.values[i] is None for one in sample) > len(sample)]
     if not words or 2 * len(words) > width:
         return lines
@@ -398,15 +411,15 @@ def _blocks(lines: Sequence[Line], taxels: int | None) -> list[list[Line]]:
     blocks: list[list[Line]] = []
     open_block = False
     for line in lines:
-        held = len(line.fields) == width and line.is_numbers
-        if held and open_block and not line.after_blank:
+        is_row = len(line.fields) == width and line.is_numbers
+        if is_row and open_block and not line.after_blank:
             blocks[-1].append(line)
-        elif held:
+        elif is_row:
             blocks.append([line])
-        elif blocks and (held_too := _like_a_row(line, width)):
-            what = f"line {line.number} holds {held_too}, the others {width} numbers"
+        elif blocks and (fault := _fault_of_row(line, width)):
+            what = f"line {line.number} holds {fault}, the others {width} numbers"
             raise BadDataError(what, way_out="give every row one length, numbers alone")
-        open_block = held
+        open_block = is_row
     if taxels is not None and width >= taxels:  # rows of one table, whatever stands between
         return [[line for block in blocks for line in block]]
     lengths = {len(block) for block in blocks}
@@ -417,8 +430,8 @@ def _blocks(lines: Sequence[Line], taxels: int | None) -> list[list[Line]]:
     return blocks if len(lengths) == 1 else [[line for block in blocks for line in block]]
 
 
-def _like_a_row(line: Line, width: int) -> str:
-    """What a line holds that looks like one of the table, and is not; empty for a title and for other lines."""
+def _fault_of_row(line: Line, width: int) -> str:
+    """Fault of a line that looks like a row of the table and is none; empty for a title and for other lines."""
     if len(line.fields) < 2 or line.text.lstrip('" ').lower().startswith(("frame", "time", "@@")):
         return ""
     odd = [field for field, value in zip(line.fields, line.values, strict=True) if value is None]
@@ -427,44 +440,46 @@ def _like_a_row(line: Line, width: int) -> str:
     return repr(odd[0][:30]) if odd else f"{len(line.fields)} numbers"
 
 
-def _said(before: Iterable[Line]) -> tuple[Stated, list[str]]:
-    """What the lines before the numbers say of unit, rate and saturation, and a note for each."""
-    found: dict[str, Any] = {}
+def _stated_by_lines(before: Iterable[Line]) -> tuple[Stated, list[str]]:
+    """Unit, rate and saturation by the lines before the numbers, and a note for each."""
+    values: dict[str, Any] = {}
     notes = []
     for line in before:
-        for option, value in _said_in(line.text):
-            if option not in found:
-                found[option] = value
-                said = f"{value:g}" if isinstance(value, float) else value
-                notes.append(f"{option.replace('_', '-')} {said} by line {line.number}, {line.text.strip()[:40]!r}")
-    if found.get("unit", "counts") == "counts":
-        found.pop("saturation", None)  # of a pressure, where there are none
-    return Stated(**found), notes
+        for option, value in _stated_by_line(line.text):
+            if option not in values:
+                values[option] = value
+                shown = f"{value:g}" if isinstance(value, float) else value
+                notes.append(f"{option.replace('_', '-')} {shown} by line {line.number}, {line.text.strip()[:40]!r}")
+    if values.get("unit", "counts") == "counts":
+        values.pop("saturation", None)  # of a pressure, where there are none
+    return Stated(**values), notes
 
 
-def _said_in(text: str) -> Iterable[tuple[str, Any]]:
+def _stated_by_line(text: str) -> Iterable[tuple[str, Any]]:
     word = _UNIT_LINE.search(text) or _UNIT_WORD.search(text)
     if _FULL_SCALE.search(text):
         yield "unit", "counts"
     elif word and word[1].lower() in _UNITS:
         yield "unit", _UNITS[word[1].lower()]
     for pattern, option in ((_PERIOD_LINE, "rate_hz"), (_RATE_LINE, "rate_hz"), (_SATURATION_LINE, "saturation")):
-        if (found := pattern.search(text)) and (value := float(found[found.lastindex or 1].replace(",", "."))) > 0:
+        if (match := pattern.search(text)) and (value := float(match[match.lastindex or 1].replace(",", "."))) > 0:
             yield option, 1 / value if pattern is _PERIOD_LINE else value
 
 
-def _of_blocks(lines: Sequence[Line], blocks: Sequence[Sequence[Line]], stated: Stated, notes: list[str]) -> Source:
-    """Frames of a block each, with their times where each has one above it."""
+def _frames_of_blocks(
+    lines: Sequence[Line], blocks: Sequence[Sequence[Line]], stated: Stated, notes: list[str]
+) -> Source:
+    """One frame per block, with its time where every block has one above it."""
     frames = np.array([[line.values for line in block] for block in blocks], dtype=np.float64)
     titles = [line for line in reversed(lines) if not line.is_numbers]
     times, before = [], 0
     for start in (block[0].number for block in blocks):
         above = (_TIME_LINE.search(line.text) for line in titles if before < line.number < start)
-        found = next(filter(None, above), None)
-        time = None if found is None else number(found[1], decimal_comma=True)
-        if found is None or time is None:
+        match = next(filter(None, above), None)
+        time = None if match is None else number(match[1], decimal_comma=True)
+        if match is None or time is None:
             break
-        times.append(time * (0.001 if (found[2] or "").lower() == "ms" else 1.0))
+        times.append(time * (0.001 if (match[2] or "").lower() == "ms" else 1.0))
         before = start
     arrays = {"frames": frames}
     if len(times) == len(frames):
@@ -476,20 +491,22 @@ def _of_blocks(lines: Sequence[Line], blocks: Sequence[Sequence[Line]], stated: 
     return Source(arrays, stated, tuple(notes))
 
 
-def _of_rows(rows: Sequence[Line], names: Sequence[str], given: Stated, stated: Stated, notes: list[str]) -> Source:
+def _frames_of_rows(
+    rows: Sequence[Line], names: Sequence[str], options: Stated, stated: Stated, notes: list[str]
+) -> Source:
     values = np.array([line.values for line in rows], dtype=np.float64)
-    if counts_up(values[0][np.isfinite(values[0])]) and len(rows) > 1:
+    if is_label_sequence(values[0][np.isfinite(values[0])]) and len(rows) > 1:
         notes.append(f"line {rows[0].number} counts {values[0, -2]:g}, {values[0, -1]:g}: taken for labels")
         values = values[1:]
-    shape = given.frame_shape
+    shape = options.frame_shape
     taxels = math.prod(shape) if shape else None
     if taxels is not None and len(values) == taxels and values.shape[1] < taxels:
         notes.append(f"{taxels} rows of {values.shape[1]} numbers: rows are read as taxels, columns as frames")
         return Source({"frames": values.T}, stated, tuple(notes))
-    if shape is not None and values.shape[1] - (given.skip_columns or 0) == shape[1] and len(values) % shape[0] == 0:
+    if shape is not None and values.shape[1] - (options.skip_columns or 0) == shape[1] and len(values) % shape[0] == 0:
         notes.append(f"{len(values)} rows of {shape[1]} numbers: each {shape[0]} are read as a frame")
         return Source({"frames": values[:, -shape[1] :].reshape(-1, *shape)}, stated, tuple(notes))
-    time, readings = _columns(values, list(names), taxels, given)
+    time, readings = _time_and_readings(values, list(names), taxels, options)
     arrays = {"frames": values[:, readings]}
     if len(readings) < values.shape[1]:
         notes.append(f"{len(readings)} of {values.shape[1]} columns are readings, from column {readings[0] + 1} on")
@@ -503,14 +520,16 @@ def _of_rows(rows: Sequence[Line], names: Sequence[str], given: Stated, stated: 
     return Source(arrays, stated, tuple(notes))
 
 
-def _columns(values: FloatArray, names: list[str], taxels: int | None, given: Stated) -> tuple[int | None, list[int]]:
+def _time_and_readings(
+    values: FloatArray, names: list[str], taxels: int | None, stated: Stated
+) -> tuple[int | None, list[int]]:
     """Columns of times (None without) and of readings: as stated, by their names, else by how many there are."""
     width = values.shape[1]
     plain = [_PLAIN.sub("", name.strip()).strip(" _") for name in names]
     timed = [i for i, name in enumerate(plain) if _TIME_NAME.fullmatch(name) or _TIME_NAME.fullmatch(names[i])]
     others = [i for i, name in enumerate(plain) if _OTHER_NAME.search(name) or kind_of_column(names[i])]
     others += [i for i in range(width) if i not in others and np.isnan(values[:, i]).all()]
-    first = given.skip_columns
+    first = stated.skip_columns
     if first is None and (timed or others):
         readings = [i for i in range(width) if i not in (*timed, *others)]
         if taxels is not None and len(readings) != taxels:  # by names that differ by their numbers only
@@ -519,8 +538,8 @@ def _columns(values: FloatArray, names: list[str], taxels: int | None, given: St
             readings = [i for i, stem in enumerate(stems) if alike == [stem]] or readings
         if taxels is None or len(readings) == taxels:
             return (timed[0] if timed else None), readings
-        told = ", ".join(repr(one) for one in (*names[:3], *names[-1:]))
-        what = f"names {width} columns ({told}), {len(readings)} of which may be readings, for {taxels} taxels"
+        names_shown = ", ".join(repr(one) for one in (*names[:3], *names[-1:]))
+        what = f"names {width} columns ({names_shown}), {len(readings)} of which may be readings, for {taxels} taxels"
         raise BadDataError(what, way_out=_LAYOUTS)
     if first is None:
         first = 0 if taxels is None else width - taxels
@@ -532,6 +551,6 @@ def _columns(values: FloatArray, names: list[str], taxels: int | None, given: St
     # of the columns before the readings the last that rises, or the last (one that falls is told when times are
     # checked), and none that only counts
     steps = np.diff(values[:, :first], axis=0).T
-    others = [i for i, one in enumerate(steps) if given.time_unit or not one.size or (one != 1).any()]
+    others = [i for i, one in enumerate(steps) if stated.time_unit or not one.size or (one != 1).any()]
     rising = [i for i in others if (steps[i] >= 0).all() and steps[i].any()]
-    return next(reversed(rising), None if given.rate_hz else next(reversed(others), None)), readings
+    return next(reversed(rising), None if stated.rate_hz else next(reversed(others), None)), readings

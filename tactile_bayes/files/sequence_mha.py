@@ -20,7 +20,7 @@ from tactile_bayes.files.arrays_layout import Stated
 from tactile_bayes.files.named_arrays import Source
 from tactile_bayes.files.npz import Arrays
 from tactile_bayes.files.reading import NETCDF_BYTES, check_limit, decoding, read_bytes, unpacked_limit
-from tactile_bayes.files.scan_text import chosen, seen
+from tactile_bayes.files.scan_text import choose_tool, visible_poses
 from tactile_bayes.geometry import FloatArray
 
 _LAST_KEY: Final = re.compile(rb"^ElementDataFile *= *(.*?)\r?\n", re.MULTILINE)
@@ -44,7 +44,7 @@ def is_sequence(path: Path) -> bool:
     return path.suffix.lower() == ".mha"
 
 
-def read_sequence(path: Path, given: Stated, *, frames: bool) -> Source:
+def read_sequence(path: Path, stated: Stated, *, frames: bool) -> Source:
     """Read the poses, and with `frames` the images and their times; see `files.scan_text.read_poses`."""
     data = read_bytes(path, most=NETCDF_BYTES)
     with in_file(path):
@@ -53,12 +53,12 @@ def read_sequence(path: Path, given: Stated, *, frames: bool) -> Source:
             raise BadDataError("has no numbers behind a line ElementDataFile = LOCAL", way_out="save it as one .mha")
         with decoding("is no metafile", way_out=_COPY_AGAIN):
             keys = dict(_LINE.findall(data[: last.end()].decode("utf-8")))
-        found = _poses(keys, given)
-        return replace(found, arrays={**found.arrays, **_frames(keys, data[last.end() :])}) if frames else found
+        poses = _poses(keys, stated)
+        return replace(poses, arrays={**poses.arrays, **_frames(keys, data[last.end() :])}) if frames else poses
 
 
-def _each(keys: dict[str, str], name: str, number: int) -> list[str]:
-    """A value of every frame, empty where it has none."""
+def _values_per_frame(keys: dict[str, str], name: str, number: int) -> list[str]:
+    """A key's value for each frame; empty where the frame has none."""
     return [keys.get(f"Seq_Frame{i:04d}_{name}", "") for i in range(number)]
 
 
@@ -69,20 +69,20 @@ def _numbers(texts: list[str], width: int) -> FloatArray:
         return np.array([[float(one) for one in row] if len(row) == width else [np.nan] * width for row in rows])
 
 
-def _poses(keys: dict[str, str], given: Stated) -> Source:
-    held = [one for key in keys if (one := _OF_FRAME.fullmatch(key))]
-    number = len({one[1] for one in held})
-    tools = dict.fromkeys(one[2] for one in held if one[2].endswith("Transform"))
+def _poses(keys: dict[str, str], stated: Stated) -> Source:
+    frame_keys = [one for key in keys if (one := _OF_FRAME.fullmatch(key))]
+    frame_count = len({one[1] for one in frame_keys})
+    tools = dict.fromkeys(one[2] for one in frame_keys if one[2].endswith("Transform"))
     if not tools:
         raise BadDataError("has no transforms of frames", way_out="give poses that were recorded with the frames")
-    tool = chosen([name.removesuffix("Transform") for name in tools], given, what="its transforms")
-    status = _each(keys, f"{tool}TransformStatus", number)
-    why = ["" if one in ("OK", "") else f"with status {one}" for one in status]
-    time = _numbers(_each(keys, "Timestamp", number), 1)[:, 0]
+    tool = choose_tool([name.removesuffix("Transform") for name in tools], stated, place="its transforms")
+    status = _values_per_frame(keys, f"{tool}TransformStatus", frame_count)
+    reasons = ["" if one in ("OK", "") else f"with status {one}" for one in status]
+    time = _numbers(_values_per_frame(keys, "Timestamp", frame_count), 1)[:, 0]
     if not np.isfinite(time).all():
         raise BadDataError("has frames without a time", way_out="give the times, Seq_Frame0000_Timestamp")
-    matrices = _numbers(_each(keys, f"{tool}Transform", number), 16)
-    return seen(time, matrices, why, f"poses by {tool}Transform", layout="matrix", stated={"pose_time_unit": "s"})
+    matrices = _numbers(_values_per_frame(keys, f"{tool}Transform", frame_count), 16)
+    return visible_poses(time, matrices, reasons, f"poses by {tool}Transform", layout="matrix", pose_time_unit="s")
 
 
 def _frames(keys: dict[str, str], data: bytes) -> Arrays:
@@ -101,5 +101,5 @@ def _frames(keys: dict[str, str], data: bytes) -> Arrays:
     if len(shape) != 3 or len(data) != size or min(shape) < 1:
         what = f"has DimSize {keys['DimSize']} of {kind} and {len(data)} bytes"
         raise BadDataError(what, way_out="give columns, rows and frames, unpacked or packed by zlib")
-    time = _numbers(_each(keys, "Timestamp", shape[0]), 1)[:, 0]
+    time = _numbers(_values_per_frame(keys, "Timestamp", shape[0]), 1)[:, 0]
     return {"frames": np.frombuffer(data, dtype=kind).reshape(shape), "frame_time_s": time}

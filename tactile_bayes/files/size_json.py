@@ -149,9 +149,9 @@ def _eq6_document(calibration: SizeCalibration) -> dict[str, Any]:
         axis: AxisCalibration = getattr(calibration, name)
         k, draws = len(COEFFICIENTS), axis.draws
         covariance = np.cov(draws.T) if len(draws) > 1 else np.zeros((k, k))
-        own = {part: getattr(axis, part) for part in AxisCalibration.__struct_fields__}
+        fields = {part: getattr(axis, part) for part in AxisCalibration.__struct_fields__}
         moments = {"mean": draws.mean(axis=0), "covariance": covariance}
-        document[name] = to_plain({"coefficients": COEFFICIENTS, **moments, **own})
+        document[name] = to_plain({"coefficients": COEFFICIENTS, **moments, **fields})
     return document
 
 
@@ -250,12 +250,12 @@ class RepeatabilityFile(Record, kw_only=True, omit_defaults=True):
 
     def spread(self, digest: str = "") -> Repeatability:
         """The spread that a size uses, with the hash of the file it is from."""
-        used = self.calibration
+        calibration = self.calibration
         return Repeatability(
             sd=self.between_map_sd,
-            calibration=used.name,
-            calibration_sha256=used.sha256,
-            normalise=used.normalise,
+            calibration=calibration.name,
+            calibration_sha256=calibration.sha256,
+            normalise=calibration.normalise,
             sha256=digest,
             **{name: getattr(self, name) for name in SPREAD},
         )
@@ -269,5 +269,5 @@ class RepeatabilityFile(Record, kw_only=True, omit_defaults=True):
 
 def read_repeatability(path: Path) -> Repeatability:
     """Read what `RepeatabilityFile.write` wrote."""
-    found = read_record(path, RepeatabilityFile, way_out="give a file of `calibrate repeatability`")
-    return found.spread(sha256(path))
+    file = read_record(path, RepeatabilityFile, way_out="give a file of `calibrate repeatability`")
+    return file.spread(sha256(path))

@@ -52,9 +52,9 @@ def read_text(path: Path) -> str:
     return decoded(data, path=path, way_out=_AS_UTF8, as_utf8=_AS_UTF8)
 
 
-def _raw(path: Path, text: str) -> RawTable:
+def _split_cells(path: Path, text: str) -> RawTable:
     """Split CSV text into cells; blank rows, and columns without a name or any filled cell, are left out."""
-    separator = separator_in(text)
+    separator = csv_separator(text)
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
     rows: list[tuple[int, list[str]]] = []
     before = 0
@@ -76,7 +76,7 @@ def _raw(path: Path, text: str) -> RawTable:
     return RawTable(path, header, body, separator, separator != "," and not all(map(may_be_thousands, commas)))
 
 
-def separator_in(text: str) -> str:
+def csv_separator(text: str) -> str:
     """Comma, semicolon or tab: one of which the first two lines have as many outside quotes, else most in the first.
 
     So names like ``size (cm, by pathology)`` do not make a table with semicolons one with commas.
@@ -94,7 +94,7 @@ def header_of(source: Path | Sheet) -> list[str]:
     """The names in a table's first line; none where the file is of anything else."""
     text = source.text if isinstance(source, Sheet) else first_bytes(source, _LOOKED_AT).decode("utf-8-sig", "replace")
     with contextlib.suppress(csv.Error):
-        return [name.strip() for name in next(csv.reader(io.StringIO(text), delimiter=separator_in(text)), [])]
+        return [name.strip() for name in next(csv.reader(io.StringIO(text), delimiter=csv_separator(text)), [])]
     return []
 
 
@@ -159,7 +159,7 @@ def read_table(source: Path | Sheet, schema_name: str) -> Table:
     columns: dict[str, list[Any]] = {name: [] for name in fields}
     keys = schema.get("primaryKey", [])
     with in_file(path):
-        raw = _raw(path, text)
+        raw = _split_cells(path, text)
         header, body = raw.header, raw.body
         if not header:
             raise BadDataError("is empty", way_out=f"its first line must name columns: {_names(fields)}")
@@ -206,7 +206,7 @@ class RawTable(Record):
     def number(self, line: int, column: str, text: str) -> float:
         """Parse a finite number; an error names its cell."""
         try:
-            return _parse_number(_with_point(text) if self.decimal_comma else text, {"name": column})
+            return _parse_number(_with_decimal_point(text) if self.decimal_comma else text, {"name": column})
         except BadDataError as refusal:
             raise self.error(line, column, refusal.what, way_out=refusal.way_out) from None
 
@@ -214,7 +214,7 @@ class RawTable(Record):
 def read_raw(path: Path) -> RawTable:
     """Read the cells of any CSV table as text; for the errors see `read_table`."""
     with in_file(path):
-        table = _raw(path, read_text(path))
+        table = _split_cells(path, read_text(path))
         if not table.body:
             raise BadDataError("holds no rows", way_out="give a header and at least one row")
         for name in table.header:
@@ -273,19 +273,19 @@ def _check_header(header: Sequence[str], fields: Mapping[str, Any], *, wide: str
 
 def _advice_on_column(name: str, header: Sequence[str], fields: Mapping[str, Any]) -> str:
     """Advice on a name that is not known: one of another table (trial and excision exchanged), or mistyped."""
-    for kind, held in (("trial", "readings"), ("excision", "sizes after excision")):
-        other = {one["name"]: one for one in load_schema(f"{kind}.table.json")["fields"]}
-        needed = {name for name, one in other.items() if _is_required(one)}
-        if list(other) != list(fields) and needed <= set(header) <= set(other):
-            return f"this is the table of {held}: give the other one here"
+    for kind, contents in (("trial", "readings"), ("excision", "sizes after excision")):
+        fields_of_other = {one["name"]: one for one in load_schema(f"{kind}.table.json")["fields"]}
+        needed = {name for name, one in fields_of_other.items() if _is_required(one)}
+        if list(fields_of_other) != list(fields) and needed <= set(header) <= set(fields_of_other):
+            return f"this is the table of {contents}: give the other one here"
     name = name.strip().lower()
     stem, _, unit = name.rpartition("_")
     if unit in MM_PER_UNIT and unit != "mm" and f"{stem}_mm" in fields:
         return f"convert it to {stem}_mm (multiply by {MM_PER_UNIT[unit]:g})"
-    wanted = [field for field in fields if field not in header]
-    if f"{name}_mm" in wanted:
+    columns_left = [field for field in fields if field not in header]
+    if f"{name}_mm" in columns_left:
         return f"did you mean {name}_mm, in millimetres?"
-    near = difflib.get_close_matches(name, wanted, n=1, cutoff=0.7)
+    near = difflib.get_close_matches(name, columns_left, n=1, cutoff=0.7)
     return f"did you mean {near[0]}?" if near else f"remove it; the columns are {_names(fields)}"
 
 
@@ -308,8 +308,8 @@ def _parse_cell(text: str, field: Mapping[str, Any], *, decimal_comma: bool) -> 
         what = f"{_shown(text)} has blanks or unprintable characters around or in it"
         raise BadDataError(what, way_out="remove them")
     if decimal_comma and field["type"] == "number":
-        text = _with_point(text)
-    value = _parsed(text, field)
+        text = _with_decimal_point(text)
+    value = _parse_by_type(text, field)
     rules = field.get("constraints", {})
     if value == 0 and "exclusiveMinimum" in rules and "ifZero" in field:
         raise BadDataError("is 0", way_out=field["ifZero"])
@@ -334,7 +334,7 @@ _LIMITS: Final[Mapping[str, tuple[Callable[[Any, Any], bool], str]]] = {
 }
 
 
-def _parsed(text: str, field: Mapping[str, Any]) -> Any:
+def _parse_by_type(text: str, field: Mapping[str, Any]) -> Any:
     """A cell by the type of its field."""
     match field["type"]:
         case "string":
@@ -374,7 +374,7 @@ def _parse_number(text: str, field: Mapping[str, Any]) -> float:
     raise BadDataError(f"{_shown(text)} is not a number", way_out=f"write digits only{unit}; {_blank_advice(field)}")
 
 
-def _with_point(text: str) -> str:
+def _with_decimal_point(text: str) -> str:
     """A number of a table with decimal commas, with a point; one that has a point may mean thousands by it."""
     if "." in text:
         what = f"{_shown(text)} has a point, and other numbers have decimal commas"
@@ -464,8 +464,8 @@ def number(text: str, *, decimal_comma: bool) -> float | None:
         return 3600 * int(clock[1] or 0) + 60 * int(clock[2]) + float(clock[3])
     with contextlib.suppress(ValueError):  # of a day that there is not
         if _DATED.fullmatch(text):
-            found = datetime.fromisoformat(text)
-            return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
+            moment = datetime.fromisoformat(text)
+            return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
     return None
 
 
@@ -487,20 +487,20 @@ def read_text_table(path: Path, decimal: str | None = None) -> tuple[list[Line],
     Where no `decimal` (``"point"`` or ``"comma"``) is stated, commas that may separate thousands are refused.
     """
     texts = read_lines(path)
-    separator = separator_of(texts)
+    separator = detect_separator(texts)
     if not separator:
         raise BadDataError("holds no table of numbers", way_out="give one frame or pose a line", path=str(path))
     split = []
     for i, one in enumerate(texts, start=1):
         if one.strip():
-            fields = fields_of(one.lstrip("# "), separator)  # numpy writes it before names
+            fields = split_fields(one.lstrip("# "), separator)  # numpy writes it before names
             if one.lstrip().startswith("#") and any(_is_number(field, ()) for field in fields):
-                fields = fields_of(one, separator)
+                fields = split_fields(one, separator)
             while len(fields) > 1 and not fields[-1]:
                 fields.pop()
             split.append((i, one, fields, i > 1 and not texts[i - 2].strip()))
     way_out = "state which, --decimal comma" if decimal is None else ""
-    comma = bool(with_comma((fields for _, _, fields, _ in split), way_out=way_out)) and decimal != "point"
+    comma = bool(comma_numbers((fields for _, _, fields, _ in split), way_out=way_out)) and decimal != "point"
     lines = [
         Line(i, text, fields, [number(one, decimal_comma=comma) for one in fields], after)
         for i, text, fields, after in split
@@ -508,7 +508,7 @@ def read_text_table(path: Path, decimal: str | None = None) -> tuple[list[Line],
     return lines, f"fields between {_SEPARATORS[separator]}{', decimal commas' if comma else ''}"
 
 
-def separator_of(texts: Sequence[str], marks: Sequence[str] = ()) -> str:
+def detect_separator(texts: Sequence[str], marks: Sequence[str] = ()) -> str:
     """The separator that makes most numbers of lines and least else; empty where none makes two of any.
 
     `marks` are words for no value, beside those that are known.
@@ -517,14 +517,14 @@ def separator_of(texts: Sequence[str], marks: Sequence[str] = ()) -> str:
     sample = filled[:: max(1, len(filled) // _SAMPLED)]
     made = {}  # numbers, and other fields as a negative number, in the lines that it makes lines of a table
     for separator in _SEPARATORS:
-        rows = [row for text in sample if _of_numbers(row := fields_of(text, separator), marks)]
+        rows = [row for text in sample if _is_number_row(row := split_fields(text, separator), marks)]
         numbers = sum(_is_number(field, marks) for row in rows for field in row)
         made[separator] = numbers, numbers - sum(map(len, rows))
     best = max(made, key=made.__getitem__)
     return best if made[best][0] else ""
 
 
-def _of_numbers(fields: Sequence[str], marks: Sequence[str]) -> bool:
+def _is_number_row(fields: Sequence[str], marks: Sequence[str]) -> bool:
     """True for a line of a table: two numbers or more, and little else."""
     good = sum(_is_number(field, marks) for field in fields)
     return good > 1 and good >= _LEAST_NUMBERS * len(fields)
@@ -534,19 +534,19 @@ def _is_number(text: str, marks: Sequence[str]) -> bool:
     return text in marks or may_be_thousands(text) or number(text, decimal_comma=True) is not None
 
 
-def fields_of(text: str, separator: str) -> list[str]:
+def split_fields(text: str, separator: str) -> list[str]:
     """Fields of a line without the blanks around them."""
     text = " ".join(_TOUCHING.sub(r"\1 ", text).split()) if separator == " " else text
     with decoding("is not a table of text", way_out="give a table of numbers, such as .csv"):
         return [one.strip() for one in next(csv.reader([text], delimiter=separator, skipinitialspace=True), [])]
 
 
-def with_comma(rows: Iterable[Sequence[str]], marks: Sequence[str] = (), *, way_out: str) -> list[str]:
+def comma_numbers(rows: Iterable[Sequence[str]], marks: Sequence[str] = (), *, way_out: str) -> list[str]:
     """Fields of the table's lines that are numbers with a decimal comma, or with commas between thousands.
 
     All of them may not be of the latter, where there is a way out of that.
     """
-    fields = (field for row in rows if _of_numbers(row, marks) for field in row)
+    fields = (field for row in rows if _is_number_row(row, marks) for field in row)
     commas = [one for one in fields if _ANY_DECIMAL_COMMA.fullmatch(one) or may_be_thousands(one)]
     if way_out and commas and all(map(may_be_thousands, commas)):
         first = commas[0]
@@ -555,13 +555,13 @@ def with_comma(rows: Iterable[Sequence[str]], marks: Sequence[str] = (), *, way_
     return commas
 
 
-def counts_up(line: FloatArray) -> bool:
+def is_label_sequence(line: FloatArray) -> bool:
     """True for labels of rows or columns."""
     return len(line) >= FEWEST_LABELS and line[0] in (0.0, 1.0) and bool((np.diff(line) == 1.0).all())
 
 
 def unit_of_time(name: str) -> str:
     """Unit in the name of a column of times; empty where it says none."""
-    found = _UNIT_OF_TIME.search(name.strip())
-    unit = found[1].lower() if found else ""
+    match = _UNIT_OF_TIME.search(name.strip())
+    unit = match[1].lower() if match else ""
     return {"msec": "ms", "µs": "us", "sec": "s", "secs": "s", "seconds": "s"}.get(unit, unit)

@@ -13,7 +13,7 @@ from repeated_exams import estimate_document
 import tactile_bayes as tb
 from tactile_bayes.errors import UsageError
 from tactile_bayes.exports.run import Outputs
-from tactile_bayes.files.atomic import Format, check_suffix, given_twice, same_file
+from tactile_bayes.files.atomic import Format, check_suffix, first_duplicate, same_file
 from tactile_bayes.report.pages import PageFiles
 
 NAMES: dict[str, Callable[[Path, Path], object]] = {
@@ -30,8 +30,8 @@ def test_a_link_is_the_file_that_it_leads_to(kind: str, tmp_path: Path) -> None:
     NAMES[kind](name, file)
     assert same_file(file, name)
     assert not same_file(file, other)
-    assert given_twice([file, other, name]) == name
-    assert given_twice([file, other]) is None
+    assert first_duplicate([file, other, name]) == name
+    assert first_duplicate([file, other]) is None
 
 
 def test_a_file_that_does_not_exist_is_known_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,7 +27,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.arrays_layout import ArrayMap
 from tactile_bayes.files.documents import parse_toml
-from tactile_bayes.files.imports import import_arrays, of_head, of_poses, read_arrays
+from tactile_bayes.files.imports import head_source, import_arrays, pose_source, read_arrays
 from tactile_bayes.files.named_arrays import array_template, read_named
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.forward.scene import Scene
@@ -116,7 +116,7 @@ def test_the_day_of_a_check_is_that_of_the_head_that_stands(good: Arrays, scan: 
     as_npz(tmp_path / "exam.npz", good)
     checked = replace(scan.head, checked_on="2026-03-01")
     for last in (checked, scan.head):
-        heads = [of_head(checked), of_head(last)]
+        heads = [head_source(checked), head_source(last)]
         assert import_arrays(tmp_path / "exam.npz", ArrayMap(), heads)[0].head.checked_on == last.checked_on
 
 
@@ -465,7 +465,7 @@ def test_poses_apart_in_arrays_are_named_for_what_they_are(
     with (tmp_path / name).open("wb") as file:
         (np.savez if name.endswith("z") else np.save)(file, pressed["position_mm"])
     with pytest.raises(BadDataError, match=words):
-        of_poses(tmp_path / name, ArrayMap())
+        pose_source(tmp_path / name, ArrayMap())
 
 
 def test_what_is_called_otherwise_is_listed_beside_what_is_missing(pressed: Arrays, tmp_path: Path) -> None:

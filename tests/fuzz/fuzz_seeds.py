@@ -251,12 +251,12 @@ def _read_arrays(path: Path) -> object:
 
 def _read_frames(path: Path) -> object:
     from tactile_bayes.files.arrays_layout import ArrayMap
-    from tactile_bayes.files.imports import import_arrays, of_head, of_poses
+    from tactile_bayes.files.imports import head_source, import_arrays, pose_source
     from tactile_bayes.scans import HeadGeometry
 
     y, x = np.meshgrid(2.0 * np.arange(5), 2.0 * np.arange(4))
     head = HeadGeometry(np.stack([x, y, 0 * x], axis=-1), 2.0, np.eye(4))
-    return import_arrays(path, ArrayMap(unit="kPa"), [of_head(head), of_poses(path, ArrayMap())])
+    return import_arrays(path, ArrayMap(unit="kPa"), [head_source(head), pose_source(path, ArrayMap())])
 
 
 def _mat(arrays: Mapping[str, Any], *, packed: bool) -> bytes:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tactile_bayes.actions.show import describe
 from tactile_bayes.errors import EXIT_BAD_DATA, BadDataError
 from tactile_bayes.files.documents import load_schema
-from tactile_bayes.files.tables import check_references, read_table, separator_in
+from tactile_bayes.files.tables import check_references, csv_separator, read_table
 
 TRIAL = "trial.table.json"
 EXCISION = "excision.table.json"
@@ -80,7 +80,7 @@ def test_a_spreadsheet_of_another_country_is_read(tmp_path: Path, separator: str
     ],
 )
 def test_the_separator_is_told_by_two_lines(text: str, separator: str) -> None:
-    assert separator_in(text) == separator
+    assert csv_separator(text) == separator
 
 
 def test_size_table_needs_three_columns(tmp_path: Path) -> None:
