@@ -1,13 +1,12 @@
 """Wide trial tables (one row per patient or mass, as REDCap exports them), read by a column mapping in TOML.
 
-The mapping says which column holds what; nothing is guessed. A blank cell is `not_done` unless the mapping gives the
-word that the table writes for a mass that was looked for and not found.
+The mapping names the column of each reading; nothing is guessed. A blank cell is `not_done`; for a mass that was looked
+for and not found the mapping gives the table's word.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
@@ -15,7 +14,7 @@ from tactile_bayes.declarations import Meta, Record
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.documents import parse_record, parse_toml
 from tactile_bayes.files.reading import TOML_BYTES, read_text
-from tactile_bayes.files.tables import RawTable, Table, composed, parse_date, read_raw
+from tactile_bayes.files.tables import RawTable, Table, check_unique, composed, read_raw
 from tactile_bayes.presets import MM_PER_UNIT
 
 _WAY_OUT: Final = "see the column mapping in the tutorial"
@@ -93,7 +92,7 @@ def read_wide_excision(path: Path, mapping: ColumnMap, excision: ExcisionColumns
             "ex_vivo_mm": row.size(excision.size, factor),
             "ex_vivo_second_mm": row.number(excision.second, factor),
             "sd_mm": row.number(excision.sd, factor),
-            "date": row.day(excision.date),
+            "date": row.value(excision.date, "date"),
         }
         for row in rows
     ]
@@ -101,20 +100,15 @@ def read_wide_excision(path: Path, mapping: ColumnMap, excision: ExcisionColumns
 
 
 def _table(path: Path, rows: Sequence[Mapping[str, Any]], keys: Sequence[str], *, lines: list[int]) -> Table:
-    """Rows as columns; no two may have the same keys."""
+    """Table of rows; no two may have the same keys."""
     columns = {name: [row[name] for row in rows] for name in rows[0]}
     table = Table(path=path, columns=columns, line_numbers=lines)
-    first: dict[tuple[Any, ...], int] = {}
-    for row, key in enumerate(zip(*(columns[name] for name in keys), strict=True)):
-        if (before := first.setdefault(key, row)) != row:
-            what = f"{' + '.join(map(str, key))} stands on line {table.line_numbers[before]} already"
-            way_out = "remove one row" if "modality" in keys else "remove one, or name the column of the mass"
-            raise table.error(row, "patient", what, way_out=way_out)
+    check_unique(table, keys, way_out="remove one row, or name the column of the mass")
     return table
 
 
 def read_mapping(path: Path) -> ColumnMap:
-    """Read the mapping, with every text in one spelling; for the errors see `files.documents.read_record`."""
+    """Read the mapping, with every text in NFC; for the errors see `files.documents.read_record`."""
     with in_file(path):
         text = composed(read_text(path, most=TOML_BYTES, way_out=_WAY_OUT))
         return parse_record(parse_toml(text, way_out=_WAY_OUT), ColumnMap, path=path)
@@ -135,14 +129,18 @@ class _Row(NamedTuple):
         mass = "1" if mapping.mass is None else self.cells[mapping.mass]
         return {"patient": self.cells[mapping.patient], "mass": mass}
 
+    def value(self, column: str | None, kind: Literal["number", "date"]) -> Any:
+        """A number or date; None without its column or cell."""
+        return self.table.cell(self.line, column, self.cells[column], kind) if column else None
+
     def number(self, column: str | None, factor: float) -> float | None:
         """A number in mm; None without its column or cell."""
-        text = self.cells[column] if column else ""
-        return factor * self.table.number(self.line, str(column), text) if text else None
+        value = self.value(column, "number")
+        return None if value is None else factor * value
 
     def size(self, column: str, factor: float) -> float:
         """A size in mm, which is above 0."""
-        value = self.table.number(self.line, column, self.cells[column])
+        value: float = self.value(column, "number")
         if value == 0:
             ask = 'does 0 mean that the mass was not found? then add not_detected = ["0"] to the mapping'
             raise self.table.error(self.line, column, "is 0", way_out=ask)
@@ -150,19 +148,9 @@ class _Row(NamedTuple):
             raise self.table.error(self.line, column, f"is {value:g}", way_out="a size is above 0")
         return factor * value
 
-    def day(self, column: str | None) -> date | None:
-        """A date; None without its column or cell."""
-        text = self.cells[column] if column else ""
-        try:
-            return parse_date(text) if text else None
-        except ValueError:
-            raise self.table.error(
-                self.line, str(column), f"{text!r} is no date", way_out="write it as 2026-03-01"
-            ) from None
-
 
 def _rows(path: Path, mapping: ColumnMap, names: Sequence[str | None]) -> list[_Row]:
-    """The rows with their names and cells in one spelling; the mapping's columns must be there."""
+    """Rows with names and cells in NFC; the mapping's columns must be there."""
     table = read_raw(path)
     header = [composed(name) for name in table.header]
     for name in filter(None, (*mapping.key_columns(), *names)):
@@ -196,7 +184,7 @@ def _reading(row: _Row, reading: ReadingColumns, mapping: ColumnMap) -> dict[str
         "probability": probability,
         "reader": (row.cells[reading.reader] or None) if reading.reader else None,
         "visit": reading.visit,
-        "date": row.day(reading.date),
+        "date": row.value(reading.date, "date"),
         "posterior": None,
         "synthetic": mapping.synthetic,
     }

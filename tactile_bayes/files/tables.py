@@ -1,4 +1,4 @@
-"""Tables of text: CSV under a schema, cell by cell, and lines of numbers as instruments export them."""
+"""Tables of text: CSV under a schema, and tables of numbers as instruments export them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, date, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -33,12 +33,12 @@ DECIMAL_COMMA: Final = re.compile(r"[+-]?[0-9]+,[0-9]+")
 _THOUSANDS: Final = re.compile(r"[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+")
 _QUOTED: Final = re.compile(r'"[^"]*"')
 _AS_UTF8: Final = "save it as CSV UTF-8"
-_LOOKED_AT: Final = 4096  # bytes of a file for its header
+_MOST_HEADER: Final = 4096  # bytes
 _EXPORT: Final = "export the sheet as CSV UTF-8"
 _NOT_TEXT: Final = (
-    ((ZIP_MAGIC,), "is a spreadsheet or another zip archive (xlsx, ods), not CSV", _EXPORT),
-    ((b"\xd0\xcf\x11\xe0",), "is an old Office file (xls), not CSV", _EXPORT),
-    ((b"\x1f\x8b",), "is compressed with gzip", "decompress it first"),
+    (ZIP_MAGIC, "is a spreadsheet or another zip archive (xlsx, ods), not CSV", _EXPORT),
+    (b"\xd0\xcf\x11\xe0", "is an old Office file (xls), not CSV", _EXPORT),
+    (b"\x1f\x8b", "is compressed with gzip", "decompress it first"),
 )
 """First bytes of files that are no UTF-8 text, what they are, and the way out."""
 
@@ -46,8 +46,8 @@ _NOT_TEXT: Final = (
 def read_text(path: Path) -> str:
     """Text of a CSV file in UTF-8, with or without a byte order mark."""
     data = read_bytes(path, most=TABLE_BYTES)
-    for marks, what, way_out in _NOT_TEXT:
-        if data.startswith(marks):
+    for magic, what, way_out in _NOT_TEXT:
+        if data.startswith(magic):
             raise BadDataError(what, way_out=way_out, path=str(path))
     return decoded(data, path=path, way_out=_AS_UTF8, as_utf8=_AS_UTF8)
 
@@ -77,29 +77,31 @@ def _split_cells(path: Path, text: str) -> RawTable:
 
 
 def csv_separator(text: str) -> str:
-    """Comma, semicolon or tab: one of which the first two lines have as many outside quotes, else most in the first.
+    """Separator of CSV text: of comma, semicolon and tab the most frequent in the first line, outside quotes.
 
-    So names like ``size (cm, by pathology)`` do not make a table with semicolons one with commas.
+    One that the second line has as often goes first: commas in names like ``size (cm, by pathology)`` do not count.
     """
     first, second, *_ = (_QUOTED.sub("", line) for line in [*text.lstrip("\r\n").split("\n", 2), "", ""])
 
-    def trust(separator: str) -> tuple[bool, int]:
+    def rank(separator: str) -> tuple[bool, int]:
         count = first.count(separator)
         return 0 < count == second.count(separator), count
 
-    return max(",;\t", key=trust)
+    return max(",;\t", key=rank)
 
 
 def header_of(source: Path | Sheet) -> list[str]:
-    """The names in a table's first line; none where the file is of anything else."""
-    text = source.text if isinstance(source, Sheet) else first_bytes(source, _LOOKED_AT).decode("utf-8-sig", "replace")
+    """Names in a table's first line; empty where that is no CSV."""
+    text = (
+        source.text if isinstance(source, Sheet) else first_bytes(source, _MOST_HEADER).decode("utf-8-sig", "replace")
+    )
     with contextlib.suppress(csv.Error):
         return [name.strip() for name in next(csv.reader(io.StringIO(text), delimiter=csv_separator(text)), [])]
     return []
 
 
 def composed(text: str) -> str:
-    """A name or code in one spelling (NFC): programs write an accented letter as one character or as two."""
+    """A name or code in Unicode NFC: programs write an accented letter as one character or as two."""
     return unicodedata.normalize("NFC", text)
 
 
@@ -112,8 +114,8 @@ def may_be_thousands(number: str) -> bool:
 #
 # Nothing is guessed or repaired. Each fault is one `BadDataError` naming the file, the line, the column, the value
 # and what to do. Two properties of a field go beyond the Table Schema standard: ``"column": "required"`` (the
-# column must be there although its cells may be blank) and ``ifZero`` (what to ask when a cell that must exceed 0
-# holds 0). One of a schema does: ``wide`` (how tables with other columns are read).
+# column must be there although its cells may be blank) and ``ifZero`` (the question when a cell that must exceed 0
+# holds 0). So does one of a schema: ``wide`` (how tables with other columns are read).
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _DATE = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}")
@@ -142,7 +144,7 @@ class Table(Record):
         return len(self.line_numbers)
 
     def error(self, row: int, column: str, what: str, *, way_out: str) -> BadDataError:
-        """Error for a cell found wrong after reading, in the reader's own form; rows count from 0."""
+        """Error for a cell that is wrong beyond its schema, worded as the reader's; rows count from 0."""
         return _fault(self.line_numbers[row], column, what, way_out=way_out).with_path(self.path)
 
 
@@ -171,18 +173,19 @@ def read_table(source: Path | Sheet, schema_name: str) -> Table:
             row = dict(zip(header, cells, strict=True))
             row |= {name: composed(row.get(name, "")) for name in keys}
             for name, field in fields.items():
-                try:
-                    cell = _parse_cell(row.get(name, ""), field, decimal_comma=raw.decimal_comma)
-                except BadDataError as refusal:
-                    raise _fault(line, name, refusal.what, way_out=refusal.way_out) from None
-                columns[name].append(cell)
+                columns[name].append(_cell(line, row.get(name, ""), field, decimal_comma=raw.decimal_comma))
     table = Table(path=path, columns=columns, line_numbers=[line for line, _ in body])
-    first: dict[tuple[Any, ...], int] = {}
-    for index, key in enumerate(_keys(table, keys)):
-        if (before := first.setdefault(key, index)) != index:
-            what = f"{_shown_key(key)} stands on line {table.line_numbers[before]} already"
-            raise table.error(index, " + ".join(keys), what, way_out="remove one row or correct its key")
+    check_unique(table, keys)
     return table
+
+
+def check_unique(table: Table, keys: Sequence[str], *, way_out: str = "remove one row or correct its key") -> None:
+    """Refuse two rows with the same values in the columns `keys`."""
+    first: dict[tuple[Any, ...], int] = {}
+    for row, key in enumerate(_keys(table, keys)):
+        if (before := first.setdefault(key, row)) != row:
+            what = f"{_shown_key(key)} stands on line {table.line_numbers[before]} already"
+            raise table.error(row, " + ".join(keys), what, way_out=way_out)
 
 
 class RawTable(Record):
@@ -203,12 +206,10 @@ class RawTable(Record):
         """Error for a cell; lines count from 1."""
         return _fault(line, column, what, way_out=way_out).with_path(self.path)
 
-    def number(self, line: int, column: str, text: str) -> float:
-        """Parse a finite number; an error names its cell."""
-        try:
-            return _parse_number(_with_decimal_point(text) if self.decimal_comma else text, {"name": column})
-        except BadDataError as refusal:
-            raise self.error(line, column, refusal.what, way_out=refusal.way_out) from None
+    def cell(self, line: int, column: str, text: str, kind: Literal["number", "date"]) -> Any:
+        """Parse a cell as a finite number or a date; None where it is blank."""
+        with in_file(self.path):
+            return _cell(line, text, {"name": column, "type": kind}, decimal_comma=self.decimal_comma)
 
 
 def read_raw(path: Path) -> RawTable:
@@ -235,14 +236,14 @@ def csv_text(names: Sequence[str], rows: Iterable[Iterable[object]], *, digits: 
 
 
 def csv_cell(value: object, digits: int | None = None) -> str:
-    """Text of a cell as `read_table` takes it: None is blank, numbers have all their digits, or so many significant."""
+    """Text of a cell as `read_table` takes it: None is blank; floats have all digits, or so many significant ones."""
     if value is None:
         return ""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float):
         return repr(value) if digits is None else f"{value:.{digits}g}"
-    return "".join(one if one.isprintable() else ascii(one)[1:-1] for one in str(value).strip())
+    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in str(value).strip())
 
 
 def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Table]) -> None:
@@ -272,10 +273,10 @@ def _check_header(header: Sequence[str], fields: Mapping[str, Any], *, wide: str
 
 
 def _advice_on_column(name: str, header: Sequence[str], fields: Mapping[str, Any]) -> str:
-    """Advice on a name that is not known: one of another table (trial and excision exchanged), or mistyped."""
+    """Way out for an unknown column: give the other table (trial and excision exchanged), or correct the name."""
     for kind, contents in (("trial", "readings"), ("excision", "sizes after excision")):
-        fields_of_other = {one["name"]: one for one in load_schema(f"{kind}.table.json")["fields"]}
-        needed = {name for name, one in fields_of_other.items() if _is_required(one)}
+        fields_of_other = {field["name"]: field for field in load_schema(f"{kind}.table.json")["fields"]}
+        needed = {name for name, field in fields_of_other.items() if _is_required(field)}
         if list(fields_of_other) != list(fields) and needed <= set(header) <= set(fields_of_other):
             return f"this is the table of {contents}: give the other one here"
     name = name.strip().lower()
@@ -298,8 +299,16 @@ def _check_length(line: int, cells: Sequence[str], header: Sequence[str]) -> Non
     raise BadDataError(f"line {line}: {len(cells)} cells under {len(header)} columns", way_out=way_out)
 
 
+def _cell(line: int, text: str, field: Mapping[str, Any], *, decimal_comma: bool) -> Any:
+    """Value of a cell; an error names its line and column."""
+    try:
+        return _parse_cell(text, field, decimal_comma=decimal_comma)
+    except BadDataError as error:
+        raise _fault(line, field["name"], error.what, way_out=error.way_out) from None
+
+
 def _parse_cell(text: str, field: Mapping[str, Any], *, decimal_comma: bool) -> Any:
-    """A cell by the schema's type and rules; None where it is blank and may be. Errors do not say where it stands."""
+    """Value of a cell by its field's type and rules; None where it is blank and may be."""
     if text == "":
         if _is_required(field):
             raise BadDataError("is blank", way_out=f"fill it in: {field['description']}")
@@ -335,7 +344,7 @@ _LIMITS: Final[Mapping[str, tuple[Callable[[Any, Any], bool], str]]] = {
 
 
 def _parse_by_type(text: str, field: Mapping[str, Any]) -> Any:
-    """A cell by the type of its field."""
+    """Value of a cell by the type of its field."""
     match field["type"]:
         case "string":
             return text
@@ -346,8 +355,9 @@ def _parse_by_type(text: str, field: Mapping[str, Any]) -> Any:
                 return int(text)
             what, way_out = "is not a whole number", f"write it as 1, 2, 3; {_blank_advice(field)}"
         case "date":
-            with contextlib.suppress(ValueError):
-                return parse_date(text)
+            with contextlib.suppress(ValueError):  # of a day that does not exist
+                if _DATE.fullmatch(text):
+                    return date.fromisoformat(text)
             what, way_out = "is no date", f"write it as 2026-03-01; {_blank_advice(field)}"
         case _:
             for value, words in ((True, field["trueValues"]), (False, field["falseValues"])):
@@ -375,18 +385,11 @@ def _parse_number(text: str, field: Mapping[str, Any]) -> float:
 
 
 def _with_decimal_point(text: str) -> str:
-    """A number of a table with decimal commas, with a point; one that has a point may mean thousands by it."""
+    """Number with a decimal point, in a table of decimal commas; one that has a point is refused: thousands?"""
     if "." in text:
         what = f"{_shown(text)} has a point, and other numbers have decimal commas"
         raise BadDataError(what, way_out="write all numbers one way")
     return text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
-
-
-def parse_date(text: str) -> date:
-    """Date of a cell, year-month-day; else a ValueError."""
-    if not _DATE.fullmatch(text):
-        raise ValueError(text)
-    return date.fromisoformat(text)
 
 
 def _keys(table: Table, fields: Sequence[str]) -> list[tuple[Any, ...]]:
@@ -422,8 +425,8 @@ def _fault(line: int, column: str, what: str, *, way_out: str) -> BadDataError:
 
 _TEXT_AS_UTF8: Final = "save it as UTF-8 text"
 _SEPARATORS: Final = {"\t": "tabs", ";": "semicolons", ",": "commas", " ": "blanks"}
-_SAMPLED: Final = 300  # lines by which the separator is told
-_LEAST_NUMBERS: Final = 0.6  # share of a line's fields that are numbers where it is one of the table
+_SAMPLED: Final = 300  # lines by which the separator is chosen
+_LEAST_NUMBERS: Final = 0.6  # share of numbers among the fields of a row of numbers
 _AROUND: Final = " \t\"'[](){}"  # of a field, as R and Python print numbers
 _TOUCHING: Final = re.compile(r"(\.\d+)(?=[+-]\d+\.\d)")  # numbers of Polhemus, of one width each
 _CLOCK: Final = re.compile(r"(?:(\d{1,2}):)?(\d{1,2}):(\d{1,2}(?:\.\d+)?)")
@@ -431,10 +434,10 @@ _DATED: Final = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{1,2}:\d{2}:\d{2}(\.\d+)?(Z|
 _UNIT_OF_TIME: Final = re.compile(r"(?:[\[(_ ]|(?<=time))(ms|us|ns|s|min|msec|µs|secs?|seconds)[\])]?$", re.IGNORECASE)
 _ANY_DECIMAL_COMMA: Final = re.compile(r"[+-]?[0-9]*,[0-9]+(e[+-]?[0-9]+)?", re.IGNORECASE)
 FEWEST_LABELS: Final = 8
-"""So many numbers that count 0, 1, 2... or 1, 2, 3... are labels of rows or columns, not readings."""
+"""From so many on, numbers that count up are labels of rows or columns, not readings."""
 NO_SENSEL: Final = "B"  #: A cell beside the sensor in Tekscan's files.
 _NO_VALUE: Final = ("", "nan", "na", "n/a", "-", "--", NO_SENSEL.lower(), "null")
-"""Words for a reading that there is not."""
+"""Words for a missing reading."""
 
 
 class Line(Record):
@@ -444,11 +447,11 @@ class Line(Record):
     text: str
     fields: list[str]
     values: list[float | None]  #: The number of each field, NaN for no value; None where it is anything else.
-    after_blank: bool  #: A blank line stands before it.
+    after_blank: bool  #: True after a blank line.
 
     @property
     def is_numbers(self) -> bool:
-        """Whether each of its fields is a number or no value."""
+        """True if each field is a number or no value."""
         return None not in self.values
 
 
@@ -470,7 +473,7 @@ def number(text: str, *, decimal_comma: bool) -> float | None:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Lines of a text, UTF-8 or with a byte order mark; a minus sign that is no hyphen is one."""
+    """Lines of a text in UTF-8, or in UTF-16 with a byte order mark; the minus sign U+2212 becomes a hyphen."""
     data = read_bytes(path, most=TABLE_BYTES)
     if b"\0" in data and (kind := kind_of(path)):
         raise BadDataError(f"is {kind}, not a table of text", way_out="save it as .csv", path=str(path))
@@ -482,7 +485,7 @@ def read_lines(path: Path) -> list[str]:
 
 
 def read_text_table(path: Path, decimal: str | None = None) -> tuple[list[Line], str]:
-    """The lines of a text that are not blank, and how their fields are separated: so that most of them are numbers.
+    """Lines of a text that are not blank, split so that most fields are numbers, and their separator in words.
 
     Where no `decimal` (``"point"`` or ``"comma"``) is stated, commas that may separate thousands are refused.
     """
@@ -509,25 +512,25 @@ def read_text_table(path: Path, decimal: str | None = None) -> tuple[list[Line],
 
 
 def detect_separator(texts: Sequence[str], marks: Sequence[str] = ()) -> str:
-    """The separator that makes most numbers of lines and least else; empty where none makes two of any.
+    """Separator that gives the most numbers and the fewest other fields; empty where no line has two numbers.
 
-    `marks` are words for no value, beside those that are known.
+    `marks` are further words for no value.
     """
-    filled = [one for one in texts if one.strip()]
+    filled = [text for text in texts if text.strip()]
     sample = filled[:: max(1, len(filled) // _SAMPLED)]
-    made = {}  # numbers, and other fields as a negative number, in the lines that it makes lines of a table
+    scores = {}  # by separator: numbers in rows of numbers, and minus the other fields there
     for separator in _SEPARATORS:
         rows = [row for text in sample if _is_number_row(row := split_fields(text, separator), marks)]
         numbers = sum(_is_number(field, marks) for row in rows for field in row)
-        made[separator] = numbers, numbers - sum(map(len, rows))
-    best = max(made, key=made.__getitem__)
-    return best if made[best][0] else ""
+        scores[separator] = numbers, numbers - sum(map(len, rows))
+    best = max(scores, key=scores.__getitem__)
+    return best if scores[best][0] else ""
 
 
 def _is_number_row(fields: Sequence[str], marks: Sequence[str]) -> bool:
     """True for a line of a table: two numbers or more, and little else."""
-    good = sum(_is_number(field, marks) for field in fields)
-    return good > 1 and good >= _LEAST_NUMBERS * len(fields)
+    numbers = sum(_is_number(field, marks) for field in fields)
+    return numbers > 1 and numbers >= _LEAST_NUMBERS * len(fields)
 
 
 def _is_number(text: str, marks: Sequence[str]) -> bool:
@@ -542,9 +545,9 @@ def split_fields(text: str, separator: str) -> list[str]:
 
 
 def comma_numbers(rows: Iterable[Sequence[str]], marks: Sequence[str] = (), *, way_out: str) -> list[str]:
-    """Fields of the table's lines that are numbers with a decimal comma, or with commas between thousands.
+    """Fields of rows of numbers that have a decimal comma, or commas between thousands.
 
-    All of them may not be of the latter, where there is a way out of that.
+    With a `way_out` they are refused where all may have commas between thousands: which is meant cannot be told.
     """
     fields = (field for row in rows if _is_number_row(row, marks) for field in row)
     commas = [one for one in fields if _ANY_DECIMAL_COMMA.fullmatch(one) or may_be_thousands(one)]
@@ -556,12 +559,12 @@ def comma_numbers(rows: Iterable[Sequence[str]], marks: Sequence[str] = (), *, w
 
 
 def is_label_sequence(line: FloatArray) -> bool:
-    """True for labels of rows or columns."""
+    """True for numbers that count 0, 1, 2... or 1, 2, 3..., as labels of rows or columns do."""
     return len(line) >= FEWEST_LABELS and line[0] in (0.0, 1.0) and bool((np.diff(line) == 1.0).all())
 
 
 def unit_of_time(name: str) -> str:
-    """Unit in the name of a column of times; empty where it says none."""
+    """Unit in the name of a column of times; empty without one."""
     match = _UNIT_OF_TIME.search(name.strip())
     unit = match[1].lower() if match else ""
     return {"msec": "ms", "µs": "us", "sec": "s", "secs": "s", "seconds": "s"}.get(unit, unit)
