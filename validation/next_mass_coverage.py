@@ -81,7 +81,7 @@ def ranks(
     for trial in range(trials):
         readings, ex_vivo_mm = simulate(design, np.random.default_rng([seed, trial]))
         rng = np.random.default_rng([seed, trial, 1])
-        found = model.posteriors_of(Trial(readings, ex_vivo_mm), sample=sample, rng=rng)[0].get("tactile")
+        found = model.fit_modalities(Trial(readings, ex_vivo_mm), sample=sample, rng=rng)[0].get("tactile")
         if found is not None:
             yield (
                 float(np.mean(found.draws["mape_percent"] < truth)),

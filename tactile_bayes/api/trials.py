@@ -246,7 +246,7 @@ class Pilot(Record, eq=False):
             if name not in sizes:
                 way_out = f"it has {', '.join(sizes)}; choose one with --against"
                 raise BadDataError(f"holds no readings by {name}", way_out=way_out, path=str(self.path))
-        found = planning.assumptions_from(sizes["tactile"], sizes[against], map_sd=given.get("map_sd"))
+        found = planning.pilot_errors(sizes["tactile"], sizes[against], map_sd=given.get("map_sd"))
         if found is None:
             way_out = "give the errors by options"
             raise BadDataError("has fewer than 3 masses found by a modality", way_out=way_out, path=str(self.path))
@@ -333,7 +333,9 @@ def planned(given: Mapping[str, Any], pilot: Pilot | None, progress: Progress) -
     with open_executor(workers=asked.workers) as executor:
 
         def run(cases: Sequence[planning.PlanCase]) -> tuple[planning.Design, ...]:
-            outcomes = run_batch(planning.run_case, cases, key=attrgetter("key"), executor=executor, progress=progress)
+            outcomes = run_batch(
+                planning.simulate_design, cases, key=attrgetter("key"), executor=executor, progress=progress
+            )
             for outcome in outcomes:
                 if outcome.value is None:
                     raise BadDataError(f"{outcome.key}: {outcome.error}", way_out="change the errors assumed")
@@ -378,7 +380,7 @@ def _needed(
         except UndefinedError as undefined:
             raise BadDataError(str(undefined), way_out="change the errors assumed") from None
         for _ in range(planning.ROUNDS):
-            about = planning.sizes_about(guess)
+            about = planning.patients_around(guess)
             cases = [case(patients=one, maps=number) for one in about if (number, one) not in found]
             found |= {(number, one.patients): one for one in run(cases)}
             answer = planning.patients_needed([found[number, one] for one in about], aim, target, trials=first.trials)

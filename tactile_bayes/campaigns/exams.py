@@ -30,7 +30,7 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import on_map
 from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.verdict import no_verdict
-from tactile_bayes.trial.readings import day_of, in_order
+from tactile_bayes.trial.readings import day_of, visits_in_order
 
 # --- What a file says of its exam: facts of the session, and the files that it was made from.
 
@@ -432,7 +432,7 @@ def visits_of(exams: Sequence[Exam]) -> dict[str, Visits]:
     for exam in exams:
         found[exam.of_visits][exam.visit].append(exam)
     return {
-        name: {visit: visits[visit] for visit in in_order(visit_dates(visits)) or visits}
+        name: {visit: visits[visit] for visit in visits_in_order(visit_dates(visits)) or visits}
         for name, visits in found.items()
     }
 

@@ -20,7 +20,7 @@ from tactile_bayes.report.figure_file import FORMATS, figure_file, finish, plain
 from tactile_bayes.report.pages import Growth, page
 from tactile_bayes.trial.figures import Figures
 from tactile_bayes.trial.method_comparison import MethodComparison
-from tactile_bayes.trial.next_mass import NextOfModality
+from tactile_bayes.trial.next_mass import ModalityErrors
 from tactile_bayes.trial.planning import PlanReport
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes, Trial, mass_numbers
 from tactile_bayes.trial.summary import BINS, Calibration, ModalityReport, Prediction, TrialReport, prediction_of
@@ -246,5 +246,5 @@ def _of_variances(report: ModalityReport) -> list[str]:
     return [trial_words.number(None if one is None else 100 * one**0.5, ".0f") for one in variances]
 
 
-def _middles(one: NextOfModality, names: Iterable[str]) -> list[str]:
+def _middles(one: ModalityErrors, names: Iterable[str]) -> list[str]:
     return [getattr(one, name).shown(".3g") for name in names]

@@ -1,4 +1,4 @@
-"""Accuracy of a modality against excision, and two modalities against each other."""
+"""Accuracy of a modality against excision, and of two modalities compared."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ from tactile_bayes.trial.figures import (
 from tactile_bayes.trial.lines import all_equal
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 
-# --- Cautions about a modality's intervals, where the data meet a caution's condition.
+# --- Cautions about a modality's intervals.
 
-FEW_MISSES = 3  #: Up to so many misses, each moves the mean error by more than an uncorrected interval allows for.
+FEW_MISSES = 3  #: Of so few misses each moves the mean error by more than an uncorrected interval allows for.
 
 
 def cautions(sizes: ModalitySizes, *, intervals: Intervals) -> tuple[str, ...]:
@@ -55,19 +55,18 @@ def cautions(sizes: ModalitySizes, *, intervals: Intervals) -> tuple[str, ...]:
 # --- Figures that count a missed mass as size 0, with intervals that allow for misses not yet observed.
 #
 # Where one mass in 25 is missed, a trial of 25 has none, one or two misses, and each moves the mean error by some 3
-# points. Leaving out or redrawing patients sees only the misses that occurred: without any, the interval allows for
-# none.
+# points. Jackknife and bootstrap see only the misses that occurred: without any, the interval allows for none.
 
 
 def figure_with_misses(
     statistic: SumStatistic, sizes: ModalitySizes, *, scale: Scale, intervals: Intervals, power: int, missed: Statistic
 ) -> Figure:
-    r"""Weighted mean over masses, found and missed, with an interval over patients.
+    r"""Weighted mean over masses, detected and missed, with an interval over patients.
 
-    The weights of the mean go with this `power` of the ex-vivo size, where 0 weighs all masses alike; `missed` is the
-    mean if every mass were missed.
+    The weights of the mean are this `power` of the ex-vivo size, where 0 weighs all masses alike; `missed` is the mean
+    if every mass were missed.
 
-    The mean is :math:`(1 - p) a + p b` with the missed share p of the weights, a over masses found and b if all were
+    The mean is :math:`(1 - p) a + p b` with the missed share p of the weights, a over detected masses and b if all were
     missed. The corrected interval recovers the variances of a and p from their own intervals (Zou & Donner 2008, Stat.
     Med. 27, 1693): a's is the jackknife's, p's that of Jeffreys' prior for the effective number of patients. Other
     methods treat a miss as one more size.
@@ -76,20 +75,20 @@ def figure_with_misses(
     def weight(of: ModalitySizes) -> FloatArray:
         return np.asarray((of.ex_vivo_mm / of.ex_vivo_mm.max()) ** power)
 
-    plain = figure(statistic, sizes, scale=scale, intervals=intervals, leverage=weight)
-    if intervals.method != "corrected" or plain.value is None:
-        return plain
-    found = figure(statistic, sizes.only_detected(), scale=scale, intervals=intervals, leverage=weight)
-    if found.value is None or found.interval is None:
-        return plain
+    pooled = figure(statistic, sizes, scale=scale, intervals=intervals, leverage=weight)
+    if intervals.method != "corrected" or pooled.value is None:
+        return pooled
+    of_detected = figure(statistic, sizes.only_detected(), scale=scale, intervals=intervals, leverage=weight)
+    if of_detected.value is None or of_detected.interval is None:
+        return pooled
     weights = weight(sizes)
     share = float(weights[~sizes.detected].sum() / weights.sum())
     low, high = share_interval(share, effective_number(weights, sizes.patient), confidence=intervals.probability)
-    step = missed(sizes) - found.value
+    step = missed(sizes) - of_detected.value
     by_share = sorted((step * (low - share), step * (high - share)))
-    by_found = ((1 - share) * (end - found.value) for end in found.interval)
-    below, above = (math.hypot(one, other) for one, other in zip(by_found, by_share, strict=True))
-    return replace(plain, interval=(plain.value - below, plain.value + above), interval_reason="")
+    by_detected = ((1 - share) * (end - of_detected.value) for end in of_detected.interval)
+    below, above = (math.hypot(a, b) for a, b in zip(by_detected, by_share, strict=True))
+    return replace(pooled, interval=(pooled.value - below, pooled.value + above), interval_reason="")
 
 
 def share_interval(share: float, number: float, *, confidence: float) -> Ends:
@@ -105,16 +104,16 @@ def share_interval(share: float, number: float, *, confidence: float) -> Ends:
 
 
 def accuracy_figures(sizes: ModalitySizes, *, intervals: Intervals) -> dict[str, Figure]:
-    """Accuracy of one modality: `mape_percent`, `mae_mm` (a mass not found counts as size 0), the same over detected
+    """Accuracy of one modality: `mape_percent`, `mae_mm` (a mass not detected has size 0), the same over detected
     masses only, weighted and median percent errors, and `bias_percent` (detected only: 0 has no logarithm)."""
-    found = sizes.only_detected()
-    bias = figure(geometric_ratio, found, scale="log", intervals=intervals)
+    detected = sizes.only_detected()
+    bias = figure(geometric_ratio, detected, scale="log", intervals=intervals)
     on_log = partial(figure_with_misses, scale="log", intervals=intervals)
     return {
         "mape_percent": mape_figure(sizes, intervals=intervals),
-        "mape_detected_percent": figure(mape_percent, found, scale="log", intervals=intervals),
-        "mae_mm": on_log(mae_mm, sizes, power=0, missed=lambda one: float(one.ex_vivo_mm.mean())),
-        "mae_detected_mm": figure(mae_mm, found, scale="log", intervals=intervals),
+        "mape_detected_percent": figure(mape_percent, detected, scale="log", intervals=intervals),
+        "mae_mm": on_log(mae_mm, sizes, power=0, missed=lambda of: float(of.ex_vivo_mm.mean())),
+        "mae_detected_mm": figure(mae_mm, detected, scale="log", intervals=intervals),
         "weighted_mape_percent": on_log(weighted_mape_percent, sizes, power=1, missed=lambda _: 100.0),
         "median_error_percent": figure(median_percent, sizes),
         "bias_percent": bias.mapped(lambda ratio: 100 * (ratio - 1)),
@@ -122,22 +121,23 @@ def accuracy_figures(sizes: ModalitySizes, *, intervals: Intervals) -> dict[str,
 
 
 def mape_figure(sizes: ModalitySizes, *, intervals: Intervals) -> Figure:
-    """Percent error with its interval; a mass not found counts as 100 %."""
+    """Percent error with its interval; a mass not detected counts as 100 %."""
     return figure_with_misses(mape_percent, sizes, scale="log", intervals=intervals, power=0, missed=lambda _: 100.0)
 
 
 def _mm_errors(sizes: ModalitySizes) -> FloatArray:
-    return columns(np.abs(sizes.size_mm - some(sizes.ex_vivo_mm)), 1.0, sizes.ex_vivo_mm)
+    """(n, 3) absolute error in mm, 1, and ex-vivo size of each mass."""
+    return columns(np.abs(sizes.size_mm - require_any(sizes.ex_vivo_mm)), 1.0, sizes.ex_vivo_mm)
 
 
 def _mean(sums: FloatArray) -> FloatArray:
     return ratio(sums[..., 0], sums[..., 1])
 
 
-# Mean absolute error in percent of the ex-vivo size, each mass alike; a mass not found has size 0, an error of 100 %:
+# Mean absolute error in percent of the ex-vivo size, each mass alike; one not detected has size 0, an error of 100 %:
 # 100/n sum |y - e| / e. Wellman & Howe (1999), section 3, call it "percent mean absolute error (MAE)".
 mape_percent = SumStatistic(
-    lambda sizes: columns(np.abs(sizes.size_mm / some(sizes.ex_vivo_mm) - 1), 1.0),
+    lambda sizes: columns(np.abs(sizes.size_mm / require_any(sizes.ex_vivo_mm) - 1), 1.0),
     lambda sums: 100 * _mean(sums),
     "no mass to average over",
 )
@@ -152,7 +152,7 @@ mae_mm = SumStatistic(_mm_errors, _mean, "no mass to average over")
 
 # Geometric mean of size over ex-vivo size; 1 without bias, and twofold up cancels twofold down.
 geometric_ratio = SumStatistic(
-    lambda sizes: columns(np.log(sizes.size_mm) - np.log(some(sizes.ex_vivo_mm)), 1.0),
+    lambda sizes: columns(np.log(sizes.size_mm) - np.log(require_any(sizes.ex_vivo_mm)), 1.0),
     lambda sums: np.exp(_mean(sums)),
     "no mass to average over",
 )
@@ -160,11 +160,11 @@ geometric_ratio = SumStatistic(
 
 def median_percent(sizes: ModalitySizes) -> float:
     """Median absolute error in percent of the ex-vivo size."""
-    return 100 * float(np.median(np.abs(sizes.size_mm / some(sizes.ex_vivo_mm) - 1)))
+    return 100 * float(np.median(np.abs(sizes.size_mm / require_any(sizes.ex_vivo_mm) - 1)))
 
 
-def some(values: FloatArray) -> FloatArray:
-    """Return the values; `UndefinedError` when there are none."""
+def require_any(values: FloatArray) -> FloatArray:
+    """The values; `UndefinedError` when there are none."""
     if len(values) == 0:
         raise UndefinedError("no mass to average over")
     return values
@@ -172,8 +172,8 @@ def some(values: FloatArray) -> FloatArray:
 
 # --- The paper's line through zero, with three figures that are all called r squared.
 #
-# The paper names no convention for r squared; its printed 0.14 can only be the centred or Pearson's (shared reading
-# of Fig. 10), so the centred one leads. The regression is of sizes y on ex-vivo sizes e.
+# The paper names no convention for r squared; its printed 0.14 can only be the centred or Pearson's (by Fig. 10), so
+# the centred one leads. The regression is of sizes y on ex-vivo sizes e.
 
 
 def origin_line_figures(sizes: ModalitySizes, *, intervals: Intervals) -> dict[str, Figure]:
@@ -188,24 +188,24 @@ def origin_line_figures(sizes: ModalitySizes, *, intervals: Intervals) -> dict[s
 
 
 def _terms(sizes: ModalitySizes) -> FloatArray:
-    """Products of sizes, then of sizes about their means: e e, e y, y y, 1, e', y', e'e', e'y', y'y'."""
-    unit = some(sizes.ex_vivo_mm).max()  # so that squares neither overflow nor vanish
+    """(n, 9) products of sizes, then of sizes about their means: e e, e y, y y, 1, e', y', e'e', e'y', y'y'."""
+    unit = require_any(sizes.ex_vivo_mm).max()  # so that squares neither overflow nor vanish
     e, y = sizes.ex_vivo_mm / unit, sizes.size_mm / unit
     de, dy = e - e.mean(), y - y.mean()
     return columns(e * e, e * y, y * y, 1.0, de, dy, de * de, de * dy, dy * dy)
 
 
 def _terms_of_varied(sizes: ModalitySizes, *, ex_vivo: bool) -> FloatArray:
-    """The terms where the sizes vary, and with `ex_vivo` the ex-vivo sizes too."""
+    """`_terms`; `UndefinedError` where the sizes, or with `ex_vivo` the ex-vivo sizes, do not vary."""
     for name, values in (("sizes", sizes.size_mm), ("ex-vivo sizes", sizes.ex_vivo_mm))[: 1 + ex_vivo]:
-        if all_equal(some(values)):
+        if all_equal(require_any(values)):
             raise UndefinedError(
                 "one mass has no spread" if len(values) == 1 else f"all {len(values)} {name} are equal"
             )
     return _terms(sizes)
 
 
-_of_sizes, _of_pairs = (partial(_terms_of_varied, ex_vivo=one) for one in (False, True))
+_terms_with_size_spread, _terms_with_both_spreads = (partial(_terms_of_varied, ex_vivo=one) for one in (False, True))
 
 
 def _slope(sums: FloatArray) -> FloatArray:
@@ -213,7 +213,7 @@ def _slope(sums: FloatArray) -> FloatArray:
 
 
 def _sse(sums: FloatArray) -> FloatArray:
-    """Sum of squares about the line through zero."""
+    """Sum of squared residuals of the line through zero."""
     return np.maximum(sums[..., 2] - _slope(sums) * sums[..., 1], 0.0)
 
 
@@ -228,14 +228,14 @@ slope = SumStatistic(_terms, _slope)
 CORRELATIONS = {
     # share of the variance about the mean that the line through zero explains, 1 - SSE0 / SST; below 0 when the mean of
     # the sizes would do better. Kvalseth (1985), Am. Stat. 39, 279, recommends it
-    "r2_centred": SumStatistic(_of_sizes, lambda sums: 1 - ratio(_sse(sums), squares(sums)[1])),
+    "r2_centred": SumStatistic(_terms_with_size_spread, lambda sums: 1 - ratio(_sse(sums), squares(sums)[1])),
     # share of the sum of squares about zero that the line explains, 1 - SSE0 / sum y^2: what R prints for
     # lm(y ~ 0 + x). It flatters: any line through a cloud far from zero explains most of it
     "r2_uncentred": SumStatistic(_terms, lambda sums: 1 - ratio(_sse(sums), sums[..., 2]), "no mass was detected"),
     # squared correlation coefficient; blind to scale and offset
-    "r2_pearson": SumStatistic(_of_pairs, lambda sums: _pearson(sums) ** 2),
+    "r2_pearson": SumStatistic(_terms_with_both_spreads, lambda sums: _pearson(sums) ** 2),
     # correlation coefficient; its sign says what the squares hide
-    "pearson_r": SumStatistic(_of_pairs, _pearson),
+    "pearson_r": SumStatistic(_terms_with_both_spreads, _pearson),
 }
 
 
@@ -247,8 +247,8 @@ REFERENCE = "tactile"
 class ModalityRatio(Figures):
     """Percent error of one modality over the tactile one's on common masses."""
 
-    masses: Annotated[int, Meta(ge=0)]  #: That both modalities looked for.
-    masses_detected: Annotated[int, Meta(ge=0)]  #: That both found.
+    masses: Annotated[int, Meta(ge=0)]  #: Masses that both modalities looked for.
+    masses_detected: Annotated[int, Meta(ge=0)]  #: Masses that both detected.
     ratio: NotNegative | None  #: On the masses that both looked for; masses not detected counted as size 0.
     ratio_interval: Ends | None
     ratio_detected: NotNegative | None  #: On the masses that both detected.
@@ -262,23 +262,23 @@ def mape_ratios(sizes: Mapping[str, ModalitySizes], *, intervals: Intervals) -> 
     if reference is None:
         return {}
     ratios = {}
-    for name, one in sizes.items():
+    for name, modality_sizes in sizes.items():
         if name != REFERENCE:
-            looked_for = on_common_masses(one, reference)
-            found = on_common_masses(one.only_detected(), reference.only_detected())
+            looked_for = on_common_masses(modality_sizes, reference)
+            both_detected = on_common_masses(modality_sizes.only_detected(), reference.only_detected())
             figures = {
                 "ratio": mape_ratio(*looked_for, intervals=intervals),
-                "ratio_detected": mape_ratio(*found, intervals=intervals),
+                "ratio_detected": mape_ratio(*both_detected, intervals=intervals),
             }
-            n, both = len(looked_for[0].size_mm), len(found[0].size_mm)
-            ratios[name] = ModalityRatio(masses=n, masses_detected=both, **fields_of(figures))
+            n, n_detected = len(looked_for[0].size_mm), len(both_detected[0].size_mm)
+            ratios[name] = ModalityRatio(masses=n, masses_detected=n_detected, **fields_of(figures))
     return ratios
 
 
-def on_common_masses(one: ModalitySizes, other: ModalitySizes) -> tuple[ModalitySizes, ModalitySizes]:
+def on_common_masses(first: ModalitySizes, second: ModalitySizes) -> tuple[ModalitySizes, ModalitySizes]:
     """Both modalities, limited to their common masses, in the same order."""
-    _, of_one, of_other = np.intersect1d(one.mass, other.mass, return_indices=True)
-    return one.take(of_one), other.take(of_other)
+    _, in_first, in_second = np.intersect1d(first.mass, second.mass, return_indices=True)
+    return first.take(in_first), second.take(in_second)
 
 
 def mape_ratio(sizes: ModalitySizes, reference: ModalitySizes, *, intervals: Intervals) -> Figure:
@@ -286,10 +286,11 @@ def mape_ratio(sizes: ModalitySizes, reference: ModalitySizes, *, intervals: Int
 
     The interval leaves each patient out of both at once, so that patients hard for both do not widen it.
     """
-    return resampled(_pair(sizes, reference, ratio), scale="log", intervals=intervals)
+    return resampled(_error_sample(sizes, reference, ratio), scale="log", intervals=intervals)
 
 
-def _pair(sizes: ModalitySizes, reference: ModalitySizes, combine: Callable[..., FloatArray]) -> Sample:
+def _error_sample(sizes: ModalitySizes, reference: ModalitySizes, combine: Callable[..., FloatArray]) -> Sample:
+    """Percent errors of two modalities, combined by their difference or ratio."""
     return Sample(mape_percent, (sizes, reference), combine, f"the error of {reference.name} is 0")
 
 
@@ -298,11 +299,11 @@ def _pair(sizes: ModalitySizes, reference: ModalitySizes, combine: Callable[...,
 # Up to so many patients every pattern of signs is tried; beyond, this many random ones.
 MOST_EXACT = 14
 FLIPS = 9_999
-_AT_ONCE = 111
+_FLIPS_AT_ONCE = 111
 
 
 class PairedComparison(Figures):
-    """Percent errors of `first` against `second` on their common masses; a mass not found counts as size 0."""
+    """Percent errors of `first` against `second` on their common masses; a mass not detected has size 0."""
 
     first: str
     second: str
@@ -321,7 +322,7 @@ class PairedComparison(Figures):
 
 def paired_comparisons(sizes: Mapping[str, ModalitySizes], *, intervals: Intervals) -> list[PairedComparison]:
     """Compare every pair of modalities on their common masses, with Holm's correction of p values."""
-    pairs = [_compare(sizes[one], sizes[other], intervals) for one, other in combinations(sizes, 2)]
+    pairs = [_paired_comparison(sizes[first], sizes[second], intervals) for first, second in combinations(sizes, 2)]
     corrected = holm([pair.p_value for pair in pairs])
     return [replace(pair, p_holm=p) for pair, p in zip(pairs, corrected, strict=True)]
 
@@ -354,31 +355,32 @@ def sign_flip(by_patient: FloatArray, *, seed: int, flips: int = FLIPS) -> float
     differences = by_patient[by_patient != 0]
     if len(differences) == 0:
         return None
-    # the same sum in another order differs in rounding; a hair's breadth is equal
+    # sums in another order differ by rounding, and count as equal
     observed = abs(float(differences.sum())) * (1 - 1e-9)
     if len(differences) <= MOST_EXACT:
         patterns = (np.arange(2 ** len(differences))[:, None] >> np.arange(len(differences))) & 1
         return float(np.mean(np.abs((1 - 2 * patterns) @ differences) >= observed))
     rng = np.random.default_rng([seed, len(differences)])
     beyond = 1
-    for start in range(0, flips, _AT_ONCE):
-        signs = 1 - 2 * rng.integers(0, 2, (min(_AT_ONCE, flips - start), len(differences)), dtype=np.int8)
+    for start in range(0, flips, _FLIPS_AT_ONCE):
+        signs = 1 - 2 * rng.integers(0, 2, (min(_FLIPS_AT_ONCE, flips - start), len(differences)), dtype=np.int8)
         beyond += int(np.sum(np.abs(signs @ differences) >= observed))
     return beyond / (flips + 1)
 
 
-def _compare(one: ModalitySizes, other: ModalitySizes, intervals: Intervals) -> PairedComparison:
-    first, second = on_common_masses(one, other)
-    difference = resampled(_pair(first, second, np.subtract), scale="linear", intervals=intervals)
-    quotient = resampled(_pair(first, second, ratio), scale="log", intervals=intervals)
+def _paired_comparison(first: ModalitySizes, second: ModalitySizes, intervals: Intervals) -> PairedComparison:
+    """Difference and ratio of the errors of two modalities on their common masses, and the test."""
+    first, second = on_common_masses(first, second)
+    difference = resampled(_error_sample(first, second, np.subtract), scale="linear", intervals=intervals)
+    quotient = resampled(_error_sample(first, second, ratio), scale="log", intervals=intervals)
     patients = first.patients
     with np.errstate(all="ignore"):
         off = np.abs(first.size_mm / first.ex_vivo_mm - 1) - np.abs(second.size_mm / second.ex_vivo_mm - 1)
     sums = np.zeros(len(patients))
     np.add.at(sums, np.searchsorted(patients, first.patient), off)
     return PairedComparison(
-        first=one.name,
-        second=other.name,
+        first=first.name,
+        second=second.name,
         masses=len(first.size_mm),
         patients=len(patients),
         first_percent=figure(mape_percent, first).value,

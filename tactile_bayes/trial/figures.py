@@ -1,4 +1,4 @@
-"""Figures with intervals over patients: bootstrap, jackknife, exact sums."""
+"""Figures of a trial with intervals over patients: jackknife, bootstrap, exact intervals of proportions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 
 Scale = Literal["log", "linear", "fisher", "slope"]
 
-# Below this the spread of so few leave-one-out values says little; a Student t with 6 degrees of freedom would hide it.
+# The spread of fewer leave-one-out values says little, which Student's t with 6 degrees of freedom would hide.
 MIN_PATIENTS = 8
 # An interval on the logarithm whose upper end is more than this many times the lower one says nothing.
 WIDEST = 1000.0
@@ -42,10 +42,10 @@ def interval_from_values(
     r"""Two-sided jackknife interval of a statistic from its values with one patient left out.
 
     `values` are the statistic without each of G patients, `freedom` the degrees of freedom of Student's t where they
-    are fewer than G - 1. ``log`` works on the logarithm (figures above 0: the interval then stays above 0), ``linear``
-    on the figure, ``fisher`` on the inverse hyperbolic tangent (coefficients between -1 and 1), ``slope`` as ``log``
-    where the figure is above 0 with every patient left out, else as ``linear``. With fewer than `MIN_PATIENTS`
-    patients, or where the values do not exist or do not differ, it is undefined.
+    are fewer than G - 1. ``log`` works on the logarithm (of figures above 0: the interval stays above 0), ``linear`` on
+    the figure, ``fisher`` on the inverse hyperbolic tangent (of coefficients between -1 and 1), ``slope`` as ``log``
+    where all values are above 0, else as ``linear``. Undefined with fewer than `MIN_PATIENTS` patients, or where the
+    values do not exist or do not differ.
 
     .. math:: \hat\theta \pm t_{G-1}\sqrt{\tfrac{G-1}{G}\sum_g (\hat\theta_{(g)} - \bar\theta_{(\cdot)})^2}
 
@@ -55,13 +55,13 @@ def interval_from_values(
     need_patients(groups)
     if scale == "slope":
         scale = "log" if value > 0 and np.all(values > 0) else "linear"
-    everything, others = float(on_scale(value, scale)), on_scale(values, scale)
-    variance = (groups - 1) / groups * float(np.sum((others - others.mean()) ** 2))
-    if variance <= (1e-12 * max(1.0, abs(everything))) ** 2:
+    centre, left_out = float(on_scale(value, scale)), on_scale(values, scale)
+    variance = (groups - 1) / groups * float(np.sum((left_out - left_out.mean()) ** 2))
+    if variance <= (1e-12 * max(1.0, abs(centre))) ** 2:
         raise UndefinedError("the figure is the same whichever patient is left out, so its error cannot be estimated")
     degrees = groups - 1 if freedom is None else min(max(freedom, 1.0), groups - 1)
     reach = float(stdtrit(degrees, 0.5 + 0.5 * confidence)) * math.sqrt(variance)
-    low, high = everything - reach, everything + reach
+    low, high = centre - reach, centre + reach
     if scale == "linear":
         return low, high
     if scale == "fisher":
@@ -96,17 +96,17 @@ def kurtosis_freedom(values: npt.NDArray[np.float64]) -> float:
 
 
 def on_scale(values: float | FloatArray, scale: Scale) -> FloatArray:
-    """Transform values to a scale: unchanged, logarithms, or Fisher's z; `UndefinedError` where one has none."""
-    found = np.asarray(values, dtype=np.float64)
+    """Values on a scale: unchanged, logarithms, or Fisher's z; `UndefinedError` where one has none."""
+    numbers = np.asarray(values, dtype=np.float64)
     if scale == "linear":
-        return found
+        return numbers
     if scale == "fisher":
-        if np.any(np.abs(found) >= 1):
+        if np.any(np.abs(numbers) >= 1):
             raise UndefinedError("the coefficient is 1 or -1, or becomes so without one patient")
-        return np.arctanh(found)
-    if np.any(found <= 0):
+        return np.arctanh(numbers)
+    if np.any(numbers <= 0):
         raise UndefinedError("the figure is 0, or becomes 0 without one patient, and has no logarithm")
-    return np.log(found)
+    return np.log(numbers)
 
 
 # --- Statistics that depend on masses only through sums, so that resampling patients is cheap.
@@ -118,7 +118,7 @@ class SumStatistic(Record):
     terms: Callable[[ModalitySizes], FloatArray]
     """(n, k) array of what each mass adds; raises `UndefinedError` where the masses leave the figure undefined."""
     finish: Callable[[FloatArray], FloatArray]
-    """The figure from the (..., k) sums, for all leading axes at once; NaN where it does not exist."""
+    """The figure from (..., k) sums, over any leading axes; NaN where it does not exist."""
     undefined: str = "the masses do not determine it"  #: The reason when `finish` gives NaN.
 
     def __call__(self, sizes: ModalitySizes) -> float:
@@ -177,14 +177,14 @@ def clopper_pearson(k: float, n: float, *, confidence: float) -> tuple[float, fl
 
 # --- Bootstrap intervals over patients (BCa), keeping a patient's masses together.
 
-_LEAST_DEFINED = 0.99  #: Of the redrawn trials, at least this share must have the figure at all.
+_LEAST_DEFINED = 0.99  #: Share of the redrawn trials in which the figure must exist.
 
 
 class Intervals(Record):
-    """How the intervals of figures are made: their probability and their method.
+    """Settings of the intervals of figures.
 
-    ``corrected`` is the jackknife with the corrections of record 0077; ``bca`` draws the patients `resamples` times.
-    The seed is also that of the sign flips.
+    Method ``corrected`` is the jackknife with the corrections of record 0077; ``bca`` draws the patients `resamples`
+    times. The seed is also that of the sign flips.
     """
 
     probability: float = 0.95
@@ -198,7 +198,7 @@ JACKKNIFE = Intervals()
 
 @lru_cache(maxsize=8)
 def draw_patients(patients: int, *, resamples: int, seed: int) -> FloatArray:
-    """(resamples, patients) how often each patient is drawn, with replacement; equal for every figure."""
+    """(resamples, patients) numbers of times that each patient is drawn with replacement, for every figure alike."""
     rng = np.random.default_rng([seed, patients])
     draws = rng.multinomial(patients, np.full(patients, 1 / patients), size=resamples).astype(np.float64)
     draws.flags.writeable = False
@@ -229,7 +229,7 @@ def bca_interval(value: float, drawn: FloatArray, left_out: FloatArray, *, confi
 
 # --- A figure of a trial: a number, its interval, and the reason where one of them is missing.
 
-LARGEST = 1e150  #: Room above for percent and squares; NaN fails the comparison too.
+LARGEST = 1e150  #: Larger figures are refused: percent and squares of them would overflow. NaN fails `<` too.
 
 Statistic = Callable[[ModalitySizes], float]
 
@@ -240,21 +240,21 @@ class Figure(Record):
     value: float | None  #: None where the data leave it undefined; `reason` then says why.
     reason: str = ""
     interval: tuple[float, float] | None = None
-    """Low and high end, None where none is given; `interval_reason` says why when one was asked for."""
+    """Low and high end; None where there is none, and `interval_reason` says why if the figure has intervals."""
     interval_reason: str = ""
-    has_interval: bool = False  #: Whether an interval belongs to this figure at all.
+    has_interval: bool = False  #: True for a figure that is reported with an interval, even where it is undefined.
 
     def mapped(self, function: Callable[[float], float]) -> Figure:
         """Convert the figure by a monotonic function; ends beyond double precision drop the interval."""
         ends = self.interval
-        one = replace(self, value=None if self.value is None else function(self.value))
+        mapped = replace(self, value=None if self.value is None else function(self.value))
         if ends is None:
-            return one
+            return mapped
         with contextlib.suppress(OverflowError):
             low, high = sorted(map(function, ends))
             if abs(low) < LARGEST and abs(high) < LARGEST:
-                return replace(one, interval=(low, high))
-        return replace(one, interval=None, interval_reason="the interval is wider than double precision holds")
+                return replace(mapped, interval=(low, high))
+        return replace(mapped, interval=None, interval_reason="the interval is wider than double precision holds")
 
 
 Ends = tuple[float, float]
@@ -271,24 +271,28 @@ class Figures(Record):
         """A figure with its interval, by its name."""
         interval, reasons = f"{name}_interval", getattr(self, "reasons", {})
         ends: Any = getattr(self, interval, UNSET)
-        given = ends is not UNSET
+        has_interval = ends is not UNSET
         return Figure(
-            getattr(self, name), reasons.get(name, ""), ends if given else None, reasons.get(interval, ""), given
+            getattr(self, name),
+            reasons.get(name, ""),
+            ends if has_interval else None,
+            reasons.get(interval, ""),
+            has_interval,
         )
 
 
 def fields_of(figures: Mapping[str, Figure]) -> dict[str, Any]:
-    """Fields of a record of `Figures`."""
+    """Fields of a `Figures` record: values, intervals, and reasons for those that are missing."""
     fields: dict[str, Any] = {}
     reasons: dict[str, str] = {}
-    for name, one in figures.items():
-        fields[name] = one.value
-        if one.value is None:
-            reasons[name] = one.reason
-        if one.has_interval:
-            fields[f"{name}_interval"] = one.interval
-            if one.interval is None:
-                reasons[f"{name}_interval"] = one.interval_reason
+    for name, item in figures.items():
+        fields[name] = item.value
+        if item.value is None:
+            reasons[name] = item.reason
+        if item.has_interval:
+            fields[f"{name}_interval"] = item.interval
+            if item.interval is None:
+                reasons[f"{name}_interval"] = item.interval_reason
     return {**fields, "reasons": reasons}
 
 
@@ -308,7 +312,7 @@ def figure(
     """
     if scale is None or intervals is None:
         try:
-            return Figure(finite(statistic, sizes))
+            return Figure(evaluate(statistic, sizes))
         except UndefinedError as undefined:
             return Figure(None, str(undefined))
     freedom = None
@@ -322,7 +326,7 @@ class Sample(Record):
 
     statistic: Statistic
     sizes: tuple[ModalitySizes, ...]
-    combine: Callable[..., FloatArray] = lambda one: one  #: Of the statistics of all modalities.
+    combine: Callable[..., FloatArray] = lambda value: value  #: Combines the statistics of all modalities.
     undefined: str = ""  #: The reason when `combine` gives NaN.
 
     @property
@@ -332,7 +336,7 @@ class Sample(Record):
 
     def value(self) -> float:
         """The statistic from all patients."""
-        return self._combined([np.array(finite(self.statistic, one)) for one in self.sizes]).item()
+        return self._combined([np.array(evaluate(self.statistic, one)) for one in self.sizes]).item()
 
     def left_out(self) -> FloatArray:
         """(g,) statistic without each patient."""
@@ -340,32 +344,35 @@ class Sample(Record):
 
     def redrawn(self, draws: FloatArray) -> FloatArray:
         """(b,) statistic for each row of (b, g) counts of patients; NaN where undefined."""
-        return self.combine(*(self._drawn_anew(one, self.patients, draws) for one in self.sizes))
+        return self.combine(*(self._redrawn_one(one, self.patients, draws) for one in self.sizes))
 
-    def _combined(self, values: Sequence[FloatArray], where: str = "") -> FloatArray:
-        made = self.combine(*values)
-        if np.any(np.isnan(made)):
-            raise UndefinedError(self.undefined + where)
-        return made
+    def _combined(self, values: Sequence[FloatArray], when: str = "") -> FloatArray:
+        """The combined statistics; `UndefinedError` with the reason and `when` where one does not exist."""
+        combined = self.combine(*values)
+        if np.any(np.isnan(combined)):
+            raise UndefinedError(self.undefined + when)
+        return combined
 
     def _without_each(self, sizes: ModalitySizes, patients: npt.NDArray[np.int64]) -> FloatArray:
+        """(g,) statistic of one modality without each patient, from sums where they suffice."""
         if isinstance(self.statistic, SumStatistic):
             with np.errstate(all="ignore"):
                 sums = self.statistic.by_patient(sizes, patients)
                 values = self.statistic.finish(sums.sum(axis=0) - sums)
             if np.all(np.abs(values) < LARGEST):
-                return values
-        return np.array([finite(self.statistic, sizes.only(sizes.patient != one)) for one in patients])
+                return values  # else one by one below, for the reason why one is undefined
+        return np.array([evaluate(self.statistic, sizes.only(sizes.patient != patient)) for patient in patients])
 
-    def _drawn_anew(self, sizes: ModalitySizes, patients: npt.NDArray[np.int64], draws: FloatArray) -> FloatArray:
+    def _redrawn_one(self, sizes: ModalitySizes, patients: npt.NDArray[np.int64], draws: FloatArray) -> FloatArray:
+        """(b,) statistic of one modality for each row of counts; NaN where undefined."""
         if isinstance(self.statistic, SumStatistic):
             with np.errstate(all="ignore"):
                 return self.statistic.finish(draws @ self.statistic.by_patient(sizes, patients))
         values = np.full(len(draws), np.nan)
-        times = draws[:, np.searchsorted(patients, sizes.patient)].astype(np.int64)
-        for i, of_mass in enumerate(times):
+        counts = draws[:, np.searchsorted(patients, sizes.patient)].astype(np.int64)
+        for i, count in enumerate(counts):
             with contextlib.suppress(UndefinedError):
-                values[i] = finite(self.statistic, sizes.take(np.repeat(np.arange(len(of_mass)), of_mass)))
+                values[i] = evaluate(self.statistic, sizes.take(np.repeat(np.arange(len(count)), count)))
         return values
 
 
@@ -387,8 +394,8 @@ def resampled(sample: Sample, *, scale: Scale, intervals: Intervals, freedom: fl
     return Figure(value, interval=interval, has_interval=True)
 
 
-def finite(statistic: Statistic, sizes: ModalitySizes) -> float:
-    """Compute the statistic; `UndefinedError` where double precision cannot hold it."""
+def evaluate(statistic: Statistic, sizes: ModalitySizes) -> float:
+    """Value of the statistic; `UndefinedError` where double precision cannot hold it."""
     with np.errstate(all="ignore"):
         value = float(statistic(sizes))
     if not abs(value) < LARGEST:

@@ -1,4 +1,4 @@
-"""Lines between two methods: Deming, Passing-Bablok, concordance."""
+"""Lines between two methods: least squares, Deming and Passing-Bablok; and Lin's concordance."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from tactile_bayes.trial.readings import FloatArray
 
 # Up to so many points the pairs are listed (2 million of them); beyond, ranks are found by counting inversions.
 MOST_LISTED = 2000
-RESOLUTION = 1e-9  #: Beyond MOST_LISTED an ordered angle is found to this many radians.
-# Differences below this share of the numbers themselves are rounding, as in laboratories' programs, and as between
-# averages of equal replicates.
+RESOLUTION = 1e-9  #: Error of an ordered angle in radians, for more points than `MOST_LISTED`.
+# Smaller differences, as a share of the numbers, are rounding: those between averages of equal replicates. Laboratory
+# programs take them as ties, too.
 EQUAL = 1e-12
 
 
@@ -39,7 +39,7 @@ class PairAngles:
             self._upright = _pairs_of_equals(self._x[:, None]) - self._coincident
             self.number = len(x) * (len(x) - 1) // 2 - self._coincident
         else:
-            self._angles = _listed(x, y, vertical)
+            self._angles = _sorted_angles(x, y, vertical)
             self.number = len(self._angles)
 
     def below(self, angle: float, *, inclusive: bool) -> int:
@@ -48,13 +48,13 @@ class PairAngles:
             return int(np.searchsorted(self._angles, angle, side="right" if inclusive else "left"))
         slope = math.copysign(1.0, angle) if abs(angle) == math.pi / 4 else math.tan(angle)
         z = self._y - slope * self._x
-        grain = EQUAL * (np.abs(self._y).max() + abs(slope) * np.abs(self._x).max())
-        z = np.rint(z / grain) if grain > 0 else z
-        upright = self._upright if self._vertical < 0 else 0
-        return _inversions(self._x, z, ties=inclusive) + upright - (self._coincident if inclusive else 0)
+        rounding = EQUAL * (np.abs(self._y).max() + abs(slope) * np.abs(self._x).max())
+        z = np.rint(z / rounding) if rounding > 0 else z
+        vertical_pairs = self._upright if self._vertical < 0 else 0
+        return _count_inversions(self._x, z, ties=inclusive) + vertical_pairs - (self._coincident if inclusive else 0)
 
     def ranked(self, rank: int) -> float:
-        """The angle of a rank, from 1."""
+        """Angle of a rank, counted from 1."""
         if not self._counted:
             return float(self._angles[rank - 1])
         low, high = -math.pi / 2, math.pi / 2
@@ -64,7 +64,7 @@ class PairAngles:
         return high
 
     def shift(self, *, rising: bool) -> int:
-        """Twice the shift of the median's rank: one for each angle beyond 45 degrees against the line, half at it."""
+        """Twice the shift of the median's rank: 2 for each angle steeper than 45 degrees against the line, 1 at it."""
         if rising:
             return self.below(-math.pi / 4, inclusive=True) + self.below(-math.pi / 4, inclusive=False)
         on_or_above = self.number - self.below(math.pi / 4, inclusive=False)
@@ -73,23 +73,25 @@ class PairAngles:
 
 def kendall_sign(x: FloatArray, y: FloatArray) -> int:
     """Sign of Kendall's tau: concordant less discordant pairs."""
-    discordant = _inversions(x, y, ties=False)
+    discordant = _count_inversions(x, y, ties=False)
     tied = _pairs_of_equals(x[:, None]) + _pairs_of_equals(y[:, None])
     both = _pairs_of_equals(np.stack([x, y], axis=1))
     concordant = len(x) * (len(x) - 1) // 2 - tied + both - discordant
     return (concordant > discordant) - (concordant < discordant)
 
 
-def _listed(x: FloatArray, y: FloatArray, vertical: float) -> FloatArray:
+def _sorted_angles(x: FloatArray, y: FloatArray, vertical: float) -> FloatArray:
+    """Ascending angles of all pairs of points that do not coincide."""
     first, second = np.triu_indices(len(x), 1)
     dx, dy = _difference(x[second], x[first]), _difference(y[second], y[first])
-    apart = (dx != 0) | (dy != 0)
-    dx, dy = dx[apart], dy[apart]
-    upright = dx == 0
-    return np.sort(np.where(upright, vertical, np.arctan(dy / np.where(upright, 1.0, dx))))
+    distinct = (dx != 0) | (dy != 0)
+    dx, dy = dx[distinct], dy[distinct]
+    is_vertical = dx == 0
+    return np.sort(np.where(is_vertical, vertical, np.arctan(dy / np.where(is_vertical, 1.0, dx))))
 
 
 def _difference(a: FloatArray, b: FloatArray) -> FloatArray:
+    """a - b, 0 where it is rounding."""
     difference = a - b
     return np.where(np.abs(difference) < EQUAL * (np.abs(a) + np.abs(b)) / 2, 0.0, difference)
 
@@ -100,14 +102,14 @@ def _pairs_of_equals(rows: FloatArray) -> int:
     return int(np.sum(number * (number - 1) // 2))
 
 
-def _inversions(x: FloatArray, z: FloatArray, *, ties: bool) -> int:
-    """Number of pairs of ascending x whose z descends; with `ties`, also pairs of equal z, or of equal x and z."""
-    place_of, seen, number = bisect_left if ties else bisect_right, list[float](), 0
+def _count_inversions(x: FloatArray, z: FloatArray, *, ties: bool) -> int:
+    """Number of pairs whose z falls as x rises; with `ties`, also pairs of equal z, or of equal x and z."""
+    insertion_point, earlier, count = bisect_left if ties else bisect_right, list[float](), 0
     for value in z[np.lexsort((z, x))].tolist():
-        place = place_of(seen, value)
-        number += len(seen) - place
-        seen.insert(place, value)
-    return number
+        position = insertion_point(earlier, value)
+        count += len(earlier) - position
+        earlier.insert(position, value)
+    return count
 
 
 class Line(Record):
@@ -121,10 +123,10 @@ class Line(Record):
     """`intercept_se`, `slope_se`: Analytic standard errors, as if the pairs were independent; None where there is no
     formula."""
     stated: tuple[Ends, Ends] | None = None
-    """Intervals of intercept and slope that the fit itself gives; infinite for few pairs."""
+    """Intervals of intercept and slope where the fit gives them in place of standard errors; infinite for few pairs."""
 
     def intervals(self, *, confidence: float) -> tuple[Ends, Ends] | None:
-        """Analytic intervals of intercept and slope, by Student's t with n - 2 degrees of freedom, or those stated."""
+        """Analytic intervals of intercept and slope: by Student's t with n - 2 degrees of freedom, or `stated`."""
         if self.intercept_se is None or self.slope_se is None:
             return self.stated
         t = student(self.n - 2, confidence=confidence)
@@ -145,15 +147,15 @@ class Line(Record):
 def passing_bablok(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) -> Line:
     """Fit y on x without assuming a distribution or knowing which method errs more.
 
-    Undefined with fewer than two different points, when the middle slope is vertical, or when so many slopes are beyond
-    45 degrees against the line that the shifted median lies beyond the last.
+    Undefined with fewer than two different points, when the middle slope is vertical, or when so many slopes are
+    steeper than 45 degrees against the line that the shifted median lies beyond the last.
 
     Passing & Bablok (1983), J. Clin. Chem. Clin. Biochem. 21, 709, for a line that rises; the mirror image for one that
     falls. The intercept is the median of y - slope x. Slope ends are order statistics at the shifted median -+
     :math:`z\\sqrt{n(n-1)(2n+5)/18}/2`, intercept ends the medians for the two slope ends. When either slope end lies
     beyond the ordered slopes, both ends of both intervals are infinite.
     """
-    _need_two(x)
+    _require_two_masses(x)
     rising = kendall_sign(x, y) >= 0
     angles = PairAngles(x, y, vertical=math.pi / 2 if rising else -math.pi / 2)
     if angles.number == 0:
@@ -161,7 +163,7 @@ def passing_bablok(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) ->
     shift = angles.shift(rising=rising)
     if (angles.number + shift) // 2 + 1 > angles.number or angles.number + shift < 1:
         raise UndefinedError("the shifted median lies beyond the slopes: the points neither rise nor fall")
-    slope = _at(angles, angles.number + shift)
+    slope = _slope_at_rank(angles, angles.number + shift)
     if not abs(slope) < 1e15:
         raise UndefinedError("the middle slope is vertical")
     # slope ends beyond the slopes themselves, or among those of -1 (+1 for a falling line), say nothing of the line
@@ -171,17 +173,17 @@ def passing_bablok(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) ->
     least = 2 * (angles.below(against, inclusive=True) - angles.below(against, inclusive=False)) + 1
     slopes = intercepts = (-math.inf, math.inf)
     if (low + 1) // 2 >= least and (high + 1) // 2 <= angles.number - (high % 2 == 0):
-        slopes = _at(angles, low), _at(angles, high)
+        slopes = _slope_at_rank(angles, low), _slope_at_rank(angles, high)
         if all(abs(end) < 1e15 for end in slopes):
             intercepts = float(np.median(y - slopes[1] * x)), float(np.median(y - slopes[0] * x))
     return Line(float(np.median(y - slope * x)), slope, n, stated=(intercepts, slopes))
 
 
-def _at(angles: PairAngles, twice: int) -> float:
+def _slope_at_rank(angles: PairAngles, twice_rank: int) -> float:
     """The slope at rank (twice + 1) / 2: one ordered angle, or the middle of two."""
-    rank = (twice + 1) // 2
+    rank = (twice_rank + 1) // 2
     first = angles.ranked(rank)
-    return math.tan(first if twice % 2 else (first + angles.ranked(rank + 1)) / 2)
+    return math.tan(first if twice_rank % 2 else (first + angles.ranked(rank + 1)) / 2)
 
 
 # --- Straight lines between two methods: least squares, Deming and weighted Deming regression.
@@ -193,8 +195,8 @@ def _at(angles: PairAngles, twice: int) -> float:
 
 def least_squares(x: FloatArray, y: FloatArray) -> Line:
     """Fit by least vertical squares; undefined with fewer than two different x."""
-    _need_two(x)
-    mean_x, mean_y, u, _, p = _moments(x, y, np.ones_like(x))
+    _require_two_masses(x)
+    mean_x, mean_y, u, _, p = _weighted_moments(x, y, np.ones_like(x))
     if u == 0:
         raise UndefinedError("all reference values are equal, so no line is determined")
     slope = p / u
@@ -220,8 +222,8 @@ def deming(x: FloatArray, y: FloatArray, *, error_ratio: float = 1.0) -> Line:
     """
     if not 0 < error_ratio < math.inf:
         raise ValueError(f"error_ratio is {error_ratio}; give a variance of x over that of y, above 0")
-    _need_two(x)
-    mean_x, mean_y, u, q, p = _moments(x, y, np.ones_like(x))
+    _require_two_masses(x)
+    mean_x, mean_y, u, q, p = _weighted_moments(x, y, np.ones_like(x))
     slope = deming_slope(u, q, p, error_ratio)
     intercept = mean_y - slope * mean_x
     if len(x) < 3 or slope == 0:
@@ -247,12 +249,12 @@ def weighted_deming(
     line = deming(x, y, error_ratio=error_ratio)
     intercept, slope = line.intercept, line.slope
     for _ in range(max_iterations):
-        weights = _by_size(x, y, intercept, slope, error_ratio)
-        mean_x, mean_y, u, q, p = _moments(x, y, weights)
-        before = intercept, slope
+        weights = _size_weights(x, y, intercept, slope, error_ratio)
+        mean_x, mean_y, u, q, p = _weighted_moments(x, y, weights)
+        previous = intercept, slope
         slope = deming_slope(u, q, p, error_ratio)
         intercept = mean_y - slope * mean_x
-        if abs(slope - before[1]) < threshold and abs(intercept - before[0]) < threshold:
+        if abs(slope - previous[1]) < threshold and abs(intercept - previous[0]) < threshold:
             break
     return Line(intercept, slope, len(x))
 
@@ -283,7 +285,7 @@ def deming_slopes(u: FloatArray, q: FloatArray, p: FloatArray, *, error_ratio: f
 
 
 def deming_slope(u: float, q: float, p: float, error_ratio: float) -> float:
-    """One of them, in floats: weighted lines ask for hundreds. Undefined where the line is vertical."""
+    """`deming_slopes` of one sample, in floats for speed; undefined where the line is vertical."""
     d, p = error_ratio * q - u, 0.0 if abs(p) <= EQUAL * math.sqrt(u * q) else p
     root = math.hypot(d, 2 * math.sqrt(error_ratio) * p)
     if d < 0:
@@ -294,7 +296,7 @@ def deming_slope(u: float, q: float, p: float, error_ratio: float) -> float:
 
 
 def all_equal(values: FloatArray) -> bool:
-    """Whether (n,) values, n > 0, differ by rounding only."""
+    """True if (n,) values, n > 0, differ by rounding only."""
     return bool(np.ptp(values) <= EQUAL * np.abs(values).max())
 
 
@@ -309,17 +311,17 @@ def student(freedom: float, *, confidence: float) -> float:
     return float(stdtrit(freedom, 0.5 + 0.5 * confidence))
 
 
-def _by_size(x: FloatArray, y: FloatArray, intercept: float, slope: float, error_ratio: float) -> FloatArray:
+def _size_weights(x: FloatArray, y: FloatArray, intercept: float, slope: float, error_ratio: float) -> FloatArray:
     """1 over the squared size at each pair by the line."""
-    off = y - intercept - slope * x
-    share = off / (1 + error_ratio * slope**2)
-    size = (x + error_ratio * slope * share + error_ratio * (y - share)) / (1 + error_ratio)
+    residual = y - intercept - slope * x
+    y_correction = residual / (1 + error_ratio * slope**2)
+    size = (x + error_ratio * slope * y_correction + error_ratio * (y - y_correction)) / (1 + error_ratio)
     if np.any(size == 0):
         raise UndefinedError("the line gives one pair the size 0, which has no weight")
     return np.asarray(size**-2.0)
 
 
-def _moments(x: FloatArray, y: FloatArray, w: FloatArray) -> tuple[float, float, float, float, float]:
+def _weighted_moments(x: FloatArray, y: FloatArray, w: FloatArray) -> tuple[float, float, float, float, float]:
     """Weighted means of x and y, and sums of squares and products about them."""
     total = w.sum()
     mean_x, mean_y = float(w @ x / total), float(w @ y / total)
@@ -327,7 +329,7 @@ def _moments(x: FloatArray, y: FloatArray, w: FloatArray) -> tuple[float, float,
     return mean_x, mean_y, float(w @ dx**2), float(w @ dy**2), float(w @ (dx * dy))
 
 
-def _need_two(x: FloatArray) -> None:
+def _require_two_masses(x: FloatArray) -> None:
     if len(x) < 2:
         raise UndefinedError(f"a line needs at least 2 masses (found {len(x)})")
 
@@ -372,11 +374,11 @@ def concordance(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) -> Co
         bias_correction=2 / (scale + 1 / scale + shift**2),
         scale_shift=scale,
         location_shift=shift,
-        interval=_fisher(rho, r, shift, n, confidence),
+        interval=_fisher_interval(rho, r, shift, n, confidence),
     )
 
 
-def _fisher(rho: float, r: float, shift: float, n: int, confidence: float) -> tuple[float, float] | None:
+def _fisher_interval(rho: float, r: float, shift: float, n: int, confidence: float) -> tuple[float, float] | None:
     if n < 4 or r == 0 or abs(rho) >= 1:
         return None
     spread = (1 - r**2) * rho**2 * (1 - rho**2) / r**2 + 2 * rho**3 * (1 - rho) * shift**2 / r

@@ -37,7 +37,7 @@ from tactile_bayes.trial.readings import FloatArray, ModalitySizes
 
 # --- Exact factors k such that mean + k SD of a normal sample bounds its percentiles with a stated confidence.
 
-_NODES = 400
+_NODES, _MOST_OFFSET = 400, 9.0  # of the quadrature over the sample's mean
 
 
 def percentile_factor(n: int, *, percentile: float, confidence: float) -> float:
@@ -56,21 +56,20 @@ def content_factor(n: int, *, content: float, confidence: float) -> float:
     Two-sided tolerance factor of Wald & Wolfowitz (1946), exact as in Odeh & Owen (1980); Carkeet (2015) uses it for
     the two limits of agreement taken as a pair.
     """
-    at, normal = np.polynomial.legendre.leggauss(_NODES)
-    reach = min(9.0, float(ndtri(1 - 1e-17)))
-    off = (at + 1) / 2 * reach
-    weight = normal / 2 * reach * 2 * np.exp(-(off**2) / 2) / math.sqrt(2 * math.pi)
-    radius2, freedom = chndtrix(content, 1, off**2 / n), n - 1  # Phi(shift + r) - Phi(shift - r) = content
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    offset = (nodes + 1) / 2 * _MOST_OFFSET  # of the sample's mean, in standard errors
+    weight = weights / 2 * _MOST_OFFSET * 2 * np.exp(-(offset**2) / 2) / math.sqrt(2 * math.pi)
+    radius2, freedom = chndtrix(content, 1, offset**2 / n), n - 1  # Phi(shift + r) - Phi(shift - r) = content
 
-    def reached(k: float) -> float:
+    def confidence_at(k: float) -> float:
         return float(weight @ gammaincc(freedom / 2, freedom * radius2 / k**2 / 2))
 
     low, high = 0.0, 1.0
-    while reached(high) < confidence and high < 1e12:
+    while confidence_at(high) < confidence and high < 1e12:
         low, high = high, 4 * high
     while high - low > 1e-13 * high:
         middle = (low + high) / 2
-        low, high = (middle, high) if reached(middle) < confidence else (low, middle)
+        low, high = (middle, high) if confidence_at(middle) < confidence else (low, middle)
     return (low + high) / 2
 
 
@@ -78,10 +77,10 @@ def content_factor(n: int, *, content: float, confidence: float) -> float:
 #
 # Differences are the method under test less the reference, y - x. Intervals take the masses as independent; where a
 # patient has several masses the jackknife over patients stands beside them.
-# Share of the differences that lie between the limits.
-SHARE = 0.95
+
+SHARE = 0.95  #: Share of the differences that lie between the limits.
 _REACH = float(ndtri(0.5 + 0.5 * SHARE))  #: SDs of a normal distribution within which they lie.
-# Times that errors proportional to size must be likelier than constant ones, and masses needed to judge it.
+# Likelihood ratio above which errors count as proportional to size, and masses needed to judge it.
 LIKELIER = 3.0
 LEAST_MASSES = 8
 
@@ -117,19 +116,19 @@ def limits(differences: FloatArray, *, confidence: float = 0.95) -> Limits:
     :math:`s\sqrt{1/n + z^2/(2(n-1))}` for the approximate intervals. The exact ones are tolerance factors: Carkeet
     (2015), Optom. Vis. Sci. 92, e71.
     """
-    found = _limits_of_means(differences, 0.0, confidence=confidence)
-    n, bias, sd, z, tail = found.n, found.bias, found.sd, _REACH, 0.5 + 0.5 * confidence
-    inner = percentile_factor(n, percentile=0.5 + 0.5 * SHARE, confidence=1 - tail)
-    outer = percentile_factor(n, percentile=0.5 + 0.5 * SHARE, confidence=tail)
+    plain = _limits_of_means(differences, 0.0, confidence=confidence)
+    n, bias, sd, z, tail = plain.n, plain.bias, plain.sd, _REACH, 0.5 + 0.5 * confidence
+    k_near = percentile_factor(n, percentile=0.5 + 0.5 * SHARE, confidence=1 - tail)
+    k_far = percentile_factor(n, percentile=0.5 + 0.5 * SHARE, confidence=tail)
     pair = [content_factor(n, content=SHARE, confidence=c) for c in (1 - tail, tail)]
     reach = lines.student(n - 1, confidence=confidence) * math.sqrt(1 / n + z * z / (2 * (n - 1)))
 
-    def both(near: float, far: float) -> tuple[Ends, Ends]:
+    def symmetric(near: float, far: float) -> tuple[Ends, Ends]:
         return (bias - far * sd, bias - near * sd), (bias + near * sd, bias + far * sd)
 
-    low, high = both(inner, outer)
-    pairs, approximate = both(*pair), both(z - reach, z + reach)
-    return replace(found, low_interval=low, high_interval=high, pair_intervals=pairs, approximate_intervals=approximate)
+    low, high = symmetric(k_near, k_far)
+    pairs, approximate = symmetric(*pair), symmetric(z - reach, z + reach)
+    return replace(plain, low_interval=low, high_interval=high, pair_intervals=pairs, approximate_intervals=approximate)
 
 
 def limits_unlinked(x: Sequence[FloatArray], y: Sequence[FloatArray], *, confidence: float = 0.95) -> Limits:
@@ -146,21 +145,21 @@ def limits_unlinked(x: Sequence[FloatArray], y: Sequence[FloatArray], *, confide
     (2013), Stat. Methods Med. Res. 22, 630.
     """
     means = np.array([b.mean() - a.mean() for a, b in zip(x, y, strict=True)])
-    reference, own = _averaged_out(x), _averaged_out(y)
-    found = _limits_of_means(means, reference[0] + own[0], confidence=confidence)
+    reference, within = _averaged_out(x), _averaged_out(y)
+    plain = _limits_of_means(means, reference[0] + within[0], confidence=confidence)
     between = float(means.var(ddof=1))
-    parts = {"means": (between, found.n - 1), "reference_within": reference, "within": own}
-    wide, narrow = _recovered(list(parts.values()), found.sd**2, bias_variance=between / found.n, confidence=confidence)
+    parts = {"means": (between, plain.n - 1), "reference_within": reference, "within": within}
+    outer, inner = _recovered(list(parts.values()), plain.sd**2, bias_variance=between / plain.n, confidence=confidence)
     return replace(
-        found,
-        low_interval=(found.low - wide, found.low + narrow),
-        high_interval=(found.high - narrow, found.high + wide),
+        plain,
+        low_interval=(plain.low - outer, plain.low + inner),
+        high_interval=(plain.high - inner, plain.high + outer),
         components={name: variance for name, (variance, _) in parts.items()},
     )
 
 
 def _limits_of_means(differences: FloatArray, averaged_out: float, *, confidence: float) -> Limits:
-    """Limits without intervals of their own; averaging over replicates took this variance out of the differences."""
+    """Limits without their intervals, from differences of means; `averaged_out` is the variance lost by averaging."""
     n = len(differences)
     if n < 2:
         raise UndefinedError(f"limits of agreement need at least 2 masses (found {n})")
@@ -178,7 +177,7 @@ def _averaged_out(groups: Sequence[FloatArray]) -> tuple[float, int]:
 
 
 class Trend(Record):
-    """How differences change with size: slope of a least-squares line, per unit of size, with its t test."""
+    """Slope of the differences on size by least squares, per unit of size, with its t test."""
 
     slope: float
     interval: Ends | None
@@ -192,18 +191,16 @@ def trend(differences: FloatArray, sizes: FloatArray, *, confidence: float = 0.9
     the reference itself (Krouwer 2008, Stat. Med. 27, 778): against the mean, unequal errors alone make a slope.
     """
     line = lines.least_squares(sizes, differences)
-    both = line.intervals(confidence=confidence)
-    if both is None or line.slope_se is None:
+    intervals = line.intervals(confidence=confidence)
+    if intervals is None or line.slope_se is None:
         return Trend(line.slope, None, None)
     if line.slope_se == 0:
-        return Trend(line.slope, both[1], 1.0 if line.slope == 0 else 0.0)
-    return Trend(line.slope, both[1], 2 * float(stdtr(line.n - 2, -abs(line.slope) / line.slope_se)))
+        return Trend(line.slope, intervals[1], 1.0 if line.slope == 0 else 0.0)
+    return Trend(line.slope, intervals[1], 2 * float(stdtr(line.n - 2, -abs(line.slope) / line.slope_se)))
 
 
 def errors_are_proportional(x: FloatArray, y: FloatArray) -> bool:
-    r"""Whether normal ln y - ln x with one SD is likelier than normal y - x, by a factor of `LIKELIER`.
-
-    False for fewer than `LEAST_MASSES` masses.
+    r"""True if normal ln y - ln x is `LIKELIER` than normal y - x; False for fewer than `LEAST_MASSES` masses.
 
     Likelihoods of y, profiled over mean and SD as in Box & Cox (1964), J. R. Stat. Soc. B 26, 211: the logarithm's
     carries the Jacobian :math:`\prod 1/y`.
@@ -235,54 +232,61 @@ def _recovered(parts: Sequence[tuple[float, int]], total: float, *, bias_varianc
 
 # --- Limits of agreement with intervals over patients, for differences of any distribution and any masses per patient.
 #
-# The exact and the approximate intervals that other programs print take the masses as independent and the
-# differences as normal; they stand beside these in the JSON report.
+# The exact and the approximate intervals that other programs print, also in the JSON report, take the masses as
+# independent and the differences as normal.
 
-_ONE = "one mass has no spread"
+_NO_SPREAD = "one mass has no spread"
 
 
-def limit_figures(found: ModalitySizes, *, intervals: Intervals) -> dict[str, Figure]:
+def limit_figures(detected: ModalitySizes, *, intervals: Intervals) -> dict[str, Figure]:
     """Lower and upper limit in mm and as the logarithm of the ratio, for single readings of detected masses."""
     return {
-        f"limit_{side}_{unit}": _limit(terms, sign, found, intervals=intervals)
+        f"limit_{side}_{unit}": _limit(terms, sign, detected, intervals=intervals)
         for unit, terms in (("mm", partial(_limit_terms, np.asarray)), ("log_ratio", partial(_limit_terms, np.log)))
         for side, sign in (("low", -1), ("high", 1))
     }
 
 
 def _limit(
-    terms: Callable[[ModalitySizes], FloatArray], sign: int, found: ModalitySizes, *, intervals: Intervals
+    terms: Callable[[ModalitySizes], FloatArray], sign: int, detected: ModalitySizes, *, intervals: Intervals
 ) -> Figure:
-    """A limit; its corrected interval is from those of the mean and, on the log scale, of the SD (Zou 2013)."""
-    end = SumStatistic(terms, lambda sums: _limit_mean(sums) + sign * _REACH * _limit_sd(sums), _ONE)
-    plain = figure(end, found, scale="linear", intervals=intervals)
+    """A limit of agreement. Its corrected interval combines those of the mean and of the SD, on the log scale (Zou
+    2013)."""
+    end = SumStatistic(terms, lambda sums: _limit_mean(sums) + sign * _REACH * _limit_sd(sums), _NO_SPREAD)
+    plain = figure(end, detected, scale="linear", intervals=intervals)
     if intervals.method != "corrected" or plain.interval is None:
         return plain
+    jackknife = partial(_jackknife_interval, detected, terms, confidence=intervals.probability)
     try:
-        mean, around = _jackknifed(SumStatistic(terms, _limit_mean, _ONE), found, scale="linear", intervals=intervals)
-        sd, about = _jackknifed(SumStatistic(terms, _limit_sd, _ONE), found, scale="log", intervals=intervals)
+        mean, mean_ends = jackknife(_limit_mean, scale="linear")
+        sd, sd_ends = jackknife(_limit_sd, scale="log")
     except UndefinedError as undefined:
         return replace(plain, interval=None, interval_reason=str(undefined))
     limit = mean + sign * _REACH * sd
-    below, above = (_REACH * (sd - about[0]), _REACH * (about[1] - sd))[::sign]
-    ends = limit - math.hypot(mean - around[0], below), limit + math.hypot(around[1] - mean, above)
+    below, above = (_REACH * (sd - sd_ends[0]), _REACH * (sd_ends[1] - sd))[::sign]
+    ends = limit - math.hypot(mean - mean_ends[0], below), limit + math.hypot(mean_ends[1] - mean, above)
     return replace(plain, interval=ends)
 
 
-def _jackknifed(
-    statistic: SumStatistic, found: ModalitySizes, *, scale: Scale, intervals: Intervals
+def _jackknife_interval(
+    detected: ModalitySizes,
+    terms: Callable[[ModalitySizes], FloatArray],
+    finish: Callable[[FloatArray], FloatArray],
+    *,
+    scale: Scale,
+    confidence: float,
 ) -> tuple[float, Ends]:
-    """Value with its jackknife interval, and the degrees of freedom of its leave-one-out values."""
-    sample = Sample(statistic, (found,))
-    value, left = sample.value(), sample.left_out()
-    freedom = kurtosis_freedom(on_scale(left, scale))
-    return value, interval_from_values(value, left, scale=scale, confidence=intervals.probability, freedom=freedom)
+    """Value with its jackknife interval, whose degrees of freedom allow for few influential patients."""
+    sample = Sample(SumStatistic(terms, finish, _NO_SPREAD), (detected,))
+    value, left_out = sample.value(), sample.left_out()
+    freedom = kurtosis_freedom(on_scale(left_out, scale))
+    return value, interval_from_values(value, left_out, scale=scale, confidence=confidence, freedom=freedom)
 
 
 def _limit_terms(scale: Callable[[FloatArray], FloatArray], sizes: ModalitySizes) -> FloatArray:
-    """1, d, d', d'd', 1/m, squares about the mass's mean and their degrees of freedom; ' about the mean of all d.
+    """(n, 7) 1, d, d', d'd', 1/m, sum of squares within the mass and its degrees of freedom; ' about the mean of all d.
 
-    Differences d are on a scale, of the means of replicates on it.
+    Differences d, on a scale, are of the mean of a mass's m replicates.
     """
     if len(sizes.size_mm) == 0:
         raise UndefinedError("no mass was detected")
@@ -301,26 +305,26 @@ def _limit_mean(sums: FloatArray) -> FloatArray:
 
 
 def _limit_sd(sums: FloatArray) -> FloatArray:
-    """SD of one difference: that of the masses' means, plus the part that averaging over replicates removed."""
+    """SD of the difference of single readings: between masses, plus what averaging over replicates removed."""
     n, _, first, second, inverse, squares, freedom = np.moveaxis(sums, -1, 0)
     between = ratio(second - first**2 / n, n - 1)
     within = np.where(freedom > 0.5, ratio(squares, freedom), 0.0)
     return np.asarray(np.sqrt(np.maximum(between + (1 - inverse / n) * within, 0.0)))
 
 
-# --- Everything of one modality.
+# --- Method comparison of one modality: all figures and their intervals.
 
-# Lines that are not sums are fitted anew without each patient; beyond so many masses that takes too long.
+# Lines that are not sums are fitted anew without each patient; with more masses that takes too long.
 MOST_REFITTED = 300
-# Sizes beyond these have squares that double precision does not hold.
+# Squares of sizes beyond these overflow or vanish.
 _SMALLEST, _LARGEST = 1e-100, 1e100
 
-_T = TypeVar("_T")
+_Result = TypeVar("_Result")
 _Fit = Callable[[ModalitySizes], lines.Line]
 Unit = Literal["mm", "log_ratio"]
 Against = Literal["on_ex_vivo", "on_mean"]
 _Refitted = Ends | None | UnsetType
-"""The interval of a figure that has none where there are more than `MOST_REFITTED` masses."""
+"""An interval that is left out for more than `MOST_REFITTED` masses."""
 _LimitMm = Annotated[float, described("Limit of agreement in mm for single readings; the interval is over patients.")]
 _LimitLog = Annotated[
     float, described("Limit of agreement in ln(size / ex vivo) for single readings; the interval is over patients.")
@@ -328,7 +332,7 @@ _LimitLog = Annotated[
 
 
 class MethodComparison(Figures, kw_only=True):
-    """Detected masses as measurements: lines, concordance, limits of agreement, with intervals over patients."""
+    """Sizes of detected masses against excision: lines, concordance, limits, with intervals over patients."""
 
     masses: Count
     error_ratio: Annotated[float, Meta(gt=0)]  #: Variance of the ex-vivo error over that of the modality's.
@@ -374,25 +378,26 @@ class MethodComparison(Figures, kw_only=True):
 
 def compare_methods(sizes: ModalitySizes, *, intervals: Intervals, error_ratio: float = 1.0) -> MethodComparison:
     """Compare one modality's detected sizes with excision."""
-    found = sizes.only_detected()
-    x, y = found.ex_vivo_mm, found.size_mm
+    detected = sizes.only_detected()
+    x, y = detected.ex_vivo_mm, detected.size_mm
     robust = _fitted(partial(lines.passing_bablok, confidence=intervals.probability))
     slope: Scale = "slope" if intervals.method == "corrected" else "linear"
     figures: dict[str, Figure] = {}
     for name, statistic, scale in _statistics(error_ratio, robust, slope):
-        wanted = scale if isinstance(statistic, SumStatistic) or len(x) <= MOST_REFITTED else None
-        figures[name] = figure(statistic, found, scale=wanted, intervals=intervals, leverage=_squared_distance)
-    figures |= limit_figures(found, intervals=intervals)
-    judged, level = len(x) >= 2 and _squarable(x, y), intervals.probability
+        on = scale if isinstance(statistic, SumStatistic) or len(x) <= MOST_REFITTED else None
+        figures[name] = figure(statistic, detected, scale=on, intervals=intervals, leverage=_squared_distance)
+    figures |= limit_figures(detected, intervals=intervals)
+    measurable, level = len(x) >= 2 and _can_be_squared(x, y), intervals.probability
+    analytic = _analytic_intervals(detected, robust, confidence=level, error_ratio=error_ratio) if measurable else {}
     return MethodComparison(
         masses=len(x),
         error_ratio=error_ratio,
         **fields_of(figures),
-        analytic_intervals=_analytic(found, robust, confidence=level, error_ratio=error_ratio) if judged else {},
-        limits=_limits(found, confidence=level) if judged else {},
-        trends=_trends(x, y, confidence=level) if judged else {},
-        concordance_parts=_or_none(lambda: lines.concordance(x, y, confidence=level)) if judged else None,
-        errors_grow_with_size=judged and errors_are_proportional(x, y),
+        analytic_intervals=analytic,
+        limits=_limits(detected, confidence=level) if measurable else {},
+        trends=_trends(x, y, confidence=level) if measurable else {},
+        concordance_parts=_or_none(lambda: lines.concordance(x, y, confidence=level)) if measurable else None,
+        errors_grow_with_size=measurable and errors_are_proportional(x, y),
     )
 
 
@@ -423,8 +428,8 @@ def _statistics(error_ratio: float, robust: _Fit, slope: Scale) -> list[tuple[st
         *((f"{name}_intercept_mm", part(fit, "intercept"), "linear") for name, fit in fits),
         *((f"{name}_slope", part(fit, "slope"), slope) for name, fit in fits),
         ("concordance", SumStatistic(_terms, _concordance, "concordance needs sizes that vary"), "fisher"),
-        ("difference_mean_mm", SumStatistic(_terms, _bias), "linear"),
-        ("difference_sd_mm", SumStatistic(_terms, _sd, _ONE), "log"),
+        ("difference_mean_mm", SumStatistic(_terms, _mean_difference), "linear"),
+        ("difference_sd_mm", SumStatistic(_terms, _difference_sd, _NO_SPREAD), "log"),
     ]
 
 
@@ -432,11 +437,11 @@ _NO_LINE = "the ex-vivo sizes or the sizes do not vary, so no line is determined
 
 
 def _terms(sizes: ModalitySizes) -> FloatArray:
-    """x, y, 1, x', y', x'x', x'y', y'y' with ' about the means."""
+    """(n, 8) x, y, 1, x', y', x'x', x'y', y'y' with ' about the means."""
     x, y = sizes.ex_vivo_mm, sizes.size_mm
     if len(x) == 0:
         raise UndefinedError("no mass was detected")
-    _need_squares(x, y)
+    _require_squarable(x, y)
     dx, dy = lines.centred(x, x.mean()), lines.centred(y, y.mean())
     return columns(x, y, 1.0, dx, dy, dx * dx, dx * dy, dy * dy)
 
@@ -456,87 +461,96 @@ def _intercept_with(slope: Callable[[FloatArray], FloatArray]) -> Callable[[Floa
 
 def _concordance(sums: FloatArray) -> FloatArray:
     u, q, p = squares(sums)
-    bias = _bias(sums)
+    bias = _mean_difference(sums)
     return np.where((u == 0) | (q == 0), np.nan, ratio(2 * p, u + q + sums[..., 2] * bias**2))
 
 
-def _bias(sums: FloatArray) -> FloatArray:
+def _mean_difference(sums: FloatArray) -> FloatArray:
     return ratio(sums[..., 1] - sums[..., 0], sums[..., 2])
 
 
-def _sd(sums: FloatArray) -> FloatArray:
+def _difference_sd(sums: FloatArray) -> FloatArray:
     u, q, p = squares(sums)
     return np.sqrt(np.maximum(ratio(u + q - 2 * p, sums[..., 2] - 1), 0.0))
 
 
 def _fitted(fit: Callable[[FloatArray, FloatArray], lines.Line]) -> _Fit:
-    """A line that several figures share, fitted once to the same masses."""
+    """Function that fits a line to the masses of a modality, and keeps the last line for several figures."""
 
     @lru_cache(maxsize=1)
     def fitted(sizes: ModalitySizes) -> lines.Line:
-        _need_squares(sizes.ex_vivo_mm, sizes.size_mm)
+        _require_squarable(sizes.ex_vivo_mm, sizes.size_mm)
         return fit(sizes.ex_vivo_mm, sizes.size_mm)
 
     return fitted
 
 
-def _need_squares(x: FloatArray, y: FloatArray) -> None:
-    if len(x) and not _squarable(x, y):
+def _require_squarable(x: FloatArray, y: FloatArray) -> None:
+    if len(x) and not _can_be_squared(x, y):
         raise UndefinedError("the sizes are too large or too small for double precision")
 
 
-def _squarable(x: FloatArray, y: FloatArray) -> bool:
+def _can_be_squared(x: FloatArray, y: FloatArray) -> bool:
+    """True if squares of all sizes are within double precision."""
     both = np.concatenate([x, y])
     return bool(both.min() > _SMALLEST and both.max() < _LARGEST)
 
 
-def _analytic(found: ModalitySizes, robust: _Fit, *, confidence: float, error_ratio: float) -> dict[str, Ends | None]:
-    x, y = found.ex_vivo_mm, found.size_mm
+def _analytic_intervals(
+    detected: ModalitySizes, robust: _Fit, *, confidence: float, error_ratio: float
+) -> dict[str, Ends | None]:
+    """Intervals of the lines and of concordance that take the masses as independent, by name; None where undefined."""
+    x, y = detected.ex_vivo_mm, detected.size_mm
 
     def by_jackknife() -> lines.Line:
-        """Errors from leaving out one mass at a time, which is usual where no formula exists."""
+        """Weighted Deming line with standard errors from leaving out one mass at a time: there is no formula."""
         weighted = partial(lines.weighted_deming, error_ratio=error_ratio)
-        line, few = weighted(x, y), 3 < len(x) <= MOST_REFITTED
-        return lines.Line(line.intercept, line.slope, line.n, *lines.jackknife_errors(weighted, x, y)) if few else line
+        line = weighted(x, y)
+        if not 3 < len(x) <= MOST_REFITTED:
+            return line
+        return lines.Line(line.intercept, line.slope, line.n, *lines.jackknife_errors(weighted, x, y))
 
     fits: dict[str, Callable[[], lines.Line]] = {
         "ols": lambda: lines.least_squares(x, y),
         "deming": lambda: lines.deming(x, y, error_ratio=error_ratio),
         "weighted_deming": by_jackknife,
-        "passing_bablok": lambda: robust(found),
+        "passing_bablok": lambda: robust(detected),
     }
-    ends: dict[str, Ends | None] = {}
+    intervals: dict[str, Ends | None] = {}
     for name, fit in fits.items():
-        plain = _or_none(fit)
-        if plain is None and name == "passing_bablok":
+        line = _or_none(fit)
+        if line is None and name == "passing_bablok":
             continue
-        two = (None if plain is None else plain.intervals(confidence=confidence)) or (None, None)
-        for part, both in zip(("intercept_mm", "slope"), two, strict=True):
-            ends[f"{name}_{part}"] = None if both is None or not np.all(np.isfinite(both)) else both
+        both = (None if line is None else line.intervals(confidence=confidence)) or (None, None)
+        for part, interval in zip(("intercept_mm", "slope"), both, strict=True):
+            intervals[f"{name}_{part}"] = None if interval is None or not np.all(np.isfinite(interval)) else interval
     agreement = _or_none(lambda: lines.concordance(x, y, confidence=confidence))
-    ends["concordance"] = None if agreement is None else agreement.interval
-    return ends
+    intervals["concordance"] = None if agreement is None else agreement.interval
+    return intervals
 
 
-def _limits(found: ModalitySizes, *, confidence: float) -> dict[Unit, Limits]:
+def _limits(detected: ModalitySizes, *, confidence: float) -> dict[Unit, Limits]:
+    """Limits of agreement in mm and on the logarithm, allowing for replicates where there are any."""
     scales: dict[Unit, Callable[[FloatArray], FloatArray]] = {"mm": np.asarray, "log_ratio": np.log}
-    x, y, groups = found.ex_vivo_mm, found.size_mm, found.replicates_mm
+    x, y, groups = detected.ex_vivo_mm, detected.size_mm, detected.replicates_mm
     if all(len(group) == 1 for group in groups):
         return {unit: limits(on(y) - on(x), confidence=confidence) for unit, on in scales.items()}
     return {
-        unit: limits_unlinked([on(e) for e in x[:, None]], [on(one) for one in groups], confidence=confidence)
+        unit: limits_unlinked([on(e) for e in x[:, None]], [on(group) for group in groups], confidence=confidence)
         for unit, on in scales.items()
     }
 
 
 def _trends(x: FloatArray, y: FloatArray, *, confidence: float) -> dict[Against, Trend]:
+    """Trends of the differences with the ex-vivo size and with the mean of both; those undefined are left out."""
     against: dict[Against, FloatArray] = {"on_ex_vivo": x, "on_mean": (x + y) / 2}
-    judge = partial(trend, y - x, confidence=confidence)
-    found = ((name, _or_none(partial(judge, sizes))) for name, sizes in against.items())
-    return {name: one for name, one in found if one is not None}
+    trend_on = partial(trend, y - x, confidence=confidence)
+    trends = ((name, _or_none(partial(trend_on, sizes))) for name, sizes in against.items())
+    return {name: result for name, result in trends if result is not None}
 
 
-def _or_none(compute: Callable[[], _T]) -> _T | None:
+def _or_none(compute: Callable[[], _Result]) -> _Result | None:
+    """The result; None where the data leave it undefined."""
     try:
         return compute()
     except UndefinedError:

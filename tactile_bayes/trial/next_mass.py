@@ -8,14 +8,14 @@ For mass i of patient g with true log size :math:`\xi_i`, centred at the mean of
 
 with bias :math:`\beta`, slope :math:`\gamma` on the logarithm, patient effects :math:`u_g \sim N(0, \rho^2)`, mass
 effects :math:`b_i \sim N(0, \tau^2)` and replicate noise :math:`w_{ij} \sim N(0, \omega^2)`. The effects are
-integrated out exactly: all that is left is normal, patient by patient. Masses not found enter through their share.
+integrated out exactly: what is left is a multivariate normal per patient. Masses not detected enter by their share.
 
 The expected error depends on the root mean square r of bias, slope error and total SD,
 
 .. math:: r^2 = \beta^2 + (\gamma - 1)^2 s_\xi^2 + \rho^2 + \tau^2 + \omega^2,
 
-so the prior is put on it and on how it splits, not on the parts: separate priors favour a larger sum than any of them
-says (record 0078). It is uniform in ln r, as far as the caliper's own error lets r be seen.
+so the prior is on r and on the shares of its parts: separate priors on the parts favour a large sum (record 0078). It
+is uniform in ln r where r is well above the caliper's own error.
 """
 
 from __future__ import annotations
@@ -64,13 +64,13 @@ class Middle(Record):
         return f"{self.median:{spec}} [{self.low:{spec}}, {self.high:{spec}}]"
 
 
-class NextOfModality(Record):
+class ModalityErrors(Record):
     """Posterior of one modality's errors."""
 
     masses: Count
     patients: Count
     mape_percent: Middle  #: Expected error of the next mass, misses included.
-    mape_detected_percent: Middle  #: Expected error of one that is found.
+    mape_detected_percent: Middle  #: Expected error of a mass that is detected.
     bias_percent: Middle
     log_slope: Middle  #: Slope of ln size.
     total_sd: Middle
@@ -81,24 +81,24 @@ class NextOfModality(Record):
 
 
 class IntervalKind(Record):
-    """How intervals are made."""
+    """Kind and probability of the intervals: equal-tailed."""
 
     kind: Literal["eti"]
     probability: float
 
 
 class Posterior(Record, eq=False):
-    """Posterior of one modality: (n,) draws of each of its figures."""
+    """Posterior of one modality's errors: (n,) draws of each figure, and their summary."""
 
-    summary: NextOfModality
+    summary: ModalityErrors
     draws: dict[str, FloatArray]
     diagnostics: dict[str, float]
 
 
 class NextMass(Record):
-    """Posteriors of all modalities, and for every pair the probability that the first errs less on the next mass."""
+    """Posteriors of all modalities, and for each pair the probability that the first errs less on the next mass."""
 
-    modalities: dict[str, NextOfModality]
+    modalities: dict[str, ModalityErrors]
     interval: IntervalKind
     probability_less_error: dict[str, float]
     left_out: dict[str, str]  #: Modalities without a model, and why.
@@ -107,11 +107,11 @@ class NextMass(Record):
     def lines(self) -> list[str]:
         """Text lines of the report."""
         lines = ["Bayesian errors-in-variables model, beside the table above and not instead of it:"]
-        for name, one in self.modalities.items():
-            error, found = one.mape_percent.shown(".1f"), one.mape_detected_percent.shown(".1f")
+        for name, summary in self.modalities.items():
+            error, if_detected = summary.mape_percent.shown(".1f"), summary.mape_detected_percent.shown(".1f")
             lines.append(
-                f"{name}: next mass: expected error {error} %, if it is found {found} %; "
-                f"bias {one.bias_percent.shown('+.1f')} %, slope of ln size {one.log_slope.shown('.2f')}"
+                f"{name}: next mass: expected error {error} %, if it is found {if_detected} %; "
+                f"bias {summary.bias_percent.shown('+.1f')} %, slope of ln size {summary.log_slope.shown('.2f')}"
             )
         lines += [f"probability that {pair}: {p:.3f}" for pair, p in self.probability_less_error.items()]
         return [*lines, *(f"{name}: no model: {reason}" for name, reason in self.left_out.items())]
@@ -122,8 +122,8 @@ def draw(
 ) -> ParameterDraws:
     """Draw from a log density by importance sampling about its mode, or by MCMC where that cannot be trusted.
 
-    The density takes (m, p) arrays to (m,); `centre` and `covariance` guess the mode and the covariance about it. Where
-    MCMC, too, does not reach its criteria, `NotConvergedError` says so.
+    The density maps (m, p) arrays to (m,); `centre` and `covariance` guess the mode and the covariance about it.
+    `NotConvergedError` where MCMC does not converge either.
     """
     try:
         mode, about, _ = mode_and_covariance(log_density, centre, scale=np.sqrt(np.diag(covariance)))
@@ -135,57 +135,59 @@ def draw(
 def next_mass(trial: Trial, *, sample: Sampler = draw, rng: np.random.Generator) -> NextMass:
     """Fit the model to each modality and compare them.
 
-    The expected error is that of one reading of a mass drawn from the sizes of this trial, of a new patient. Modalities
-    are fitted one by one, so that the probability that one errs less takes their errors as independent.
+    The expected error is that of one reading of a mass with a size like the trial's, of a new patient. Modalities are
+    fitted one by one, so the probability that one errs less takes their errors as independent.
     """
-    posteriors, left_out = posteriors_of(trial, sample=sample, rng=rng)
-    compared = {}
-    for one, other in combinations(posteriors, 2):  # P(A < B) for independent draws, over all pairs of them
-        a, b = (posteriors[name].draws["mape_percent"] for name in (one, other))
+    posteriors, left_out = fit_modalities(trial, sample=sample, rng=rng)
+    probabilities = {}
+    for first, second in combinations(posteriors, 2):  # P(A < B) for independent draws, over all pairs of them
+        a, b = (posteriors[name].draws["mape_percent"] for name in (first, second))
         below = float(np.mean(np.searchsorted(np.sort(a), b)) / len(a))
-        compared[f"{one} errs less than {other}"] = rounded(below)
+        probabilities[f"{first} errs less than {second}"] = rounded(below)
     return NextMass(
-        {name: one.summary for name, one in posteriors.items()},
+        {name: first.summary for name, first in posteriors.items()},
         IntervalKind("eti", INTERVAL),
-        compared,
+        probabilities,
         left_out,
-        {name: one.diagnostics for name, one in posteriors.items()},
+        {name: first.diagnostics for name, first in posteriors.items()},
     )
 
 
-def posteriors_of(
+def fit_modalities(
     trial: Trial, *, sample: Sampler, rng: np.random.Generator
 ) -> tuple[dict[str, Posterior], dict[str, str]]:
-    """The model of each modality by its name, and why others have none; as `next_mass`."""
+    """Posterior of each modality by name, and the reason for each modality without one."""
     caliper = {
         number: (trial.ex_vivo_sd_mm.get(key) or CALIPER * trial.ex_vivo_mm[key]) / trial.ex_vivo_mm[key]
         for key, number in mass_numbers(trial.ex_vivo_mm).items()
     }
     posteriors: dict[str, Posterior] = {}
     left_out: dict[str, str] = {}
-    for name, one in trial.sizes().items():
-        found = one.only_detected()
-        if len(found.patients) < MIN_PATIENTS:
-            left_out[name] = f"needs at least {MIN_PATIENTS} patients with a mass found (has {len(found.patients)})"
+    for name, sizes in trial.sizes().items():
+        detected = sizes.only_detected()
+        if len(detected.patients) < MIN_PATIENTS:
+            left_out[name] = f"needs at least {MIN_PATIENTS} patients with a mass found (has {len(detected.patients)})"
             continue
-        posteriors[name] = _fit(one, caliper, sample=sample, rng=rng)
+        posteriors[name] = _posterior(sizes, caliper, sample=sample, rng=rng)
     return posteriors, left_out
 
 
-def _fit(sizes: ModalitySizes, caliper: Mapping[int, float], *, sample: Sampler, rng: np.random.Generator) -> Posterior:
-    found = sizes.only_detected()
-    model = LogModel(found, np.array([caliper[int(mass)] for mass in found.mass]))
+def _posterior(
+    sizes: ModalitySizes, caliper: Mapping[int, float], *, sample: Sampler, rng: np.random.Generator
+) -> Posterior:
+    detected = sizes.only_detected()
+    model = LogModel(detected, np.array([caliper[int(mass)] for mass in detected.mass]))
     centre, covariance = model.start()
-    drawn = sample(model.log_density, centre, covariance, rng=rng)
-    theta = np.asarray(drawn.theta).reshape(-1, len(centre))
-    missed = len(sizes.size_mm) - len(found.size_mm)
-    misses = rng.beta(missed + PRIOR_MISS, len(found.size_mm) + PRIOR_MISS, len(theta))
-    of_found = expected_error_percent(model, theta)
+    draws = sample(model.log_density, centre, covariance, rng=rng)
+    theta = np.asarray(draws.theta).reshape(-1, len(centre))
+    missed = len(sizes.size_mm) - len(detected.size_mm)
+    misses = rng.beta(missed + PRIOR_MISS, len(detected.size_mm) + PRIOR_MISS, len(theta))
+    error_of_detected = expected_error_percent(model, theta)
     sds = np.sqrt(np.array(variances(theta)))
-    tails = [0.5, 0.5 - INTERVAL / 2, 0.5 + INTERVAL / 2]
+    probabilities = [0.5, 0.5 - INTERVAL / 2, 0.5 + INTERVAL / 2]
     figures = {
-        "mape_percent": (1 - misses) * of_found + 100 * misses,
-        "mape_detected_percent": of_found,
+        "mape_percent": (1 - misses) * error_of_detected + 100 * misses,
+        "mape_detected_percent": error_of_detected,
         "bias_percent": 100 * np.expm1(theta[:, 0]),
         "log_slope": theta[:, 1],
         "total_sd": np.exp(theta[:, 2]),
@@ -194,30 +196,32 @@ def _fit(sizes: ModalitySizes, caliper: Mapping[int, float], *, sample: Sampler,
         "replicate_sd": sds[2],
         "miss_share": misses,
     }
-    middles = {name: Middle(*map(rounded, np.quantile(values, tails).tolist())) for name, values in figures.items()}
-    summary = NextOfModality(masses=len(found.size_mm), patients=len(found.patients), **middles)
-    return Posterior(summary, figures, {name: rounded(float(value)) for name, value in drawn.diagnostics.items()})
+    summaries = {
+        name: Middle(*map(rounded, np.quantile(values, probabilities).tolist())) for name, values in figures.items()
+    }
+    summary = ModalityErrors(masses=len(detected.size_mm), patients=len(detected.patients), **summaries)
+    return Posterior(summary, figures, {name: rounded(float(value)) for name, value in draws.diagnostics.items()})
 
 
 class LogModel:
-    """Likelihood and prior of one modality; masses with equal numbers of replicates need only their means.
+    """Likelihood and prior of one modality, from `detected` masses and the (n,) relative SD of each ex-vivo size.
 
-    `found` are the detected masses, `caliper` the (n,) relative SD of each ex-vivo size.
+    Of the replicates it needs each mass's mean and number, and the pooled sum of squares.
     """
 
-    def __init__(self, found: ModalitySizes, caliper: FloatArray) -> None:
-        self.log_e = np.log(found.ex_vivo_mm)
+    def __init__(self, detected: ModalitySizes, caliper: FloatArray) -> None:
+        self.log_e = np.log(detected.ex_vivo_mm)
         self.centre = float(self.log_e.mean())
         self.spread = max(float(self.log_e.std(ddof=1)), 1e-3)
         self._x = self.log_e - self.centre
         self._caliper2 = caliper**2
         self.caliper = math.sqrt(float(np.mean(self._caliper2)))
-        logs = [np.log(group) for group in found.replicates_mm]
+        logs = [np.log(group) for group in detected.replicates_mm]
         self._number = np.array([len(group) for group in logs], dtype=np.float64)
         self._y = np.array([group.mean() for group in logs]) - self.centre
         self._within = float(sum(np.sum((group - group.mean()) ** 2) for group in logs))
         self._freedom = float(np.sum(self._number - 1))
-        _, self._patient = np.unique(found.patient, return_inverse=True)
+        _, self._patient = np.unique(detected.patient, return_inverse=True)
         self._patients = int(self._patient.max()) + 1
 
     def start(self) -> tuple[FloatArray, FloatArray]:
@@ -236,11 +240,13 @@ class LogModel:
         """(m,) unnormalised log posterior of (m, 5) rows, see `variances`."""
         bias, slope = theta.T[:2]
         rho2, tau2, omega2 = variances(theta)
-        # the true size given the ex-vivo one: normal about a shrunken value
+        # the true log size given the ex-vivo one: normal about a value shrunk towards the mean
         prior2 = max(self.spread**2 - float(np.mean(self._caliper2)), 0.25 * self.spread**2)
-        keep = prior2 / (prior2 + self._caliper2)
-        mean = bias[:, None] + slope[:, None] * keep * self._x
-        variance = slope[:, None] ** 2 * keep * self._caliper2 + tau2[:, None] + omega2[:, None] / self._number[None, :]
+        shrinkage = prior2 / (prior2 + self._caliper2)
+        mean = bias[:, None] + slope[:, None] * shrinkage * self._x
+        variance = (
+            slope[:, None] ** 2 * shrinkage * self._caliper2 + tau2[:, None] + omega2[:, None] / self._number[None, :]
+        )
         off = (self._y - mean) / variance
         log_like = -0.5 * np.sum((self._y - mean) * off + np.log(variance), axis=1)
         log_like += self._patients_part(rho2, off, 1 / variance)
@@ -280,11 +286,11 @@ def log_prior(theta: FloatArray, *, spread: float, caliper: float) -> FloatArray
     the SD has Jeffreys' prior. Both shares of the variance are uniform. Normal priors keep bias and slope finite.
     """
     bias, slope, log_total, *logits = theta.T
-    off = slope - 1
-    square = bias**2 + (off * spread) ** 2 + _total_variance(log_total) + caliper**2
-    prior = log_total - 1.5 * np.log(square) - 0.5 * ((bias / PRIOR_BIAS) ** 2 + (off / PRIOR_SLOPE) ** 2)
-    for one in logits:
-        prior = prior + log_expit(one) + log_expit(-one)
+    slope_error = slope - 1
+    square = bias**2 + (slope_error * spread) ** 2 + _total_variance(log_total) + caliper**2
+    prior = log_total - 1.5 * np.log(square) - 0.5 * ((bias / PRIOR_BIAS) ** 2 + (slope_error / PRIOR_SLOPE) ** 2)
+    for logit in logits:
+        prior = prior + log_expit(logit) + log_expit(-logit)
     outside = (log_total < -12) | (log_total > math.log(MOST_TOTAL_SD))
     return np.asarray(np.where(outside, -np.inf, prior))
 
@@ -294,13 +300,13 @@ def expected_error_percent(model: LogModel, theta: FloatArray) -> FloatArray:
 
     On the logarithm the error is normal; its size-dependent mean is averaged over normal sizes like the trial's.
     """
-    at, weight = np.polynomial.hermite_e.hermegauss(15)
+    nodes, weight = np.polynomial.hermite_e.hermegauss(15)
     sd = np.exp(theta[:, 2])[:, None]
-    mean = theta[:, :1] + (theta[:, 1:2] - 1) * model.spread * at[None, :]
+    mean = theta[:, :1] + (theta[:, 1:2] - 1) * model.spread * nodes[None, :]
     folded = np.exp(mean + sd**2 / 2) * erf((mean / sd + sd) / math.sqrt(2)) - erf(mean / sd / math.sqrt(2))
     return np.asarray(100 * (folded @ weight / weight.sum()))
 
 
 def _total_variance(log_sd: FloatArray) -> FloatArray:
-    """Variance of ln size, clipped against overflow where the prior excludes it anyway."""
+    """Total variance of ln size, clipped against overflow far outside the prior."""
     return np.asarray(np.exp(2 * np.clip(log_sd, -14, 5)))

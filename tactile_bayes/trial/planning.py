@@ -25,7 +25,7 @@ LEVEL = 0.05
 
 
 class PlanCase(Record, kw_only=True):
-    """One design with assumed errors, as of `PlanErrors`: all that its simulation depends on."""
+    """A design with its assumed errors (`PlanErrors`), numbers of trials and seed: all that its simulation takes."""
 
     patients: int
     maps: int
@@ -63,7 +63,7 @@ class Design(Record):
 
 
 class Gain(Record):
-    """What more maps per mass bring at the same number of patients."""
+    """Change of power and error by more maps per mass at the same number of patients."""
 
     patients: int
     from_maps: int
@@ -73,7 +73,7 @@ class Gain(Record):
 
 
 class Needed(Record):
-    """How many patients reach an aim."""
+    """Number of patients that reach an aim."""
 
     aim: Aim
     target: float  #: Power, or the median factor from the lower to the upper end of the tactile error's interval.
@@ -90,15 +90,15 @@ class PlanReport(Record, kw_only=True):
     errors_from: dict[str, ErrorSource]  #: Where each assumed error comes from.
     designs: Annotated[tuple[Design, ...], Meta(min_length=1)]
     gains: tuple[Gain, ...]
-    needed: tuple[Needed, ...] = ()  #: By the designs above, where --power or --precision asked for it.
+    needed: tuple[Needed, ...] = ()  #: Patients that --power or --precision needs, from the designs above.
     provenance: dict[str, Any]
     research_use: Annotated[str, Meta(min_length=1)]
 
 
-def run_case(case: PlanCase) -> Design:
+def simulate_design(case: PlanCase) -> Design:
     """Simulate the trials of one design."""
-    found = np.array([_trial(case, trial) for trial in range(case.trials)], dtype=np.float64)
-    won, tactile, other, tactile_width, ratio_width = found.T
+    trials = np.array([_simulated_trial(case, trial) for trial in range(case.trials)], dtype=np.float64)
+    won, tactile, other, tactile_width, ratio_width = trials.T
     wins = int(won.sum())
     return Design(
         patients=case.patients,
@@ -112,22 +112,24 @@ def run_case(case: PlanCase) -> Design:
     )
 
 
-def map_gains(found: Iterable[Design]) -> tuple[Gain, ...]:
+def map_gains(designs: Iterable[Design]) -> tuple[Gain, ...]:
     """Gain from each further map at the same number of patients: change of power and of tactile error."""
-    ordered = sorted(found, key=lambda one: (one.patients, one.maps))
+    ordered = sorted(designs, key=lambda design: (design.patients, design.maps))
     return tuple(
-        Gain(new.patients, old.maps, new.maps, new.power - old.power, new.tactile_percent - old.tactile_percent)
-        for old, new in pairwise(ordered)
-        if old.patients == new.patients
+        Gain(
+            more.patients, fewer.maps, more.maps, more.power - fewer.power, more.tactile_percent - fewer.tactile_percent
+        )
+        for fewer, more in pairwise(ordered)
+        if fewer.patients == more.patients
     )
 
 
 # --- The number of patients that reaches a power, or a width of the interval: a line through simulated designs.
 
-# Designs simulated about the first guess, in shares of it; the guess is moved up to so many times.
+# Numbers of patients simulated about a guess, as shares of it; and how often at most the guess is renewed.
 AROUND = (0.6, 0.8, 1.0, 1.25, 1.6)
 ROUNDS = 4
-_GUESSED_WITH = 40_000  #: Masses.
+GUESS_MASSES = 40_000  #: Masses.
 
 
 def first_guess(case: PlanCase, aim: Aim, target: float) -> int:
@@ -138,7 +140,7 @@ def first_guess(case: PlanCase, aim: Aim, target: float) -> int:
     logarithm away, :math:`(2 z\,\text{cv} / \ln \text{factor})^2`. Undefined where the
     tactile errors are not the smaller ones.
     """
-    rng, n = np.random.default_rng(case.seed), _GUESSED_WITH
+    rng, n = np.random.default_rng(case.seed), GUESS_MASSES
     shared = rng.normal(case.tactile_bias, case.mass_sd, n)
     tactile = np.abs(np.exp(shared + rng.normal(0, case.map_sd, (case.maps, n))).mean(axis=0) - 1)
     other = np.abs(np.expm1(rng.normal(case.other_bias, case.other_sd, n)))
@@ -157,41 +159,41 @@ def first_guess(case: PlanCase, aim: Aim, target: float) -> int:
     return round(min(max(root**2, MIN_PATIENTS), MOST_PATIENTS))
 
 
-def sizes_about(patients: int) -> list[int]:
-    """Numbers of patients to simulate about a guess."""
+def patients_around(patients: int) -> list[int]:
+    """Numbers of patients to simulate, `AROUND` a guess."""
     return sorted({min(max(round(share * patients), MIN_PATIENTS), MOST_PATIENTS) for share in AROUND})
 
 
-def patients_needed(found: Sequence[Design], aim: Aim, target: float, *, trials: int) -> Needed | None:
+def patients_needed(designs: Sequence[Design], aim: Aim, target: float, *, trials: int) -> Needed | None:
     r"""Solve a line through simulated designs of one number of maps for the number of patients.
 
     The power's normal quantile is linear in :math:`\sqrt N`, the logarithm of an interval's width in
     :math:`1/\sqrt N`. None where the designs have no such line; the least and the most patients that a plan may have
     stand for fewer and more.
     """
-    least = min(found, key=lambda one: one.patients)
+    least = min(designs, key=lambda design: design.patients)
     width = least.tactile_width_ratio or math.inf
     if least.patients == MIN_PATIENTS and (least.power >= target if aim == "power" else width <= target):
         return Needed(aim=aim, target=target, maps=least.maps, patients=MIN_PATIENTS, patients_interval=None)
     exponent = 0.5 if aim == "power" else -0.5
-    at, level, weight = [], [], []
-    for one in found:
+    predictor, response, weights = [], [], []
+    for design in designs:
         if aim == "power":
-            share = min(max(one.power, 0.5 / trials), 1 - 0.5 / trials)
+            share = min(max(design.power, 0.5 / trials), 1 - 0.5 / trials)
             y, slope = float(ndtri(share)), math.sqrt(2 * math.pi) * math.exp(float(ndtri(share)) ** 2 / 2)
             sd = slope * math.sqrt(share * (1 - share) / trials)
-        elif one.tactile_width_ratio is None:
+        elif design.tactile_width_ratio is None:
             continue
         else:
-            y, sd = math.log(one.tactile_width_ratio), 1.0
-        at.append(one.patients**exponent)
-        level.append(y)
-        weight.append(1 / sd)
-    if len(at) < 2:
+            y, sd = math.log(design.tactile_width_ratio), 1.0
+        predictor.append(design.patients**exponent)
+        response.append(y)
+        weights.append(1 / sd)
+    if len(predictor) < 2:
         return None
-    (slope, start), covariance = np.polyfit(at, level, 1, w=weight, cov="unscaled")
-    wanted = float(ndtri(target)) if aim == "power" else math.log(target)
-    x = (wanted - start) / slope
+    (slope, start), covariance = np.polyfit(predictor, response, 1, w=weights, cov="unscaled")
+    response_at_target = float(ndtri(target)) if aim == "power" else math.log(target)
+    x = (response_at_target - start) / slope
     if slope <= 0 or x <= 0:
         return None
     patients = min(max(math.ceil(x ** (1 / exponent) - 1e-9), MIN_PATIENTS), MOST_PATIENTS)
@@ -199,12 +201,12 @@ def patients_needed(found: Sequence[Design], aim: Aim, target: float, *, trials:
     if aim == "power":
         sd = math.sqrt(float(np.array([x, 1.0]) @ covariance @ np.array([x, 1.0]))) / slope
         ends = (max(x - 1.96 * sd, 0.0) ** 2, (x + 1.96 * sd) ** 2)
-    return Needed(aim=aim, target=target, maps=found[0].maps, patients=patients, patients_interval=ends)
+    return Needed(aim=aim, target=target, maps=designs[0].maps, patients=patients, patients_interval=ends)
 
 
-def _trial(case: PlanCase, number: int) -> tuple[float, ...]:
-    """Simulate one trial: 1 where it is won, both mean errors, and the widths of the intervals of the tactile one and
-    of their ratio, NaN where there is none.
+def _simulated_trial(case: PlanCase, number: int) -> tuple[float, ...]:
+    """Simulate one trial: whether it is won, both mean errors, and the width ratios of the intervals of the tactile
+    error and of the ratio of errors, NaN where there is none.
 
     Designs that differ only in maps get the same masses, for a precise difference.
     """
@@ -213,58 +215,60 @@ def _trial(case: PlanCase, number: int) -> tuple[float, ...]:
     shared = rng.normal(case.tactile_bias, case.mass_sd, n)
     other = ex_vivo * np.exp(rng.normal(case.other_bias, case.other_sd, n))
     other[rng.random(n) < case.other_miss] = 0.0
-    maps = ex_vivo * np.exp(shared + rng.normal(0, case.map_sd, (case.maps, n))).mean(axis=0)
-    tactile_sizes, other_sizes = _sizes("tactile", ex_vivo, maps), _sizes("other", ex_vivo, other)
-    off = np.abs(maps / ex_vivo - 1) - np.abs(other / ex_vivo - 1)
-    p = sign_flip(off, seed=number, flips=FLIPS)
+    tactile = ex_vivo * np.exp(shared + rng.normal(0, case.map_sd, (case.maps, n))).mean(axis=0)
+    tactile_sizes, other_sizes = _sizes("tactile", ex_vivo, tactile), _sizes("other", ex_vivo, other)
+    difference = np.abs(tactile / ex_vivo - 1) - np.abs(other / ex_vivo - 1)
+    p = sign_flip(difference, seed=number, flips=FLIPS)
     error = mape_figure(tactile_sizes, intervals=Intervals(INTERVAL, method="corrected"))
     ratio = mape_ratio(other_sizes, tactile_sizes, intervals=Intervals(INTERVAL))
-    won = p is not None and p < LEVEL and float(off.sum()) < 0
-    widths = (_width(error.interval), _width(ratio.interval))
+    won = p is not None and p < LEVEL and float(difference.sum()) < 0
+    widths = (_width_ratio(error.interval), _width_ratio(ratio.interval))
     return won, mape_percent(tactile_sizes), mape_percent(other_sizes), *widths
 
 
 def _sizes(name: str, ex_vivo_mm: FloatArray, size_mm: FloatArray) -> ModalitySizes:
+    """Sizes of one mass per patient."""
     n = len(ex_vivo_mm)
     return ModalitySizes(name, np.arange(n), ex_vivo_mm, size_mm, (np.zeros(0),) * n)
 
 
-def _width(ends: Ends | None) -> float:
+def _width_ratio(ends: Ends | None) -> float:
+    """Upper over lower end of an interval."""
     return math.nan if ends is None or ends[0] <= 0 else ends[1] / ends[0]
 
 
 def _median(values: FloatArray) -> float | None:
+    """Median of the finite values; None without any."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else None
 
 
-def assumptions_from(
+def pilot_errors(
     tactile: ModalitySizes, other: ModalitySizes, *, map_sd: float | None = None
 ) -> dict[str, float] | None:
     """Errors of a pilot trial: bias, SDs between and within masses, share missed.
 
-    `map_sd` of single maps is estimated from the pilot's replicates when not given. None when a modality found fewer
-    than 3 masses; without ``map_sd`` and ``mass_sd`` when the pilot has no replicates and none is given, for then the
-    two cannot be told apart.
+    `map_sd`, of single maps, is estimated from the pilot's replicates if None. Without replicates it cannot be told
+    from ``mass_sd``, and both are left out. None when a modality detected fewer than 3 masses.
     """
-    mine, theirs = _log_errors(tactile.only_detected()), _log_errors(other.only_detected())
-    if len(mine) < 3 or len(theirs) < 3:
+    tactile_errors, other_errors = _log_errors(tactile.only_detected()), _log_errors(other.only_detected())
+    if len(tactile_errors) < 3 or len(other_errors) < 3:
         return None
     errors = {
-        "tactile_bias": float(mine.mean()),
-        "other_bias": float(theirs.mean()),
-        "other_sd": float(theirs.std(ddof=1)),
-        "other_miss": 1 - len(theirs) / len(other.size_mm),
+        "tactile_bias": float(tactile_errors.mean()),
+        "other_bias": float(other_errors.mean()),
+        "other_sd": float(other_errors.std(ddof=1)),
+        "other_miss": 1 - len(other_errors) / len(other.size_mm),
     }
-    single = figure(log_sd_within, tactile.only_replicated()).value if map_sd is None else map_sd
-    if single is None:
+    if map_sd is None:
+        map_sd = figure(log_sd_within, tactile.only_replicated()).value
+    if map_sd is None:
         return errors
-    shared = float(mine.std(ddof=1)) ** 2 - single**2 / float(
-        np.mean([len(one) for one in tactile.replicates_mm if len(one)])
-    )
-    return errors | {"mass_sd": math.sqrt(max(shared, 0.0)), "map_sd": single}
+    maps = float(np.mean([len(group) for group in tactile.replicates_mm if len(group)]))
+    shared = float(tactile_errors.std(ddof=1)) ** 2 - map_sd**2 / maps
+    return errors | {"mass_sd": math.sqrt(max(shared, 0.0)), "map_sd": map_sd}
 
 
-def _log_errors(found: ModalitySizes) -> FloatArray:
+def _log_errors(detected: ModalitySizes) -> FloatArray:
     """(n,) logarithms of the ratios of detected sizes to those after excision."""
-    return np.log(found.size_mm) - np.log(found.ex_vivo_mm)
+    return np.log(detected.size_mm) - np.log(detected.ex_vivo_mm)

@@ -23,9 +23,9 @@ MassKey = tuple[str, str]  # patient, mass
 
 
 class CellFault(Protocol):
-    """Function that makes the error for one cell, with the file and line of its row."""
+    """Makes the error for a faulty cell, naming the file and line of its row."""
 
-    def __call__(self, row: int, column: str, what: str, /, *, way_out: str) -> BadDataError: ...
+    def __call__(self, row: int, column: str, problem: str, /, *, way_out: str) -> BadDataError: ...
 
 
 class Interval(Record):
@@ -81,7 +81,7 @@ class ModalitySizes(Record, eq=False):
 
     @property
     def detected(self) -> npt.NDArray[np.bool_]:
-        """(n,) array: the mass was found in at least one replicate."""
+        """(n,) array: True for a mass detected in at least one replicate."""
         return self.size_mm > 0
 
     @property
@@ -105,7 +105,7 @@ class ModalitySizes(Record, eq=False):
         )
 
     def only_detected(self) -> ModalitySizes:
-        """Copy with only the masses that this modality found."""
+        """Copy with only the masses that this modality detected."""
         return self.only(self.detected)
 
     def only_replicated(self) -> ModalitySizes:
@@ -122,18 +122,18 @@ _COLUMNS = (
 def readings_from_columns(columns: Mapping[str, Sequence[Any]], *, fault: CellFault) -> list[Reading]:
     """Make readings from a trial table's columns, checking rules between the cells of a row.
 
-    Columns are as ``data_schema/trial.table.json`` names and types them; `fault` makes the error for a cell. At fault
-    is a size without detection or detection without a size, and an interval that is incomplete, upside down, does not
-    contain the reading's own size, or is stated for a mass that was not found.
+    Columns are as ``data_schema/trial.table.json`` names and types them; `fault` makes the error for a cell. Refused
+    are a size without detection, detection without a size, and an interval that is incomplete, upside down, does not
+    contain the reading's own size, or is stated for a mass that was not detected.
     """
     blank: list[None] = [None] * len(columns["patient"])
     readings = []
     for row, cells in enumerate(zip(*(columns.get(name, blank) for name in _COLUMNS), strict=True)):
-        patient, mass, modality, replicate, status, size_mm, low_mm, high_mm, probability, synthetic, *said = cells
+        patient, mass, modality, replicate, status, size_mm, low_mm, high_mm, probability, synthetic, *details = cells
         status = _status(row, status, size_mm, fault=fault)
         interval = _interval(row, status, size_mm, (low_mm, high_mm, probability), fault=fault)
         key = (patient, mass)
-        readings.append(Reading(key, modality, replicate, status, size_mm, interval, bool(synthetic), *said))
+        readings.append(Reading(key, modality, replicate, status, size_mm, interval, bool(synthetic), *details))
     return readings
 
 
@@ -155,6 +155,7 @@ def _status(row: int, status: str | None, size_mm: float | None, *, fault: CellF
 def _interval(
     row: int, status: str, size_mm: float | None, cells: Sequence[float | None], *, fault: CellFault
 ) -> Interval | None:
+    """Interval of a row, checked; None where its three cells are blank."""
     low_mm, high_mm, probability = cells
     if low_mm is None or high_mm is None or probability is None:
         blank = [name for name, cell in zip(("low_mm", "high_mm", "probability"), cells, strict=True) if cell is None]
@@ -168,55 +169,57 @@ def _interval(
     if low_mm > high_mm:
         raise fault(row, "low_mm", f"is {low_mm:g}, above high_mm {high_mm:g}", way_out="exchange or correct them")
     if size_mm is not None and not low_mm <= size_mm <= high_mm:
-        what = f"is {size_mm:g}, outside its own interval {low_mm:g} to {high_mm:g}"
-        raise fault(row, "size_mm", what, way_out="correct the size, low_mm or high_mm; all three are in mm")
+        problem = f"is {size_mm:g}, outside its own interval {low_mm:g} to {high_mm:g}"
+        raise fault(row, "size_mm", problem, way_out="correct the size, low_mm or high_mm; all three are in mm")
     return Interval(low_mm, high_mm, probability)
 
 
 def gather(readings: Iterable[Reading], ex_vivo_mm: Mapping[MassKey, float]) -> dict[str, ModalitySizes]:
-    """Each modality's sizes, masses averaged over their detected replicates first; tactile leads, then by name.
+    """Sizes of each modality: the mean over each mass's detected replicates. Tactile comes first, then by name.
 
     Readings come in any order; each mass must be in `ex_vivo_mm`.
     """
     ordered = sorted(readings, key=lambda r: (r.modality != "tactile", r.modality, r.key, r.replicate))
-    number = {patient: index for index, patient in enumerate(sorted({patient for patient, _ in ex_vivo_mm}))}
-    masses = mass_numbers(ex_vivo_mm)
+    patient_number = {patient: index for index, patient in enumerate(sorted({patient for patient, _ in ex_vivo_mm}))}
+    mass_number = mass_numbers(ex_vivo_mm)
     sizes = dict[str, ModalitySizes]()
     for name, group in groupby(ordered, key=lambda r: r.modality):
         rows = list(group)
-        seen, done = {r.key for r in rows}, [r for r in rows if r.status != "not_done"]
+        keys, done = {r.key for r in rows}, [r for r in rows if r.status != "not_done"]
         by_mass = {key: [r.size_mm for r in of_mass] for key, of_mass in groupby(done, key=lambda r: r.key)}
         replicates = tuple(
-            np.array([size for size in found if size is not None], dtype=np.float64) for found in by_mass.values()
+            np.array([size for size in sizes_mm if size is not None], dtype=np.float64) for sizes_mm in by_mass.values()
         )
-        with np.errstate(over="ignore"):  # a figure of an overflown mean is refused where it is formed
+        with np.errstate(over="ignore"):  # figures refuse an infinite mean
             # equal readings are their own mean, to the last bit: rounding would be an error beside excision
-            means = [np.clip(one.mean(), one.min(), one.max()) if len(one) else 0.0 for one in replicates]
+            means = [
+                np.clip(values.mean(), values.min(), values.max()) if len(values) else 0.0 for values in replicates
+            ]
         sizes[name] = ModalitySizes(
             name=name,
-            patient=np.array([number[patient] for patient, _ in by_mass], dtype=np.int64),
+            patient=np.array([patient_number[patient] for patient, _ in by_mass], dtype=np.int64),
             ex_vivo_mm=np.array([ex_vivo_mm[key] for key in by_mass], dtype=np.float64),
             size_mm=np.array(means),
             replicates_mm=replicates,
             readings=len(done),
-            masses_not_done=len(seen) - len(by_mass),
-            masses_without_reading=len(ex_vivo_mm) - len(seen),
-            mass=np.array([masses[key] for key in by_mass], dtype=np.int64),
+            masses_not_done=len(keys) - len(by_mass),
+            masses_without_reading=len(ex_vivo_mm) - len(keys),
+            mass=np.array([mass_number[key] for key in by_mass], dtype=np.int64),
         )
     return sizes
 
 
 def mass_numbers(masses: Iterable[MassKey]) -> dict[MassKey, int]:
-    """Each mass's number, in order of patient and mass."""
+    """Number of each mass, in order of patient and mass."""
     return {key: index for index, key in enumerate(sorted(masses))}
 
 
 # --- Plausibility of a trial's units: impossible sizes, and modalities that differ from excision tenfold.
 
-# Largest extents of palpable masses lie well inside; beyond, a size is more likely in another unit or misplaced.
+# Palpable masses measure well between these; a size outside is more likely in another unit or in the wrong column.
 LEAST_MM, MOST_MM = 2.0, 150.0
 UNITS = {"cm": 10.0, "inches": 25.4, "m": 1000.0}
-NEAR = 1.6  #: A median ratio within this factor of a unit is doubted. No modality is wrong sixfold in the median.
+NEAR = 1.6  #: A median ratio this near to a unit's factor is doubted: no modality is wrong sixfold in the median.
 
 
 def unit_doubts(sizes: Mapping[str, ModalitySizes], ex_vivo_mm: FloatArray) -> list[str]:
@@ -225,57 +228,60 @@ def unit_doubts(sizes: Mapping[str, ModalitySizes], ex_vivo_mm: FloatArray) -> l
     `ex_vivo_mm` is of all excised masses.
     """
     doubts = _outside("ex-vivo sizes", ex_vivo_mm)
-    for name, detected in ((name, one.only_detected()) for name, one in sizes.items() if one.detected.any()):
+    for name, detected in (
+        (name, modality.only_detected()) for name, modality in sizes.items() if modality.detected.any()
+    ):
         doubts += _outside(f"{name} sizes", np.concatenate(detected.replicates_mm))
         with np.errstate(over="ignore", under="ignore"):
             ratio = float(np.median(detected.size_mm / detected.ex_vivo_mm))
-        found = f"{name} sizes are {ratio:.3g} times the ex-vivo sizes in the median"
+        comparison = f"{name} sizes are {ratio:.3g} times the ex-vivo sizes in the median"
         for unit, factor in UNITS.items():
             if factor / NEAR < ratio < factor * NEAR:
-                doubts.append(f"{found}: are the ex-vivo sizes in {unit}?")
+                doubts.append(f"{comparison}: are the ex-vivo sizes in {unit}?")
             elif factor / NEAR < 1 / max(ratio, 1e-300) < factor * NEAR:
-                doubts.append(f"{found}: are the {name} sizes in {unit}?")
+                doubts.append(f"{comparison}: are the {name} sizes in {unit}?")
     return doubts
 
 
-def _outside(what: str, values_mm: FloatArray) -> list[str]:
+def _outside(name: str, values_mm: FloatArray) -> list[str]:
+    """Sentence on the values outside `LEAST_MM` to `MOST_MM`; empty without any."""
     outside = (values_mm < LEAST_MM) | (values_mm > MOST_MM)
     text = (
-        f"{int(outside.sum())} of {len(values_mm)} {what} lie outside {LEAST_MM:g} to {MOST_MM:g} mm "
+        f"{int(outside.sum())} of {len(values_mm)} {name} lie outside {LEAST_MM:g} to {MOST_MM:g} mm "
         f"(from {values_mm.min(initial=np.inf):.3g} to {values_mm.max(initial=0.0):.3g}): are they in mm?"
     )
     return [text] if outside.any() else []
 
 
-# --- Which readings of a trial belong to the excision: those of the last visit on or before it.
+# --- The readings to compare with excision: those of the last visit on or before it.
 
 _NUMBERED = re.compile(r"(\D*)([0-9]{1,9})")
 Row = tuple[int, Reading]
 
 
 class OtherVisits(Record):
-    """Readings that a trial's analysis leaves out because they are of other visits than the excision's."""
+    """Numbers of readings left out of a trial's analysis because they are of another visit."""
 
-    masses: int = 0  #: How many masses were read at several visits.
+    masses: int = 0  #: Masses read at several visits.
     earlier: int = 0
     later: int = 0
     """`earlier`, `later`: Readings at visits before the last one, and after the excision."""
     only_there: Mapping[str, int] = field(default_factory=dict)
-    """By modality, masses that it read at other visits alone."""
+    """Masses read at other visits alone, by modality."""
 
     def lines(self) -> list[str]:
-        """What was left out, in words; empty where nothing was."""
+        """Text of what is left out, a line each; empty where nothing is."""
         if not self.earlier and not self.later:
             return []
         parts = [f"{self.earlier} of earlier visits"] if self.earlier else []
         parts += [f"{self.later} after excision"] if self.later else []
         masses = "1 mass was" if self.masses == 1 else f"{self.masses} masses were"
-        told = f"{masses} read at several visits: the last one before excision is analysed, readings left out: "
-        lost = [
+        heading = f"{masses} read at several visits: the last one before excision is analysed, readings left out: "
+        lost_masses = [
             f"{name}: {n} mass{'es' * (n > 1)} left out, read at other visits alone"
             for name, n in self.only_there.items()
         ]
-        return [told + ", ".join(parts), *lost]
+        return [heading + ", ".join(parts), *lost_masses]
 
 
 class Trial(Record, eq=False):
@@ -285,20 +291,20 @@ class Trial(Record, eq=False):
     ex_vivo_mm: Mapping[MassKey, float]  #: Size after excision, of every mass of the readings.
     ex_vivo_sd_mm: Mapping[MassKey, float | None] = field(default_factory=dict)
     """Standard deviation of each ex-vivo size where it is known; enters the calibration in quadrature."""
-    other_visits: OtherVisits = field(default_factory=OtherVisits)  #: What the readings leave out.
+    other_visits: OtherVisits = field(default_factory=OtherVisits)  #: Readings left out, of other visits.
     files: Mapping[str, Path] = field(default_factory=dict)  #: Files that they were read from, by role.
 
     def sizes(self) -> dict[str, ModalitySizes]:
         """The sizes by each modality."""
         return gather(self.readings, self.ex_vivo_mm)
 
-    def found(self, modality: str) -> list[Reading]:
-        """The readings with a size by a modality; in one order for every order of the rows."""
-        found = (one for one in self.readings if one.modality == modality and one.size_mm is not None)
-        return sorted(found, key=lambda one: (one.key, one.replicate))
+    def sized_readings(self, modality: str) -> list[Reading]:
+        """Readings of a modality that have a size, in order of mass and replicate."""
+        sized = (one for one in self.readings if one.modality == modality and one.size_mm is not None)
+        return sorted(sized, key=lambda one: (one.key, one.replicate))
 
 
-def in_order(visits: Mapping[str, date | None]) -> list[str] | None:
+def visits_in_order(visits: Mapping[str, date | None]) -> list[str] | None:
     """Codes of visits in order of time: by their dates, else by their numbers; None where neither gives an order.
 
     A code may itself be a date or end in a number, as in 2026-03-01, 2 or V2.
@@ -315,7 +321,7 @@ def in_order(visits: Mapping[str, date | None]) -> list[str] | None:
 
 
 def day_of(code: str) -> date | None:
-    """The date that a visit's code is; None where it is none."""
+    """Date that a visit's code states; None where it is no date."""
     try:
         return date.fromisoformat(code) if len(code) == len("2026-03-01") else None
     except ValueError:
@@ -323,40 +329,38 @@ def day_of(code: str) -> date | None:
 
 
 def _numbers(codes: Iterable[str]) -> dict[str, int] | None:
-    """Number of each visit by the end of its code; None where they have none, or several stems."""
-    found = {code: _NUMBERED.fullmatch(code) for code in codes}
-    numbers = {code: int(one[2]) for code, one in found.items() if one is not None}
-    stems = {one[1].casefold() for one in found.values() if one is not None}
-    return numbers if len(numbers) == len(found) == len(set(numbers.values())) and len(stems) <= 1 else None
+    """Number at the end of each visit's code; None where one has none, two are equal or the stems differ."""
+    matches = {code: _NUMBERED.fullmatch(code) for code in codes}
+    numbers = {code: int(match[2]) for code, match in matches.items() if match is not None}
+    stems = {match[1].casefold() for match in matches.values() if match is not None}
+    return numbers if len(numbers) == len(matches) == len(set(numbers.values())) and len(stems) <= 1 else None
 
 
 def at_excision(
     readings: Sequence[Reading], excised_on: Mapping[MassKey, date | None], *, fault: CellFault
 ) -> tuple[list[Reading], OtherVisits]:
-    """The readings of each mass at its last visit on or before excision, and what that leaves out.
+    """Readings of each mass at its last visit on or before excision, and the numbers of those left out.
 
-    Readings that name neither visit nor date stay. Without dates the visits are in order of their numbers, and the last
-    one is taken to lie before excision.
-
-    Readings are in the order of the table's rows. At fault are visits whose order is not known, an excision before
-    every visit, and a reading that does not say of which of several visits it is.
+    Readings, in the order of the table's rows, that name neither visit nor date stay. Without dates the visits are
+    ordered by their numbers, and the last one is taken to lie before excision. Refused are visits whose order is not
+    known, an excision before every visit, and a reading without a visit beside others that have one.
     """
     by_mass: dict[MassKey, list[Row]] = defaultdict(list)
     for row in enumerate(readings):
         by_mass[row[1].key].append(row)
-    several = later = 0
+    several = later = 0  # masses of several visits, readings after excision
     dropped: set[int] = set()
     only_there: Counter[str] = Counter()
     for key, rows in by_mass.items():
-        visits, after = _of_mass(rows, excised_on.get(key), fault=fault)
+        visits, after = _visits_around_excision(rows, excised_on.get(key), fault=fault)
         last = visits[-1] if visits else None
-        left = {i for i, one in rows if (name := _visit(one)) is not None and name != last}
+        others = {i for i, reading in rows if (name := _visit(reading)) is not None and name != last}
         several += len(visits) + len(after) > 1
-        later += sum(_visit(readings[i]) in after for i in left)
-        dropped |= left
-        kept = {one.modality for i, one in rows if i not in left}
-        only_there.update({one.modality for _, one in rows} - kept)
-    analysed = [one for i, one in enumerate(readings) if i not in dropped]
+        later += sum(_visit(readings[i]) in after for i in others)
+        dropped |= others
+        analysed_by = {reading.modality for i, reading in rows if i not in others}
+        only_there.update({reading.modality for _, reading in rows} - analysed_by)
+    analysed = [reading for i, reading in enumerate(readings) if i not in dropped]
     return analysed, OtherVisits(several, len(dropped) - later, later, dict(sorted(only_there.items())))
 
 
@@ -365,48 +369,53 @@ def _visit(reading: Reading) -> str | None:
     return reading.visit or (None if reading.day is None else reading.day.isoformat())
 
 
-def _of_mass(rows: Sequence[Row], excised: date | None, *, fault: CellFault) -> tuple[list[str], set[str]]:
+def _visits_around_excision(
+    rows: Sequence[Row], excised: date | None, *, fault: CellFault
+) -> tuple[list[str], set[str]]:
     """Visits of a mass up to its excision, in order, and those after it."""
-    first = {name: i for i, one in reversed(rows) if (name := _visit(one)) is not None}
+    first_row = {name: i for i, reading in reversed(rows) if (name := _visit(reading)) is not None}
     days = {}
-    for name in first:
-        known = [one.day for _, one in rows if _visit(one) == name and one.day is not None]
-        days[name] = max(known, default=day_of(name))
+    for name in first_row:
+        stated_days = [reading.day for _, reading in rows if _visit(reading) == name and reading.day is not None]
+        days[name] = max(stated_days, default=day_of(name))
     after = {name for name, day in days.items() if excised is not None and day is not None and day > excised}
     before = {name: day for name, day in days.items() if name not in after}
     if after and not before:
-        row = min(first.values())
-        what = f"of this mass and all its others are after excision on {excised}"
-        raise fault(row, "date", what, way_out="correct the date here or of excision, or leave the readings out")
-    if len(first) > 1:
-        _check_said(rows, fault=fault)
-    order = in_order(before)
+        row = min(first_row.values())
+        problem = f"of this mass and all its others are after excision on {excised}"
+        raise fault(row, "date", problem, way_out="correct the date here or of excision, or leave the readings out")
+    if len(first_row) > 1:
+        _check_visits_named(rows, fault=fault)
+    order = visits_in_order(before)
     if order is None:
-        names = " and ".join(sorted(before, key=lambda name: first[name]))
-        what = f"{names} of one mass do not say which was first"
+        names = " and ".join(sorted(before, key=lambda name: first_row[name]))
+        problem = f"{names} of one mass do not say which was first"
         way_out = "give each reading its date, or number the visits in order of time"
-        raise fault(max(first[name] for name in before), "visit", what, way_out=way_out)
-    _check_dates(order, before, first, fault=fault)
+        raise fault(max(first_row[name] for name in before), "visit", problem, way_out=way_out)
+    _check_dates(order, before, first_row, fault=fault)
     return order, after
 
 
-def _check_said(rows: Sequence[Row], *, fault: CellFault) -> None:
-    """Refuse, in a mass of several visits, readings that do not say of which they are beside others that do."""
-    coded = any(one.visit for _, one in rows)
-    timed = {one.modality for _, one in rows if _visit(one) is not None}
-    for i, one in rows:
-        if one.visit is None and ((coded and one.day is not None) or (one.day is None and one.modality in timed)):
-            what = "is blank while other readings of the mass are of several visits"
-            raise fault(i, "visit", what, way_out="give every reading of the mass its visit")
+def _check_visits_named(rows: Sequence[Row], *, fault: CellFault) -> None:
+    """Refuse readings of a mass of several visits that name no visit beside others that do."""
+    any_visit_code = any(reading.visit for _, reading in rows)
+    modalities_with_visits = {reading.modality for _, reading in rows if _visit(reading) is not None}
+    for i, reading in rows:
+        if reading.visit is None and (
+            (any_visit_code and reading.day is not None)
+            or (reading.day is None and reading.modality in modalities_with_visits)
+        ):
+            problem = "is blank while other readings of the mass are of several visits"
+            raise fault(i, "visit", problem, way_out="give every reading of the mass its visit")
 
 
 def _check_dates(
-    order: Sequence[str], days: Mapping[str, date | None], first: Mapping[str, int], *, fault: CellFault
+    order: Sequence[str], days: Mapping[str, date | None], first_row: Mapping[str, int], *, fault: CellFault
 ) -> None:
     """Refuse dates that contradict the visits' numbers."""
     numbers = _numbers(order) or {}
     dated = [name for name in order if days[name] is not None and name in numbers]
-    for one, later in pairwise(sorted(dated, key=lambda name: numbers[name])):
-        if (days[later] or date.max) < (days[one] or date.min):
-            what = f"visit {later} is of {days[later]}, before visit {one} of {days[one]}"
-            raise fault(first[later], "date", what, way_out="correct the date, or the visits' numbers")
+    for earlier, later in pairwise(sorted(dated, key=lambda name: numbers[name])):
+        if (days[later] or date.max) < (days[earlier] or date.min):
+            problem = f"visit {later} is of {days[later]}, before visit {earlier} of {days[earlier]}"
+            raise fault(first_row[later], "date", problem, way_out="correct the date, or the visits' numbers")

@@ -45,7 +45,7 @@ class Components(Record):
 
 
 class ReplicateFigures(Figures):
-    """Spread between the readings of one mass, on ln size, and the components of the scatter."""
+    """Spread between the readings of one mass, on ln size, and variance components."""
 
     within_mass_log_sd: float | None
     within_mass_log_sd_interval: Ends | None
@@ -69,16 +69,16 @@ def components(y: FloatArray, mass: Index, reader: Index) -> Components:
     that a variance of 0 is no edge (Bates et al. 2015, J. Stat. Softw. 67(1)).
     """
     readers, freedom = int(reader.max()) + 1, len(y) - 1
-    solved = _solver(y - y.mean(), mass, reader)
+    terms_at = _criterion_terms(y - y.mean(), mass, reader)
 
     def criterion(ratios: FloatArray) -> float:
-        log_det, squares = solved(ratios)
+        log_det, squares = terms_at(ratios)
         return log_det + freedom * math.log(max(squares, 1e-300))
 
     start = np.array([1.0, 0.3] if readers > 1 else [1.0])
-    found = [_descend(criterion, start * factor) for factor in (1.0, 0.2, 5.0)]
-    ratios = np.abs(min(found, key=criterion))
-    residual = max(0.0, solved(ratios)[1]) / freedom
+    minima = [_minimise(criterion, start * factor) for factor in (1.0, 0.2, 5.0)]
+    ratios = np.abs(min(minima, key=criterion))
+    residual = max(0.0, terms_at(ratios)[1]) / freedom
     variances = np.where(ratios < 1e-6, 0.0, ratios**2 * residual)  # 0 where the search ended at its lower limit
     return Components(
         mass=float(variances[0]),
@@ -90,8 +90,8 @@ def components(y: FloatArray, mass: Index, reader: Index) -> Components:
     )
 
 
-def _solver(y: FloatArray, mass: Index, reader: Index) -> Callable[[FloatArray], tuple[float, float]]:
-    """At ratios of SDs: log determinant of the criterion and weighted residual sum of squares, both over variance 1.
+def _criterion_terms(y: FloatArray, mass: Index, reader: Index) -> Callable[[FloatArray], tuple[float, float]]:
+    """Function of the ratios of SDs: log determinant and generalised residual sum of squares, at residual variance 1.
 
     Masses are eliminated one by one, which leaves a system of the readers' size.
     """
@@ -101,7 +101,7 @@ def _solver(y: FloatArray, mass: Index, reader: Index) -> Callable[[FloatArray],
     np.add.at(cross, mass, terms)
     count, total = cross[:, 0], np.bincount(mass, weights=y)
 
-    def solved(ratios: FloatArray) -> tuple[float, float]:
+    def terms_at(ratios: FloatArray) -> tuple[float, float]:
         scale = np.full(terms.shape[1], ratios[1] if len(ratios) > 1 else 0.0)
         scale[0] = 1.0
         shrink = ratios[0] ** 2 / (1 + ratios[0] ** 2 * count)
@@ -112,11 +112,11 @@ def _solver(y: FloatArray, mass: Index, reader: Index) -> Callable[[FloatArray],
         log_det = np.linalg.slogdet(system)[1] + np.sum(np.log1p(ratios[0] ** 2 * count))
         return float(log_det), squares
 
-    return solved
+    return terms_at
 
 
-def _descend(function: Callable[[FloatArray], float], theta: FloatArray) -> FloatArray:
-    """A minimum by Newton's method with finite differences, kept downhill."""
+def _minimise(function: Callable[[FloatArray], float], theta: FloatArray) -> FloatArray:
+    """Local minimum by Newton's method with finite differences; steps are halved until they do not go up."""
     for _ in range(60):
         step = 1e-4 * np.maximum(np.abs(theta), 1e-2)
         values = np.array([function(point) for point in stencil(theta, step=step)])
@@ -150,7 +150,7 @@ def spread_figures(sizes: ModalitySizes, *, intervals: Intervals) -> dict[str, F
 
 
 def _terms(sizes: ModalitySizes) -> FloatArray:
-    """SD, SD over mean, variance and squared SD over mean by degrees of freedom, those, and 1, of each mass."""
+    """(n, 6) SD, SD over mean, both squared times degrees of freedom, degrees of freedom, and 1, of each mass."""
     number, _, squares = _moments(sizes, lambda size_mm: size_mm)
     freedom = number - 1.0
     sds = np.sqrt(squares / freedom)
@@ -187,7 +187,7 @@ SPREAD = {
 # --- Repeatability as a ratio, and components of the scatter of sizes: masses, readers and maps.
 
 # Two readings of one mass differ by less than this many within-mass SDs in 95 % of pairs.
-_PAIR = 1.959963984540054 * math.sqrt(2)
+REPEATABILITY_SDS = 1.959963984540054 * math.sqrt(2)
 
 
 def replicate_figures(sizes: ModalitySizes, *, intervals: Intervals) -> dict[str, Figure]:
@@ -200,37 +200,39 @@ def replicate_figures(sizes: ModalitySizes, *, intervals: Intervals) -> dict[str
     log_sd = figure(log_sd_within, replicated, scale="log", intervals=intervals)
     return {
         "within_mass_log_sd": log_sd,
-        "repeatability_low_percent": log_sd.mapped(lambda sd: 100 * math.expm1(-_PAIR * sd)),
-        "repeatability_high_percent": log_sd.mapped(lambda sd: 100 * math.expm1(_PAIR * sd)),
+        "repeatability_low_percent": log_sd.mapped(lambda sd: 100 * math.expm1(-REPEATABILITY_SDS * sd)),
+        "repeatability_high_percent": log_sd.mapped(lambda sd: 100 * math.expm1(REPEATABILITY_SDS * sd)),
         "icc": figure(icc, replicated, scale="fisher", intervals=intervals),
     }
 
 
 def _log_terms(sizes: ModalitySizes) -> FloatArray:
+    """(n, 6) 1, m, m^2, m times the centred mean of logs, m times its square, and sum of squares, for m replicates."""
     number, mean, squares = _moments(sizes, np.log)
     centred = mean - mean.mean()
     return columns(1.0, number, number**2, number * centred, number * centred**2, squares)
 
 
 def _icc(sums: FloatArray) -> FloatArray:
+    """Intraclass correlation of a one-way analysis of variance with unequal numbers of replicates."""
     masses, number, number2, first, second, within = np.moveaxis(sums, -1, 0)
     mean_within = ratio(within, number - masses)
     mean_between = ratio(second - ratio(first**2, number), masses - 1)
-    usual = ratio(number - ratio(number2, number), masses - 1)
-    return ratio(mean_between - mean_within, mean_between + (usual - 1) * mean_within)
+    mean_number = ratio(number - ratio(number2, number), masses - 1)
+    return ratio(mean_between - mean_within, mean_between + (mean_number - 1) * mean_within)
 
 
 log_sd_within = SumStatistic(_log_terms, lambda sums: np.sqrt(ratio(sums[..., 5], sums[..., 1] - sums[..., 0])))
 icc = SumStatistic(_log_terms, _icc, undefined="one mass, or no scatter at all, has no correlation within masses")
 
 
-def reader_components(found: Sequence[Reading]) -> Components | None:
-    """Variances of log size between masses, between readers and between maps, by REML, from readings with a size.
+def reader_components(readings: Sequence[Reading]) -> Components | None:
+    """REML variances of log size between masses, readers and maps, from readings with a size.
 
-    Readings without a reader are left out when any has one. None where nothing was replicated.
+    Readings without a reader are left out when any has one. None with fewer than 2 masses or 2 replicates.
     """
-    chosen = [one for one in found if one.reader] or found
-    mass, reader = _numbered([one.key for one in chosen]), _numbered([one.reader for one in chosen])
+    chosen = [one for one in readings if one.reader] or readings
+    mass, reader = _codes([one.key for one in chosen]), _codes([one.reader for one in chosen])
     masses = len(set(mass.tolist()))
     if len(chosen) - masses < 2 or masses < 2:
         return None
@@ -238,6 +240,7 @@ def reader_components(found: Sequence[Reading]) -> Components | None:
     return components(np.log(sizes), mass, reader)
 
 
-def _numbered(names: Sequence[object]) -> Index:
+def _codes(names: Sequence[object]) -> Index:
+    """Numbers of names from 0 in order of first appearance."""
     number = {name: index for index, name in enumerate(dict.fromkeys(names))}
     return np.array([number[name] for name in names], dtype=np.int64)

@@ -1,10 +1,11 @@
-"""All statistics of a trial in one call, and whether the intervals that its readings state hold."""
+"""All statistics of a trial in one call, with coverage and calibration of the intervals that its readings state."""
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -56,19 +57,19 @@ def coverage(
 ) -> tuple[Coverage, ...]:
     """Coverage at each nominal probability by the readings that state an interval, its ends included.
 
-    Replicates of a mass share its ex-vivo size, so n intervals on m masses are not n trials. The interval takes the
-    share covered as found on m trials: exact where each mass has one interval, on the wide side where it has more.
+    Replicates of a mass share its ex-vivo size, so n intervals on m masses are not n trials. `fraction_interval` is
+    that of m trials: exact where each mass has one interval, on the wide side where it has more.
     """
-    stated: dict[float, list[tuple[MassKey, bool]]] = defaultdict(list)
+    by_probability: dict[float, list[tuple[MassKey, bool]]] = defaultdict(list)
     for one in readings:
         if (ends := one.interval) is not None:
-            stated[ends.probability].append((one.key, ends.low_mm <= ex_vivo_mm[one.key] <= ends.high_mm))
-    found = []
-    for probability, group in sorted(stated.items()):
+            by_probability[ends.probability].append((one.key, ends.low_mm <= ex_vivo_mm[one.key] <= ends.high_mm))
+    levels = []
+    for probability, group in sorted(by_probability.items()):
         n, covered, masses = len(group), sum(inside for _, inside in group), len({key for key, _ in group})
         share = clopper_pearson(covered * masses / n, masses, confidence=confidence)
-        found.append(Coverage(probability, n, covered, masses, covered / n, share))
-    return tuple(found)
+        levels.append(Coverage(probability, n, covered, masses, covered / n, share))
+    return tuple(levels)
 
 
 # --- Calibration of stated uncertainties: probability integral transforms, scores, and the implied correction.
@@ -81,19 +82,19 @@ BINS = 10
 
 
 class Prediction(Record, eq=False):
-    """Predictive distributions of log ex-vivo sizes, one per reading, with the sizes found."""
+    """Predictive distributions of log ex-vivo sizes, one per reading, and the ex-vivo sizes."""
 
     median_log: FloatArray
     sd_log: FloatArray
     """`median_log`, `sd_log`: (n,) arrays of each prediction: the logarithm of its median in mm and its SD, caliper
     error included."""
-    found_log: FloatArray  #: (n,) array: logarithm of the ex-vivo size in mm.
+    ex_vivo_log: FloatArray  #: (n,) array: logarithm of the ex-vivo size in mm.
     mass: npt.NDArray[np.int64]  #: (n,) array of the masses' numbers.
 
     @property
     def z(self) -> FloatArray:
         """(n,) standardised errors: standard normal when the uncertainties are honest."""
-        return (self.found_log - self.median_log) / self.sd_log
+        return (self.ex_vivo_log - self.median_log) / self.sd_log
 
 
 class LevelCoverage(Record):
@@ -123,9 +124,9 @@ class Calibration(Record):
 
 
 def calibration(prediction: Prediction, *, confidence: float) -> Calibration:
-    """Judge predictions, of which there is one at least.
+    """Calibration of at least one prediction.
 
-    Readings of one mass share its ex-vivo size, so n readings on m masses count as m trials wherever chance is judged.
+    Readings of one mass share its ex-vivo size, so intervals and the band take n readings on m masses as m trials.
     """
     z = prediction.z
     pit = ndtr(z)
@@ -133,15 +134,16 @@ def calibration(prediction: Prediction, *, confidence: float) -> Calibration:
     ordered = np.sort(pit)
     steps = np.arange(len(pit) + 1) / len(pit)
     distance = float(max(np.max(steps[1:] - ordered), np.max(ordered - steps[:-1])))
-    mean, tail = float(np.mean(z**2)), 0.5 - 0.5 * confidence  # chi-squared, one degree of freedom per mass
+    mean, tail = float(np.mean(z**2)), 0.5 - 0.5 * confidence
+    # chi-squared, one degree of freedom per mass
     low, high = (math.sqrt(masses * mean / float(chdtri(masses, p))) for p in (tail, 1 - tail))
     scale, ends = math.sqrt(mean), (low, high)
-    shift = 100 * math.expm1(float(np.median(prediction.found_log - prediction.median_log)))
+    shift = 100 * math.expm1(float(np.median(prediction.ex_vivo_log - prediction.median_log)))
     levels = []
     for level in LEVELS:
         covered = int(np.sum(np.abs(z) <= float(ndtri(0.5 + 0.5 * level))))
-        share = clopper_pearson(covered * masses / len(z), masses, confidence=confidence)
-        levels.append(LevelCoverage(level, covered, len(z), share))
+        interval = clopper_pearson(covered * masses / len(z), masses, confidence=confidence)
+        levels.append(LevelCoverage(level, covered, len(z), interval))
     band = float(kolmogi(1 - confidence)) / math.sqrt(masses)
     return Calibration(
         n=len(z),
@@ -174,17 +176,17 @@ def crps_log_normal(prediction: Prediction) -> FloatArray:
 
     Baran & Lerch (2015), Q. J. R. Meteorol. Soc. 141, 2289.
     """
-    w, sd, found = prediction.z, prediction.sd_log, np.exp(prediction.found_log)
+    w, sd, ex_vivo = prediction.z, prediction.sd_log, np.exp(prediction.ex_vivo_log)
     mean = np.exp(prediction.median_log + sd**2 / 2)
-    return np.asarray(found * (2 * ndtr(w) - 1) - 2 * mean * (ndtr(w - sd) + ndtr(sd / math.sqrt(2)) - 1))
+    return np.asarray(ex_vivo * (2 * ndtr(w) - 1) - 2 * mean * (ndtr(w - sd) + ndtr(sd / math.sqrt(2)) - 1))
 
 
 def interval_score(prediction: Prediction, *, probability: float) -> FloatArray:
     """(n,) interval scores in mm: Gneiting & Raftery (2007), J. Am. Stat. Assoc. 102, 359, eq. 43."""
     reach = float(ndtri(0.5 + 0.5 * probability)) * prediction.sd_log
     low, high = np.exp(prediction.median_log - reach), np.exp(prediction.median_log + reach)
-    found = np.exp(prediction.found_log)
-    outside = np.maximum(low - found, 0) + np.maximum(found - high, 0)
+    ex_vivo = np.exp(prediction.ex_vivo_log)
+    outside = np.maximum(low - ex_vivo, 0) + np.maximum(ex_vivo - high, 0)
     return np.asarray(high - low + 2 / (1 - probability) * outside)
 
 
@@ -205,19 +207,22 @@ def prediction_of(trial: Trial, modality: str) -> Prediction | None:
 
     The caliper's relative error is added in quadrature.
     """
-    kept = [(one.key, stated) for one in trial.found(modality) if (stated := log_normal(one)) is not None]
-    if not kept:
+    stated = [
+        (one.key, uncertainty) for one in trial.sized_readings(modality) if (uncertainty := log_normal(one)) is not None
+    ]
+    if not stated:
         return None
     masses = mass_numbers(trial.ex_vivo_mm)
-    found = np.array([trial.ex_vivo_mm[key] for key, _ in kept], dtype=np.float64)
-    caliper = np.array([trial.ex_vivo_sd_mm.get(key) or 0.0 for key, _ in kept]) / found
-    medians, sds = np.array([stated for _, stated in kept], dtype=np.float64).T
+    ex_vivo = np.array([trial.ex_vivo_mm[key] for key, _ in stated], dtype=np.float64)
+    caliper = np.array([trial.ex_vivo_sd_mm.get(key) or 0.0 for key, _ in stated]) / ex_vivo
+    medians, sds = np.array([uncertainty for _, uncertainty in stated], dtype=np.float64).T
     return Prediction(
-        medians, np.sqrt(sds**2 + np.log1p(caliper**2)), np.log(found), np.array([masses[key] for key, _ in kept])
+        medians, np.sqrt(sds**2 + np.log1p(caliper**2)), np.log(ex_vivo), np.array([masses[key] for key, _ in stated])
     )
 
 
 def _advice(scale: float, ends: Ends, masses: int, refuted: bool) -> str:
+    """Sentence on the stated uncertainties: adequate, too narrow or too wide by `scale`, or too few masses to judge."""
     if masses < MIN_PATIENTS:
         return f"too few masses ({masses}) to judge; at least {MIN_PATIENTS} are needed"
     if ends[0] <= 1 <= ends[1]:
@@ -325,7 +330,7 @@ class ModalityReport(Figures):
 
 
 class Counts(Record):
-    """How much a trial is made of."""
+    """Numbers of patients, masses and readings of a trial."""
 
     patients: Count
     masses: Count
@@ -350,7 +355,7 @@ class TrialReport(Record, kw_only=True):
     paired_comparisons: tuple[
         accuracy.PairedComparison, ...
     ]  #: Every pair of modalities on the masses that both looked for.
-    doubts: tuple[str, ...]  #: What looks like another unit than mm.
+    doubts: tuple[str, ...]  #: Columns whose sizes seem to be in another unit than mm.
     conventions: dict[str, str]
     next_mass: NextMass | UnsetType = UNSET  #: Errors-in-variables model: what the next mass may bring.
     provenance: dict[str, Any]
@@ -379,8 +384,8 @@ def summarise(
             readings_after_excision=trial.other_visits.later,
         ),
         modalities={
-            name: modality_report(one, trial, intervals=intervals, error_ratio=error_ratio)
-            for name, one in sizes.items()
+            name: modality_report(modality_sizes, trial, intervals=intervals, error_ratio=error_ratio)
+            for name, modality_sizes in sizes.items()
         },
         mape_ratio_to_tactile=accuracy.mape_ratios(sizes, intervals=intervals),
         paired_comparisons=tuple(accuracy.paired_comparisons(sizes, intervals=intervals)),
@@ -395,28 +400,30 @@ def modality_report(
     sizes: ModalitySizes, trial: Trial, *, intervals: Intervals, error_ratio: float = 1.0
 ) -> ModalityReport:
     """Report one modality: counts, all figures, coverage."""
-    found, prediction = trial.found(sizes.name), prediction_of(trial, sizes.name)
-    fields = fields_of({name: one for family in FAMILIES for name, one in family(sizes, intervals=intervals).items()})
+    readings, prediction = trial.sized_readings(sizes.name), prediction_of(trial, sizes.name)
+    families = (family(sizes, intervals=intervals).items() for family in FAMILIES)
+    fields = fields_of(dict(chain.from_iterable(families)))
     if prediction is None:
         fields["reasons"]["calibration"] = "no reading states an interval or a standard deviation"
-    share, n = None, len(sizes.size_mm)
-    if n:  # for the effective number of patients: masses of one are no new trials
-        number = effective_number(np.ones(n), sizes.patient)
-        share = clopper_pearson(float(sizes.detected.mean()) * number, number, confidence=intervals.probability)
+    detected_interval, n = None, len(sizes.size_mm)
+    if n:  # masses of one patient are not independent: the effective number of patients takes the place of n
+        trials = effective_number(np.ones(n), sizes.patient)
+        share = float(sizes.detected.mean())
+        detected_interval = clopper_pearson(share * trials, trials, confidence=intervals.probability)
     return ModalityReport(
         n=n,
         detected=int(sizes.detected.sum()),
-        detected_interval=share,
+        detected_interval=detected_interval,
         patients=len(sizes.patients),
         readings=sizes.readings,
         readings_detected=sum(len(group) for group in sizes.replicates_mm),
         masses_not_done=sizes.masses_not_done,
         masses_without_reading=sizes.masses_without_reading,
         **fields,
-        coverage=coverage(found, trial.ex_vivo_mm, confidence=intervals.probability),
+        coverage=coverage(readings, trial.ex_vivo_mm, confidence=intervals.probability),
         method_comparison=compare_methods(sizes, intervals=intervals, error_ratio=error_ratio),
         replicates=ReplicateFigures(
-            **fields_of(replicate_figures(sizes, intervals=intervals)), variance_components=reader_components(found)
+            **fields_of(replicate_figures(sizes, intervals=intervals)), variance_components=reader_components(readings)
         ),
         calibration=None if prediction is None else calibration(prediction, confidence=intervals.probability),
         cautions=accuracy.cautions(sizes, intervals=intervals),

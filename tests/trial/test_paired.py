@@ -23,7 +23,7 @@ from tactile_bayes.trial.figures import (
     draw_patients,
     figure,
 )
-from tactile_bayes.trial.planning import PlanCase, assumptions_from, map_gains, run_case
+from tactile_bayes.trial.planning import PlanCase, map_gains, pilot_errors, simulate_design
 from tactile_bayes.trial.readings import ModalitySizes
 from validation.simulated_trials import ErrorModel, check_intervals, simulate
 
@@ -173,11 +173,11 @@ def test_the_true_error_of_a_model_is_its_mean(bias: float, sd: float, miss: flo
 def test_simulated_trials_have_the_trials_shape_and_errors() -> None:
     one, model = trial(10, 200), ErrorModel(0.1, 0.3, miss=0.1)
     again = simulate(one.patient, one.ex_vivo_mm, model, rng=np.random.default_rng(0))
-    errors = assumptions_from(again, again)
+    errors = pilot_errors(again, again)
     assert errors["tactile_bias"] == pytest.approx(0.1, abs=0.07)
     assert errors["other_sd"] == pytest.approx(0.3, rel=0.2)
     assert errors["other_miss"] == pytest.approx(0.1, abs=0.06)
-    assert assumptions_from(one, sizes("x", [11, 0, 12])) is None
+    assert pilot_errors(one, sizes("x", [11, 0, 12])) is None
 
 
 def test_intervals_are_checked_and_half_intervals_found_out() -> None:
@@ -197,8 +197,8 @@ def case(**changes: float) -> PlanCase:
 
 
 def test_plans_gain_by_patients_and_by_maps_less_each_time() -> None:
-    found = [run_case(case(maps=m)) for m in (1, 3, 5)]
-    assert run_case(case(patients=12)).power < found[1].power
+    found = [simulate_design(case(maps=m)) for m in (1, 3, 5)]
+    assert simulate_design(case(patients=12)).power < found[1].power
     one, two = map_gains(found)
     assert one.tactile_percent_change < two.tactile_percent_change < 0
     assert (one.from_maps, two.to_maps) == (1, 5)
@@ -206,19 +206,19 @@ def test_plans_gain_by_patients_and_by_maps_less_each_time() -> None:
 
 def test_without_a_difference_power_is_the_tests_level() -> None:
     """One-sided half of 5 %: the tactile error must be the smaller one."""
-    found = run_case(case(maps=1, mass_sd=0.3, map_sd=0.0, other_sd=0.3, trials=400))
+    found = simulate_design(case(maps=1, mass_sd=0.3, map_sd=0.0, other_sd=0.3, trials=400))
     assert stats.binomtest(round(found.power * 400), 400, 0.025).pvalue > 1e-3
 
 
 def test_errors_of_the_plan_are_the_expected_ones() -> None:
-    found = run_case(case(maps=1, patients=60, trials=200, other_miss=0.1))
+    found = simulate_design(case(maps=1, patients=60, trials=200, other_miss=0.1))
     assert found.other_percent == pytest.approx(ErrorModel(0, 0.4, miss=0.1).true_mape_percent, rel=0.04)
     assert found.tactile_percent == pytest.approx(ErrorModel(0, math.hypot(0.1, 0.2)).true_mape_percent, rel=0.04)
 
 
 def test_a_pilot_gives_the_assumptions() -> None:
-    found = assumptions_from(trial(12, 300, 0.2), trial(13, 300, 0.4, "ultrasound"))
+    found = pilot_errors(trial(12, 300, 0.2), trial(13, 300, 0.4, "ultrasound"))
     assert found["mass_sd"] == pytest.approx(0.2, rel=0.15)
     assert found["map_sd"] == pytest.approx(0.1, rel=0.15)
     assert found["other_sd"] == pytest.approx(0.4, rel=0.15)
-    assert run_case(PlanCase(patients=8, maps=1, **found, trials=50, seed=0)).power > 0
+    assert simulate_design(PlanCase(patients=8, maps=1, **found, trials=50, seed=0)).power > 0

@@ -59,7 +59,7 @@ def test_halved_and_doubled_widths_are_found_out_and_mended(stated: float, word:
     mended = Prediction(
         prediction.median_log,
         prediction.sd_log * found.scale,
-        prediction.found_log,
+        prediction.ex_vivo_log,
         prediction.mass,
     )
     assert judged(mended).advice.startswith("no change")
@@ -85,7 +85,7 @@ def test_crps_is_the_integral_that_defines_it() -> None:
     prediction = drawn(4)
     for index, score in enumerate(crps_log_normal(prediction)):
         median, sd = prediction.median_log[index], prediction.sd_log[index]
-        found = math.exp(prediction.found_log[index])
+        found = math.exp(prediction.ex_vivo_log[index])
         cdf = stats.lognorm(sd, scale=math.exp(median)).cdf
         below = integrate.quad(lambda x, cdf=cdf: cdf(x) ** 2, 0, found, limit=200)[0]
         above = integrate.quad(lambda x, cdf=cdf: (1 - cdf(x)) ** 2, found, 40 * found, limit=200)[0]

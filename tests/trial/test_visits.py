@@ -9,7 +9,7 @@ import pytest
 from in_process import run_here
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.trial.readings import OtherVisits, Reading, at_excision, in_order
+from tactile_bayes.trial.readings import OtherVisits, Reading, at_excision, visits_in_order
 
 MASS = ("P1", "1")
 JAN, MARCH, MAY = date(2026, 1, 10), date(2026, 3, 10), date(2026, 5, 10)
@@ -89,10 +89,10 @@ def test_an_excision_before_every_visit_is_refused() -> None:
 
 
 def test_visits_are_ordered_by_dates_numbers_or_codes_that_are_dates() -> None:
-    assert in_order({"V10": None, "V9": None}) == ["V9", "V10"]
-    assert in_order({"2026-03-01": None, "2025-12-31": None}) == ["2025-12-31", "2026-03-01"]
-    assert in_order({"b": JAN, "a": MARCH}) == ["b", "a"]
-    assert in_order({"b": JAN, "a": None}) is None
+    assert visits_in_order({"V10": None, "V9": None}) == ["V9", "V10"]
+    assert visits_in_order({"2026-03-01": None, "2025-12-31": None}) == ["2025-12-31", "2026-03-01"]
+    assert visits_in_order({"b": JAN, "a": MARCH}) == ["b", "a"]
+    assert visits_in_order({"b": JAN, "a": None}) is None
 
 
 TRIAL = """patient,mass,modality,replicate,visit,date,size_mm,status
