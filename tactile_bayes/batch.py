@@ -32,11 +32,10 @@ if TYPE_CHECKING:
 # --- Results of a batch on disk, one line each: an interrupted batch resumes from what it has.
 #
 # The first line names the settings; each further line is one item's result: JSON and its CRC-32, so that no damaged
-# result is taken for a sound one. Memory holds where each line is and not what it says, so a store may be larger than
-# memory.
+# result is taken for a sound one. Memory holds the lines' offsets only, so a store may be larger than memory.
 
 STORE_SCHEMA: Final = "tactile-bayes.batch/2"
-_FLUSHED_EVERY_S: Final = 5.0  #: Lines reach the disk at least this often: what a loss of power may cost.
+_FLUSHED_EVERY_S: Final = 5.0  #: Lines reach the disk at least this often: a loss of power costs no more.
 
 _Coder = Callable[[Any], Any]
 
@@ -46,11 +45,11 @@ def _unchanged(value: Any) -> Any:
 
 
 class BatchStore(UserDict[str, Any]):
-    """Results by the names of their items, each read from the file when it is asked for; open it with `open_store`.
+    """Results by the names of their items, each read from the file on access; open it with `open_store`.
 
-    `descriptor` is of the open, locked file, `data` where the items' lines begin; the latest line of a name counts. A
-    result that is deleted is missing in this run, and its line stays in the file. A line half written when the program
-    was killed is dropped.
+    `descriptor` is that of the open, locked file, `data` holds the offsets of the items' lines; the latest line of a
+    name counts. A deleted result is missing in this run, and its line stays in the file. A line half written when the
+    program was killed is dropped.
     """
 
     def __init__(self, descriptor: int, path: Path, *, encode: _Coder, decode: _Coder, read_only: bool = False) -> None:
@@ -61,27 +60,27 @@ class BatchStore(UserDict[str, Any]):
         self._flush_at = time.monotonic() + _FLUSHED_EVERY_S
 
     def __getitem__(self, name: str) -> Any:
-        with open(self._descriptor, "rb", closefd=False) as file:  # what is written goes to the end all the same
+        with open(self._descriptor, "rb", closefd=False) as file:  # writes go to the end all the same
             file.seek(self.data[name])
             return self._decode(_without_checksum(file.readline()[:-1].decode())["value"])
 
     def add(self, name: str, value: object) -> Any:
         """Append one result and return it as it will be read back."""
         line = json.dumps({"key": name, "value": self._encode(value)}, ensure_ascii=False)
-        began = self._end
+        offset = self._end
         self._append(_with_checksum(line))
-        self.data[name] = began
+        self.data[name] = offset
         return self._decode(json.loads(line)["value"])
 
     def load(self, header: Mapping[str, Any]) -> None:
-        """Find the results of an earlier run, or write the header of a new store; for the errors see `open_store`."""
-        wanted = _with_checksum(json.dumps(header, sort_keys=True, ensure_ascii=False))
+        """Index the results of an earlier run, or write the header of a new store; for the errors see `open_store`."""
+        header_line = _with_checksum(json.dumps(header, sort_keys=True, ensure_ascii=False))
         with open(self._descriptor, "rb", closefd=False) as file:
             first = file.readline()
-            if not first.endswith(b"\n") and wanted.encode().startswith(first):  # none yet, or its beginning
+            if not first.endswith(b"\n") and header_line.encode().startswith(first):  # none yet, or its beginning
                 if not self._read_only:
                     os.ftruncate(self._descriptor, 0)
-                    self._append(wanted)
+                    self._append(header_line)
                 return
             _check_header(first, header, path=self.path)
             self._end = len(first)
@@ -128,7 +127,7 @@ def open_store(
     `encode` and `decode` bring a result into JSON and back. `settings` are all that the results depend on besides the
     items' keys (options, seed, digests of inputs), as plain data; a store of other settings, or one in use, is a
     `UsageError`, another file or a damaged line in its middle a `BadDataError`. JSON keeps floats exactly; tuples come
-    back as lists. A store that is read only is left as it is: it may be another's, or on a disk that takes nothing.
+    back as lists. A `read_only` store is not changed: it may be another user's, or on a read-only disk.
     """
     access = os.O_RDONLY if read_only else os.O_RDWR | os.O_CREAT | os.O_APPEND
     try:
@@ -149,13 +148,13 @@ def open_store(
 
 
 def store_path(output: Path) -> Path:
-    """Where the results of a batch are kept until its output is written."""
+    """Path of the store that keeps the results of a batch until its output is written."""
     return output.with_name(f"{output.name}.unfinished")
 
 
 @contextlib.contextmanager
 def open_store_beside(output: Path | None, kind: Any, *, settings: Mapping[str, Any]) -> Iterator[BatchStore | None]:
-    """Open the store of results of a `kind`, a record or a list of them, beside the output; None without an output."""
+    """Open the store beside the output of results of a `kind`, a record or a list of them; None without an output."""
     if output is None:
         yield None
         return
@@ -186,22 +185,22 @@ def _without_checksum(line: str) -> Any:
     return json.loads(text)
 
 
-def _check_header(first: bytes, wanted: Mapping[str, Any], *, path: Path) -> None:
+def _check_header(first: bytes, header: Mapping[str, Any], *, path: Path) -> None:
     line = first[:-1].decode("utf-8", errors="replace") if first.endswith(b"\n") else ""
     try:
-        found, _ = json.JSONDecoder().raw_decode(line)  # that of another schema may have another checksum, or none
-        schema, settings = found["schema"], dict(found["settings"])
+        stored, _ = json.JSONDecoder().raw_decode(line)  # another schema may have another checksum, or none
+        schema, settings = stored["schema"], dict(stored["settings"])
     except (ValueError, KeyError, TypeError, RecursionError):
         raise BadDataError("not a store of batch results", way_out="choose another name", path=str(path)) from None
-    if schema != wanted["schema"]:
+    if schema != header["schema"]:
         raise BadDataError(
-            f"is a store of schema {schema}, this program writes {wanted['schema']}",
+            f"is a store of schema {schema}, this program writes {header['schema']}",
             way_out="finish it with the version that began it, or choose another name",
             path=str(path),
         )
     if _with_checksum(line.rpartition(" ")[0]) != line:
         raise BadDataError("line 1 is damaged", way_out="choose another name", path=str(path))
-    new = dict(wanted["settings"])
+    new = dict(header["settings"])
     differ = sorted(name for name in settings.keys() | new.keys() if settings.get(name) != new.get(name))
     if differ:
         name = differ[0]
@@ -218,14 +217,14 @@ class LocalWorkers(Executor):
     """Local worker processes, spawned and not forked: libraries with threads do not survive a fork.
 
     A worker leaves Ctrl-C to its parent and ends when the parent does, even if that was killed. Each has a pipe of its
-    own, so that one that is killed in the middle of handing over its result holds up nobody: its item comes back with
+    own, so that one that is killed while it sends its result does not block the others: its item comes back with
     `BrokenExecutor`, and another process takes its place. `concurrent.futures` has one pipe for all and waits for ever.
     """
 
     def __init__(self, workers: int) -> None:
         self._workers = workers
         self._threads = ThreadPoolExecutor(workers)  # one for each process: it hands over items and waits for results
-        self._own = threading.local()
+        self._local = threading.local()
         self._lock = threading.Lock()
         self._running: dict[BaseProcess, Connection] = {}
         self._stopped = False
@@ -237,23 +236,23 @@ class LocalWorkers(Executor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """The future of ``fn(*args, **kwargs)`` in one of the processes."""
-        return self._threads.submit(self._ask, fn, args, kwargs)
+        return self._threads.submit(self._run_item, fn, args, kwargs)
 
-    def _ask(self, fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        """Have this thread's process run an item."""
-        if getattr(self._own, "process", None) not in self._running:
-            self._own.process = self._start()
-        process = self._own.process
-        line = self._running[process]
+    def _run_item(self, fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Run an item in this thread's process, which is started if it has none."""
+        if getattr(self._local, "process", None) not in self._running:
+            self._local.process = self._start()
+        process = self._local.process
+        pipe = self._running[process]
         try:
-            line.send((fn, args, kwargs))
-            done, value = line.recv()
+            pipe.send((fn, args, kwargs))
+            succeeded, value = pipe.recv()
         except (EOFError, OSError):
             with self._lock:
                 self._running.pop(process, None)
-            line.close()
+            pipe.close()
             raise BrokenExecutor("the item's process ended without an answer") from None
-        if not done:
+        if not succeeded:
             raise value
         return value
 
@@ -283,13 +282,13 @@ class LocalWorkers(Executor):
         """Let the processes end when their items are done."""
         self._threads.shutdown(wait=wait, cancel_futures=cancel_futures)
         if wait:
-            for process, line in self._running.items():
-                line.close()
+            for process, pipe in self._running.items():
+                pipe.close()
                 process.join()
 
 
-def _serve_items(line: Connection) -> None:
-    """Run items from a pipe until its other end is closed, or the parent ends, even if that was killed; no Ctrl-C."""
+def _serve_items(pipe: Connection) -> None:
+    """Run items from a pipe until its other end is closed or the parent ends, even if killed; Ctrl-C is ignored."""
     import multiprocessing
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -303,18 +302,18 @@ def _serve_items(line: Connection) -> None:
     threading.Thread(target=end_with_parent, daemon=True).start()
     while True:
         try:
-            fn, args, kwargs = line.recv()
+            fn, args, kwargs = pipe.recv()
             answer = True, fn(*args, **kwargs)
         except EOFError:
             return
         except Exception as error:
             answer = False, error
         try:
-            line.send(answer)
+            pipe.send(answer)
         except OSError:
             return
         except Exception as error:  # it cannot be pickled
-            line.send((False, TypeError(one_line(error))))
+            pipe.send((False, TypeError(one_line(error))))
 
 
 class InlineExecutor(Executor):
@@ -331,10 +330,9 @@ class InlineExecutor(Executor):
 
 
 def open_executor(*, workers: int = 1, cluster: str | None = None) -> AbstractContextManager[Executor]:
-    """Open the executor that ``--workers`` and ``--cluster`` ask for: over a cluster if an address is given.
+    """Open an executor over a dask cluster if its address is given, else over `workers` processes of this machine.
 
-    Else over processes of this machine, of which those that are killed are replaced; 0 or 1 `workers` run in this
-    process, with the same results.
+    Killed processes are replaced; 0 or 1 `workers` run in this process, with the same results.
     """
     if cluster:
         return cluster_executor(cluster)
@@ -355,7 +353,7 @@ def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Execu
         raise UsageError(
             "a cluster needs the package distributed; install it with pip install 'tactile-bayes[cluster]'"
         ) from None
-    for name in list(logging.root.manager.loggerDict):  # its log on stderr; outcomes repeat what matters of it
+    for name in list(logging.root.manager.loggerDict):  # silent on stderr: the outcomes hold the errors
         if name.partition(".")[0] == "distributed":
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     with contextlib.ExitStack() as stack:
@@ -368,7 +366,9 @@ def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Execu
             ) from None
         _check_workers(client, address)
         executor = stack.enter_context(client.get_executor(pure=False))
-        executor.ahead = max(16, 4 * sum(client.nthreads().values()))  # none waits, and the scheduler holds few
+        executor.ahead = max(
+            16, 4 * sum(client.nthreads().values())
+        )  # no worker waits, and the scheduler holds few items
         yield executor
 
 
@@ -395,14 +395,14 @@ def _worker_version() -> str:
 # --- Ordered, resumable work over an executor: in this process, over local processes or on a dask cluster.
 #
 # Everything that repeats (many maps, many cases, many simulated scans) goes through `run_batch`. An item must carry
-# all that its result depends on, its seed included; then, on one machine and its libraries, the results are the
-# same in whatever order and by however many processes they are made.
+# all that its result depends on, its seed included; then, on one machine and its libraries, the results do not depend
+# on the order or on the number of processes.
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
-_WINDOW = 1024  #: Items handed to the executor ahead of their results; bounds the memory that waiting items take.
-_LISTED = 3  #: Items named in a line on a fault they share.
+_WINDOW = 1024  #: Most items submitted ahead of their results; bounds the memory of waiting items.
+_LISTED = 3  #: Most items named in the line of an error they share.
 
 
 DIED_TWICE = (
@@ -421,15 +421,15 @@ class Outcome(Record, Generic[Result]):
 
     @property
     def ok(self) -> bool:
-        """Whether there is a result."""
+        """True if there is a result."""
         return not self.error
 
 
 class BatchInterrupted(KeyboardInterrupt):
-    """Ctrl-C during a batch, with the outcomes that were finished.
+    """Ctrl-C during a batch, with the finished outcomes.
 
-    `store` is where the results are kept for the next run, `before` counts items done by earlier batches of the same
-    run.
+    `store` is the path that keeps the results for the next run, `before` the number of items done by earlier batches
+    of the same run.
     """
 
     def __init__(self, outcomes: Sequence[Outcome[Any]], *, total: int, store: Path | None, before: int = 0) -> None:
@@ -439,11 +439,11 @@ class BatchInterrupted(KeyboardInterrupt):
 
 
 def fault_lines(outcomes: Iterable[Outcome[Any]]) -> list[str]:
-    """One line per distinct error, with the names of its items; many items are counted instead."""
+    """One line per distinct error, with the names of its first items and the number of the others."""
     names: dict[str, list[str]] = {}
-    for one in outcomes:
-        if not one.ok:
-            names.setdefault(one.error, []).append(one.key)
+    for outcome in outcomes:
+        if not outcome.ok:
+            names.setdefault(outcome.error, []).append(outcome.key)
     more = {error: f" and {len(keys) - _LISTED} more" if len(keys) > _LISTED else "" for error, keys in names.items()}
     return [f"{', '.join(keys[:_LISTED])}{more[error]}: {error}" for error, keys in names.items()]
 
@@ -459,12 +459,12 @@ def run_batch(
 ) -> list[Outcome[Result]]:
     """Apply `function` to every item and return the outcomes in the order of the items.
 
-    An item that raises is reported by its key and one line, and the others go on, also where a worker process was
-    killed: the items it may have held are run again, and one whose process ends twice is at fault. Ctrl-C, or any fault
-    of the store, cancels what has not begun, keeps what is finished and goes on up.
+    An item that raises is reported by its key and one line, and the others go on. Where a worker process was killed,
+    the items it may have held are run again; one whose process ends twice has failed. Ctrl-C, or any fault of the
+    store, cancels the items that have not begun, keeps the finished results and is raised again.
 
     The function must be importable by name in another process, an item picklable, with the seed it needs and a unique
-    key. Without an executor the items are run here, one by one. Items that the store already has are not run again;
+    key. Without an executor the items are run here, one by one. Items whose results are in the store are not run again;
     failed ones are. `progress` is called with (done, total) once at the start and after each item.
     """
     work: dict[str, Item] = {}
@@ -472,8 +472,8 @@ def run_batch(
         if (name := key(item)) in work:
             raise BadDataError(f"two items of the batch are called {name!r}", way_out="give each its own name")
         work[name] = item
-    kept = {} if store is None else store
-    outcomes: dict[str, Outcome[Result]] = {name: Outcome(name, value=kept[name]) for name in work if name in kept}
+    stored = {} if store is None else store
+    outcomes: dict[str, Outcome[Result]] = {name: Outcome(name, value=stored[name]) for name in work if name in stored}
 
     def keep(outcome: Outcome[Result]) -> None:
         if store is not None and outcome.ok:  # as a resumed batch reads it: fresh and resumed results are equal
@@ -505,8 +505,8 @@ def _run(
 ) -> None:
     """Run all items: submit a few ahead of their results, and keep each outcome as it arrives.
 
-    An item whose worker process was lost is run again at the end, alone: if its process ends again, it is at fault. On
-    the way out of an interruption or a fault what is finished is kept, and nobody waits for running items.
+    An item whose worker process was lost is run again at the end, alone: if its process ends again, it has failed. At
+    an interruption or a fault the finished results are kept, and running items are not waited for.
     """
     workers = executor if isinstance(executor, LocalWorkers) else None
     ahead: int = getattr(executor, "ahead", _WINDOW)
@@ -538,11 +538,11 @@ def _run(
                 continue
             outcome = _outcome_of(name, future)
             keep(outcome)
-            if outcome.error == CLUSTER_LOST:  # nobody would answer: keep what has come, hand out nothing more
-                for other, (name, _) in waiting.items():
-                    came = other.done()
-                    other.cancel()
-                    keep(_outcome_of(name, other) if came else Outcome(name, error=CLUSTER_LOST))
+            if outcome.error == CLUSTER_LOST:  # no more answers come: keep the results so far, submit nothing
+                for pending, (name, _) in waiting.items():
+                    answered = pending.done()
+                    pending.cancel()
+                    keep(_outcome_of(name, pending) if answered else Outcome(name, error=CLUSTER_LOST))
                 for name, _ in rest:
                     keep(Outcome(name, error=CLUSTER_LOST))
                 return
@@ -558,7 +558,7 @@ def _run(
 
 
 def _attempt(function: Callable[[Item], Result], name: str, item: Item) -> Outcome[Result]:
-    """Run one item; its error is text, which every executor can send back."""
+    """Run one item; an error becomes text, which every executor can send back."""
     try:
         return Outcome(name, function(item))
     except Exception as error:
@@ -566,7 +566,7 @@ def _attempt(function: Callable[[Item], Result], name: str, item: Item) -> Outco
 
 
 def _outcome_of(name: str, future: Future[Outcome[Result]]) -> Outcome[Result]:
-    """Read the outcome of a finished future; a lost worker or a result that cannot be sent is the item's error."""
+    """The outcome of a finished future; a lost worker or a result that cannot be sent is the item's error."""
     try:
         return future.result()
     except CancelledError:

@@ -16,7 +16,7 @@ from tactile_bayes import __version__
 from tactile_bayes.errors import EXIT_FAULT, EXIT_INTERRUPTED, EXIT_READER_GONE, EXIT_USAGE, TactileBayesError
 from tactile_bayes.shell import ReaderGoneError, interrupt_on_signals, protect_streams, release_streams
 
-_HYPHEN = "\ue000"  # Stands for one while lines are broken: "--array-calibration" is a word to copy.
+_HYPHEN = "\ue000"  # Replaces a hyphen while lines are wrapped: "--array-calibration" is a word to copy.
 
 
 class UnbrokenHelp(click.HelpFormatter):
@@ -29,10 +29,11 @@ class UnbrokenHelp(click.HelpFormatter):
         super().write_text(_unbroken(text))
 
     def write_dl(self, rows: Iterable[tuple[str, str]], col_max: int = 30, col_spacing: int = 2) -> None:
-        super().write_dl([(_unbroken(word), _unbroken(told)) for word, told in rows], col_max, col_spacing)
+        super().write_dl([(_unbroken(term), _unbroken(text)) for term, text in rows], col_max, col_spacing)
 
 
 def _unbroken(text: str) -> str:
+    """The text with `_HYPHEN` for the hyphens of words and options."""
     return re.sub(r"(?<=[\w-])-(?=\w)|(?<!\S)-(?=[\w-])", _HYPHEN, text)
 
 
@@ -76,11 +77,11 @@ GROUPS: dict[str, dict[str, tuple[str, str]]] = {
         "tradeoff": ("laboratory.tradeoff_command", "Measure what more accuracy costs, here and now."),
     },
 }
-COMMANDS = {name: found for group in GROUPS.values() for name, found in group.items()}
+COMMANDS = {name: entry for group in GROUPS.values() for name, entry in group.items()}
 
 
 class LazyGroup(click.Group):
-    """A group that lists its commands from a table and imports one when it is asked for."""
+    """A group that lists its commands from a table and imports one when it is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         del ctx
@@ -124,34 +125,34 @@ def cli() -> None:
 
 
 COLLECT_AFTER = 100_000
-"""New objects before Python looks for cycles. With its own 700 it looks 65 times while a command loads, for nothing."""
+"""New objects between two searches for cycles. With Python's own 700 a command's start has 65, which free nothing."""
 
 
 def main() -> None:
     """Run the program; every known error becomes one line on stderr and its documented exit code."""
     gc.set_threshold(COLLECT_AFTER)
-    atexit.register(gc.freeze)  # what is left goes with the process: nothing is gained by looking through it
+    atexit.register(gc.freeze)  # the process ends: a last search for cycles gains nothing
     # The matrices here are small: more threads cost CPU and gain nothing, and workers would fight over the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     protect_streams()
     try:
         with interrupt_on_signals():
             status = _run()
-    except KeyboardInterrupt:  # once more, while the first was answered
+    except KeyboardInterrupt:  # a second one, while the first was handled
         status = EXIT_INTERRUPTED
     release_streams()
     sys.exit(status)
 
 
 def _run() -> int:
-    """Run the command that the words name; return its exit code."""
+    """Run the command of the command line; return its exit code."""
     try:
         status = cli.main(prog_name="tactile-bayes", standalone_mode=False)
         if sys.stdout is not None:
             sys.stdout.flush()
     except click.Abort as error:
-        told = str(error.__cause__ or "")  # a batch says how far it came
-        click.echo(f"interrupted: {told}" if told else "interrupted", err=True)
+        progress = str(error.__cause__ or "")  # of a batch: how many items are done
+        click.echo(f"interrupted: {progress}" if progress else "interrupted", err=True)
         return EXIT_INTERRUPTED
     except click.ClickException as error:
         _print_error(error)
@@ -178,7 +179,7 @@ _CLICK_WORDS = {
 
 
 def _print_error(error: click.ClickException) -> None:
-    """Print an error of the words on the command line, in one line as all others; without any words, the help."""
+    """Print an error of click's in one line, as all others; the help where no command or argument was given."""
     context = error.ctx if isinstance(error, click.UsageError) else None
     if type(error).__name__ == "NoArgsIsHelpError":  # of click 8.2 and later
         error.show()
@@ -191,7 +192,7 @@ def _print_error(error: click.ClickException) -> None:
 
 
 def _folder_gone() -> bool:
-    """Whether the folder that the program was started in was removed since."""
+    """True if the current folder was removed since the program started."""
     try:
         os.getcwd()  # noqa: PTH109 (no pathlib is loaded here)
     except FileNotFoundError:

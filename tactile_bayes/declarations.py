@@ -1,6 +1,6 @@
-"""Records: what a file, an option or a result holds is declared once; reader, writer and schema come from that.
+"""Records: the fields of a file, an option or a result are declared once; reader, writer and schema follow from that.
 
-A declaration gives a field its type, range and meaning::
+A declaration gives a field its type, range and meaning; a `kind` below is such a type with its rules::
 
     class Head(Record):
         "Grid and curvature of a scan head's taxels."
@@ -8,9 +8,9 @@ A declaration gives a field its type, range and meaning::
         rows: Annotated[int, Meta(ge=1)]  #: Taxels across the head.
         radius_mm: Annotated[float, Meta(gt=0)] | None = None  #: Of the arc across the head.
 
-Schemas take the meaning from there. That of an option, which a command's help has, is a text among its rules:
-``every: Annotated[int, Meta(ge=1), "Use one frame of every N."] = 1``; `described` says that of a kind of value.
-`from_plain` makes one of what JSON or TOML held, `to_plain` the reverse; docs/record_schema.py makes the schemas in
+Schemas take the meaning from there. The meaning of an option, printed in a command's help, is a text among its rules:
+``every: Annotated[int, Meta(ge=1), "Use one frame of every N."] = 1``; `described` gives a kind its meaning.
+`from_plain` makes a record of JSON or TOML data, `to_plain` the reverse; docs/record_schema.py makes the schemas in
 data_schema/. Files go through `files.documents.read_record`, which first refuses doubled keys, huge numbers and depth.
 Arrays are nested lists in files; `geometry.Vector` and `geometry.Matrix` declare them. A range belongs to its own
 member of a union: ``Annotated[int, Meta(ge=1)] | None``. A key that a file may lack is `UNSET`, with `UnsetType` in its
@@ -40,7 +40,7 @@ from tactile_bayes.errors import BadDataError, UsageError, number_words, suggest
 
 T = TypeVar("T")
 EXACT: Final = 17  #: Significant digits that give a float back as it was.
-MOST_SHOWN: Final = 100  #: Characters of a value that a record's repr shows; of a longer one it shows what it is.
+MOST_SHOWN: Final = 100  #: A record's repr shows values of up to so many characters, and the type of longer ones.
 
 if TYPE_CHECKING:  # to a type checker each record is frozen, as the class below makes them
 
@@ -72,14 +72,14 @@ class Record(_Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def described(meaning: str, **rules: Any) -> Meta:
-    """What a field means, with its range and more."""
+    """`Meta` with a meaning, a range and other rules."""
     return Meta(description=meaning, **rules)
 
 
 class Options(Record):
     """Options of a command or function: a value that its declaration does not allow is a `UsageError`, also in Python.
 
-    What the command line needs besides stands in a field's ``extra``, see `commands.options.record_options`.
+    A field's ``extra`` holds what only the command line needs, see `commands.options.record_options`.
     """
 
     def __post_init__(self) -> None:
@@ -91,51 +91,51 @@ class Options(Record):
 
 
 def field_types(record: Any) -> Mapping[str, Any]:
-    """What is declared for each field of a record."""
-    return {part.name: part.type for part in _fields(record)}
+    """Declared types of a record's fields, by name."""
+    return {info.name: info.type for info in _fields(record)}
 
 
 @cache
 def _fields(record: Any) -> tuple[msgspec.structs.FieldInfo, ...]:
-    """Fields of a record; Python evaluates their declarations anew whenever it is asked."""
+    """Fields of a record, cached: Python evaluates the declarations anew at each call."""
     return msgspec.structs.fields(record)
 
 
 def default_of(record: Any, name: str) -> Any:
     """The default of a field; None where it has none."""
-    part = next(one for one in _fields(record) if one.name == name)
-    return None if part.default is msgspec.NODEFAULT else part.default
+    default = next(info.default for info in _fields(record) if info.name == name)
+    return None if default is msgspec.NODEFAULT else default
 
 
 def value_type(kind: Any) -> Any:
-    """What a value is that somebody gives: the declaration without None, range and meaning."""
+    """The bare type of a kind: without None, range and meaning."""
     members = [one for one in _members(kind) if one is not type(None)]
     return _bare(members[0] if len(members) == 1 else kind)
 
 
 def range_of(kind: Any) -> tuple[Any, Any, tuple[str, ...]]:
-    """Least and largest value, None for no end, and which of the ends ("min", "max") are left out."""
+    """Least and largest value, None for no end, and the open ends, of "min" and "max"."""
     rules = _rules(next(one for one in _members(kind) if one is not type(None)))
     ends = tuple(end for end, rule in (("min", "gt"), ("max", "lt")) if rule in rules)
     return rules.get("gt", rules.get("ge")), rules.get("lt", rules.get("le")), ends
 
 
 def meaning_of(kind: Any) -> str:
-    """What a declaration says that it means, in a text or by `described`."""
+    """Meaning of a kind: a text among its rules, or that of `described`."""
     texts = [one for one in getattr(kind, "__metadata__", ()) if isinstance(one, str)]
     return texts[0] if texts else str(_rules(kind).get("description", ""))
 
 
 def extra_of(kind: Any) -> Mapping[str, Any]:
-    """What a declaration says besides, in ``Meta(extra=...)``."""
-    found: Mapping[str, Any] = _rules(kind).get("extra", {})
-    return found
+    """The dictionary of a kind's ``Meta(extra=...)``; empty without one."""
+    extra: Mapping[str, Any] = _rules(kind).get("extra", {})
+    return extra
 
 
 def subrecord(record: Any, names: Sequence[str], meaning: str) -> Any:
-    """A record of some fields of another, with this docstring: of a file that holds no others."""
-    fields = [(part.name, part.type, part.default) for part in _fields(record) if part.name in names]
-    fields.sort(key=lambda one: names.index(one[0]))
+    """A record of some fields of another, for a file that holds only these; `meaning` is its docstring."""
+    fields = [(info.name, info.type, info.default) for info in _fields(record) if info.name in names]
+    fields.sort(key=lambda field: names.index(field[0]))
     name = f"{record.__name__}Part"
     return msgspec.defstruct(name, fields, bases=(Record,), namespace={"__doc__": meaning}, frozen=True, kw_only=True)
 
@@ -153,7 +153,7 @@ def names_of(kind: Any) -> tuple[str, ...]:
 
 
 def as_dict(record: Any) -> dict[str, Any]:
-    """A record's values by name, those of records and data classes in it too; for what JSON holds see `to_plain`."""
+    """A record's values by name, nested records and data classes as dictionaries too; for JSON see `to_plain`."""
     return {name: _map_values(getattr(record, name), _value_as_dict) for name in names_of(record)}
 
 
@@ -161,19 +161,19 @@ def _value_as_dict(value: Any) -> Any:
     return as_dict(value) if isinstance(value, msgspec.Struct) or dataclasses.is_dataclass(value) else value
 
 
-def _map_values(value: Any, changed: Callable[[Any], Any], *, lists: bool = False) -> Any:
-    """A value, or each in dictionaries, lists and tuples, `changed`; with `lists` tuples become lists."""
+def _map_values(value: Any, function: Callable[[Any], Any], *, lists: bool = False) -> Any:
+    """Apply `function` to each value in nested dictionaries, lists and tuples; with `lists` tuples become lists."""
     if isinstance(value, dict):
-        return {key: _map_values(one, changed, lists=lists) for key, one in value.items()}
+        return {key: _map_values(one, function, lists=lists) for key, one in value.items()}
     if type(value) in (list, tuple):
-        return (list if lists else type(value))(_map_values(one, changed, lists=lists) for one in value)
-    return changed(value)
+        return (list if lists else type(value))(_map_values(one, function, lists=lists) for one in value)
+    return function(value)
 
 
 def from_plain(kind: type[T], document: object, *, where: str = "") -> T:
     """A record of plain data: dictionaries, lists, texts and numbers.
 
-    A `BadDataError` names the field at fault, `where` it stands in the file, its value, and what it may be.
+    A `BadDataError` names the field at fault by its path below `where`, its value, and the values that are allowed.
     """
     try:
         return _converted(kind, document)
@@ -194,7 +194,7 @@ def _whole(value: object) -> object:
 
 
 def check_record(record: Record, where: str = "") -> None:
-    """Hold a record that was made in Python against its declaration; for the errors see `from_plain`."""
+    """Check a record that was made in Python against its declaration; for the errors see `from_plain`."""
     from_plain(type(record), to_plain(record, digits=17), where=where)
 
 
@@ -211,8 +211,8 @@ def rounded(value: T, digits: int = 9, *, lists: bool = False) -> T:
             return type(one)(**{name: rounded(getattr(one, name), digits) for name in one.__struct_fields__})
         return float(f"{one:.{digits}g}") if isinstance(one, float) else one
 
-    found: T = _map_values(value, short, lists=lists)
-    return found
+    result: T = _map_values(value, short, lists=lists)
+    return result
 
 
 def schema_name(kind: Any) -> str | None:
@@ -222,7 +222,7 @@ def schema_name(kind: Any) -> str | None:
 
 
 def _value_repr(value: Any) -> str:
-    """A value's repr; for arrays and long values their kind with shape or length: no draws are printed."""
+    """A value's repr; for arrays and long values the type with shape or length: no draws are printed."""
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return repr(value) if value.shape == () else f"<array {'x'.join(map(str, value.shape))}>"
     text, kind = repr(value), type(value).__qualname__
@@ -232,7 +232,7 @@ def _value_repr(value: Any) -> str:
 
 
 def _decode_value(kind: Any, value: object) -> object:
-    """A path of a text, or an array of nested lists of numbers, for a field that is declared as one."""
+    """Decode a text to a path, or nested lists of numbers to an array, for a field declared as one."""
     if kind is Path:
         if value and isinstance(value, str | Path):
             return Path(value)
@@ -265,32 +265,30 @@ def _encode_array(value: object) -> object:
 
 
 def _fault(kind: Any, value: Any, where: str) -> BadDataError:
-    """What is wrong with a value that is none of its kind, in words: the innermost part at fault."""
+    """The error of a value that does not fit its kind; it names the innermost part at fault."""
     record = _record_for(kind, value)
-    if record is not None and isinstance(value, dict):
-        found = _key_at_fault(record, value, where)
-        if found:
-            return found
-    for part, of_part, one in _parts_of(kind if record is None else record, value, where):
-        if _refusal(of_part, one) is not None:
-            return _fault(of_part, one, part)
-    why = _refusal(kind, value)
+    if record is not None and isinstance(value, dict) and (fault := _key_fault(record, value, where)):
+        return fault
+    for part_path, part_kind, part in _parts_of(kind if record is None else record, value, where):
+        if _refusal(part_kind, part) is not None:
+            return _fault(part_kind, part, part_path)
+    refusal = _refusal(kind, value)
     name = where or "the document"
-    if isinstance(why, BadDataError):  # of a record's own rules, or of an array
-        what = _rule_text(where, why.what, record) if why.what else f"{name} is {short_repr(value)}"
-        return BadDataError(what, way_out=why.way_out)
+    if isinstance(refusal, BadDataError):  # of a record's own rules, or of an array
+        what = _rule_text(where, refusal.what, record) if refusal.what else f"{name} is {short_repr(value)}"
+        return BadDataError(what, way_out=refusal.way_out)
     return BadDataError(f"{name} is {short_repr(value)}", way_out=_way_out(kind, value))
 
 
 def _rule_text(where: str, what: str, record: Any) -> str:
-    """What a rule of a record or an array's form is broken by, with its place."""
+    """The fault by a record's own rule, or by an array's form, with its path in the file."""
     if not where or record is None:
         return f"{where} {what}".strip()
     return f"{where}.{what}" if what.split(" ")[0] in record.__struct_fields__ else f"{where}: {what}"
 
 
 def _refusal(kind: Any, value: Any, *, exact: bool = False) -> Exception | None:
-    """Why a value is none of its kind, or with `exact` would have to be made one, as 3.0 a whole number; else None."""
+    """The error that a kind raises on a value, or None; with `exact` 3.0 is no whole number."""
     try:
         msgspec.convert(value, kind, dec_hook=_decode_value) if exact else _converted(kind, value)
     except msgspec.ValidationError as error:
@@ -304,30 +302,30 @@ def _finite(value: Any) -> bool:
     return not isinstance(value, float) or math.isfinite(value)
 
 
-def _key_at_fault(record: Any, value: Mapping[str, Any], where: str) -> BadDataError | None:
-    """The first key that a table may not have, or has not."""
+def _key_fault(record: Any, value: Mapping[str, Any], where: str) -> BadDataError | None:
+    """The error of the first key that is unknown or missing; None without any."""
     config = record.__struct_config__
-    fields = {part.encode_name: part for part in _fields(record)}
+    fields = {info.encode_name: info for info in _fields(record)}
     known = [*([config.tag_field] if config.tag_field else []), *fields]
     for key in value if config.forbid_unknown_fields else ():
         if key not in known:
-            return BadDataError(f"{_joined(where, _shown_key(key))} is not known", way_out=suggestion(str(key), known))
-    missing = [name for name, part in fields.items() if part.required and name not in value]
+            return BadDataError(f"{_joined(where, _key_repr(key))} is not known", way_out=suggestion(str(key), known))
+    missing = [name for name, info in fields.items() if info.required and name not in value]
     return BadDataError(f"{where or 'the document'} has no {missing[0]}", way_out="add it") if missing else None
 
 
 def _parts_of(kind: Any, value: Any, where: str) -> Iterator[tuple[str, Any, Any]]:
-    """Parts of a value with the place, the kind that is declared for it, and the part."""
+    """Path, declared kind and value of each part of a value."""
     if isinstance(value, dict):
         if _is_record(kind):
-            fields = {part.encode_name: part.type for part in _fields(kind)}
+            fields = {info.encode_name: info.type for info in _fields(kind)}
             yield from ((_joined(where, key), fields[key], one) for key, one in value.items() if key in fields)
             return
-        for of_key, of_value in (
+        for key_kind, value_kind in (
             get_args(one) for one in map(_bare, _members(kind)) if get_origin(one) in (dict, Mapping)
         ):
-            yield from ((_joined(where, f"key {short_repr(key)}"), of_key, key) for key in value)
-            yield from ((_joined(where, _shown_key(key)), of_value, one) for key, one in value.items())
+            yield from ((_joined(where, f"key {short_repr(key)}"), key_kind, key) for key in value)
+            yield from ((_joined(where, _key_repr(key)), value_kind, one) for key, one in value.items())
     if isinstance(value, list | tuple):
         for one in map(_bare, _members(kind)):
             args = get_args(one)
@@ -337,11 +335,12 @@ def _parts_of(kind: Any, value: Any, where: str) -> Iterator[tuple[str, Any, Any
                 args = args[:1] * len(value)
             elif get_origin(one) is not tuple:
                 continue
-            yield from ((f"{where}[{i}]", of, part) for i, (of, part) in enumerate(zip(args, value, strict=False)))
+            pairs = zip(args, value, strict=False)
+            yield from ((f"{where}[{i}]", part_kind, part) for i, (part_kind, part) in enumerate(pairs))
 
 
 def _record_for(kind: Any, value: Any) -> Any:
-    """The record that a table is meant to be: of several forms the one that it names."""
+    """The record type for a value: the only one of a kind, or the form that the value's tag names; else None."""
     records = [one for one in map(_bare, _members(kind)) if _is_record(one)]
     if len(records) == 1:
         return records[0]
@@ -353,7 +352,7 @@ def _record_for(kind: Any, value: Any) -> Any:
 
 
 def _members(kind: Any) -> tuple[Any, ...]:
-    """Kinds of a union, each with its ranges; a single kind alone."""
+    """Members of a union, each with its rules; a kind that is no union alone."""
     bare = _bare(kind)
     return get_args(bare) if get_origin(bare) in (typing.Union, types.UnionType) else (kind,)
 
@@ -371,7 +370,7 @@ def _is_array(kind: Any) -> bool:
 
 
 def _way_out(kind: Any, value: Any) -> str:
-    """What can be given in place of a value, such as "give a number above 0"."""
+    """The advice on a refused value, such as "give a number above 0"."""
     members = [one for one in _members(kind) if one not in (type(None), UnsetType)]
     forms = [one for one in map(_bare, members) if _is_record(one)]
     if len(forms) > 1 and isinstance(value, dict):  # no form of that name
@@ -395,7 +394,7 @@ _KINDS: Final[Mapping[Any, str]] = {
 
 
 def _kind_words(kind: Any) -> str:
-    """A single kind with its range."""
+    """A single kind with its range, in words."""
     bare, rules = _bare(kind), _rules(kind)
     origin, args = get_origin(bare) or bare, get_args(bare)
     if origin is Literal:
@@ -408,13 +407,13 @@ def _kind_words(kind: Any) -> str:
         return f"a list of {len(args)}"
     if origin in (list, tuple):
         least, most = rules.get("min_length"), rules.get("max_length")
-        told = "" if least is None else f" of {least} or more" if most is None else f" of {least} to {most}"
-        return f"a list{told or ('' if most is None else f' of at most {most}')}"
+        length = "" if least is None else f" of {least} or more" if most is None else f" of {least} to {most}"
+        return f"a list{length or ('' if most is None else f' of at most {most}')}"
     return "a table of keys" if _is_record(bare) else _KINDS.get(origin, "a list of numbers")
 
 
 def _text_words(rules: Mapping[str, Any]) -> str:
-    """A text's rule: its own words (``extra={"words": ...}``) or its meaning, for a pattern is nothing for people."""
+    """A text's rule: its own words (``extra={"words": ...}``), its meaning in place of a pattern, or its length."""
     if "words" in rules.get("extra", {}):
         return str(rules["extra"]["words"])
     if "pattern" in rules and "description" in rules:
@@ -429,23 +428,23 @@ _RULES: Final = ("gt", "ge", "lt", "le", "min_length", "max_length", "pattern", 
 
 
 def _rules(kind: Any) -> dict[str, Any]:
-    """All that is declared about a kind; the last word stands."""
-    found: dict[str, Any] = {}
+    """Rules of a kind by name; of several `Meta` the later ones stand."""
+    rules: dict[str, Any] = {}
     for meta in getattr(kind, "__metadata__", ()):
-        found |= {name: getattr(meta, name) for name in _RULES if getattr(meta, name, None) is not None}
-    return found
+        rules |= {name: getattr(meta, name) for name in _RULES if getattr(meta, name, None) is not None}
+    return rules
 
 
 def _joined(where: str, key: object) -> str:
     return f"{where}.{key}" if where else str(key)
 
 
-def _shown_key(key: object) -> str:
+def _key_repr(key: object) -> str:
     text = str(key)
     return text if text.isidentifier() and len(text) <= 60 else short_repr(key)
 
 
 def short_repr(value: object) -> str:
-    """A value as an error shows it, in up to 60 characters."""
+    """A value's repr for an error, in up to 60 characters."""
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -27,7 +27,7 @@ EXIT_READER_GONE = 141
 
 
 BY_OPTIONS: ContextVar[bool] = ContextVar("by_options", default=False)
-"""Whether the command line called: its errors name options, those of Python's functions their keywords."""
+"""True while the command line runs: its errors name options, those of Python's functions their keywords."""
 
 
 class TactileBayesError(Exception):
@@ -37,7 +37,7 @@ class TactileBayesError(Exception):
 
 
 class UsageError(TactileBayesError):
-    """The options contradict each other or the state of the disk: the output exists, or cannot be written."""
+    """Options contradict each other or the state of the disk: the output exists, or cannot be written."""
 
     exit_code = EXIT_USAGE
 
@@ -63,14 +63,16 @@ def check_number(
     whole: bool = False,
     open_ends: bool = False,
 ) -> None:
-    """Refuse what is no finite number, or outside a range (`open_ends`: or at its ends), and say what can be given."""
+    """Refuse a value that is no finite number in the range, or with `open_ends` at its ends, and name the range."""
     if isinstance(value, numbers.Integral if whole else numbers.Real) and not isinstance(value, bool):
         number = float(value)
         inside = (least is None or number >= least) and (most is None or number <= most)
         if inside and not (open_ends and number in (least, most)) and math.isfinite(number):
             return
-    shown = f"{value:g}" if isinstance(value, float) else _shortened(repr(value))
-    raise UsageError(f"{name} is {shown}; give {number_words(least, most, _ENDS if open_ends else (), whole=whole)}")
+    value_text = f"{value:g}" if isinstance(value, float) else _shortened(repr(value))
+    raise UsageError(
+        f"{name} is {value_text}; give {number_words(least, most, _ENDS if open_ends else (), whole=whole)}"
+    )
 
 
 _ENDS = ("min", "max")
@@ -79,22 +81,22 @@ _ENDS = ("min", "max")
 def number_words(least: float | None, most: float | None, open_ends: Collection[str], *, whole: bool = False) -> str:
     """The numbers that can be given, in words: ``a number above 0 and below 1``; `open_ends` are of "min" and "max"."""
     above, below = (end in open_ends for end in _ENDS)
-    told = "" if least is None else f" above {least:g}" if above else f" from {least:g}"
+    words = "" if least is None else f" above {least:g}" if above else f" from {least:g}"
     if most is not None:
         joint = "" if least is None else " and" if above else " to"
-        told += f"{joint} below {most:g}" if below else f"{' to' if told and not above else ' up to'} {most:g}"
-    elif told and not above:
-        told += " on"
-    return f"a {'whole ' if whole else ''}number{told}"
+        words += f"{joint} below {most:g}" if below else f"{' to' if words and not above else ' up to'} {most:g}"
+    elif words and not above:
+        words += " on"
+    return f"a {'whole ' if whole else ''}number{words}"
 
 
 def suggestion(name: str, known: Collection[str]) -> str:
-    """The way out for a name that is not known: that of another unit, the one that was probably meant, or all."""
+    """The way out for an unknown name: the same quantity in a known unit, the nearest known name, or all of them."""
     lower = {one.lower(): one for one in known}
     stem = _without_unit(name)
-    alike = [one for one in known if _without_unit(one) == stem]
-    if stem != name and alike and name.lower() not in lower:
-        return f"give {alike[0]}, in the unit it names"
+    in_other_units = [one for one in known if _without_unit(one) == stem]
+    if stem != name and in_other_units and name.lower() not in lower:
+        return f"give {in_other_units[0]}, in the unit it names"
     near = difflib.get_close_matches(name.lower(), lower, n=1)
     return f"did you mean {lower[near[0]]}?" if near else f"known are {', '.join(known)}"
 
@@ -103,12 +105,12 @@ _UNITS = {"mm", "cm", "m", "um", "in", "kpa", "pa", "mpa", "psi", "s", "ms", "us
 
 
 def _without_unit(name: str) -> str:
-    """``x_cm`` and ``x_mm`` are one quantity."""
+    """The quantity of a name: ``x`` for ``x_cm`` and ``x_mm``."""
     stem, _, unit = name.rpartition("_")
     return stem if stem and unit.lower() in _UNITS else name
 
 
-_MOST_SHOWN = 1000  # characters of what a file holds that an error repeats
+_MOST_SHOWN = 1000  # characters of a file's content that an error repeats
 
 
 def _shortened(text: str) -> str:
@@ -118,9 +120,9 @@ def _shortened(text: str) -> str:
 
 
 class BadDataError(TactileBayesError, ValueError):
-    """A file, array or table has invalid content: `what` is wrong, with the value, and the `way_out`.
+    """A file, array or table has invalid content: `what` names the fault and the value, `way_out` the remedy.
 
-    `path` is the file at fault. Code that holds only arrays leaves it out; the reader fills it in.
+    `path` is the file at fault. Code that holds only arrays leaves it out; the reader fills it in (`in_file`).
     """
 
     exit_code = EXIT_BAD_DATA
@@ -160,8 +162,8 @@ class DeviceError(TactileBayesError):
 class NotConvergedError(TactileBayesError):
     """A sampler or solver stopped before its own criteria were met.
 
-    The message says what was not reached and how much longer to run; `diagnostics` are the figures at that time, and
-    `advice` is the remedy where running longer is none.
+    The message names the criterion and how much longer to run; `diagnostics` are the figures at that time, and `advice`
+    is the remedy where a longer run would not help.
     """
 
     exit_code = EXIT_NOT_CONVERGED
@@ -173,16 +175,16 @@ class NotConvergedError(TactileBayesError):
 
 
 def one_line(error: BaseException) -> str:
-    """An error in one line; the class is named where it is none of this program's."""
+    """An error in one line, with its class unless it is one of this program's."""
     text = " ".join(str(error).split())
     if isinstance(error, TactileBayesError) and text:
         return text
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
-# --- Reasons for giving no number: a sentence, a code for programs, and what would help.
+# --- Reasons for giving no number: a sentence, a code for programs, and the remedy.
 
-CANNOT_SHOW = "cannot_show"  #: Code of data that cannot show whether there is a lump.
+CANNOT_SHOW = "cannot_show"  #: Code of data that cannot show a lump even where there is one.
 CODES = ("empty", "undetected", "ridge", CANNOT_SHOW, "unresolved", "window", "prior", "extrapolated", "method")
 NO_LUMP = ("empty", "undetected", "ridge")
 """Codes of maps that show no lump where one would show; the others but `CANNOT_SHOW` show one without a size."""

@@ -1,4 +1,4 @@
-"""Findings: what speaks against a result, as one list that every output reads, and the verdict that it leads to."""
+"""Findings: cautions and checks on a result, as one list that every output reads, and the verdict they lead to."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ KINDS: Final[Mapping[str, Severity]] = {
     "unnamed_mass": "check",
     "own_axes": "check",
 }
-"""Severity by kind. Caution: the result may be off by more than its interval. Check: look at it first."""
+"""Severity by kind. Caution: the result may be off by more than its interval. Check: to be looked at first."""
 SEVERITIES: Final[tuple[Severity, ...]] = get_args(Severity)
 LEADS: Final[Mapping[Severity, str]] = {"caution": "CAUTION: ", "check": "To check: "}
-"""How a line with a finding begins, in every output."""
+"""First words of a finding's line, in every output."""
 
 
 class Finding(Record):
@@ -80,7 +80,7 @@ class Finding(Record):
         set_fields(self, severity=KINDS[self.kind])
 
     def labelled(self, about: str) -> Finding:
-        """The same finding, about one of several maps or visits."""
+        """The finding with the map or visit that it is about, of several."""
         return replace(self, about=f"{about}, {self.about}" if self.about else about)
 
     def sentence(self, *, paper: bool = False) -> str:
@@ -97,8 +97,7 @@ def finding(kind: str, text: str, remedy: str = "", on_paper: str = "", about: s
 
 def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Cautions before checks, otherwise in their order, each once."""
-    each = list(dict.fromkeys(findings))
-    return tuple(sorted(each, key=lambda one: one.severity != "caution"))
+    return tuple(sorted(dict.fromkeys(findings), key=lambda finding: finding.severity != "caution"))
 
 
 def verdict(findings: Iterable[Finding], *, answered: bool) -> Verdict:
@@ -109,28 +108,28 @@ def verdict(findings: Iterable[Finding], *, answered: bool) -> Verdict:
 
 
 def finding_lines(findings: Iterable[Finding], severity: Severity | None = None, *, paper: bool = False) -> list[str]:
-    """A line for each finding, cautions first; of one severity where it is given."""
-    shown = [one for one in by_severity(findings) if severity in (None, one.severity)]
-    return [f"{LEADS[one.severity]}{one.sentence(paper=paper)}." for one in shown]
+    """A line for each finding, cautions first; with `severity` those of one severity alone."""
+    chosen = [one for one in by_severity(findings) if severity in (None, one.severity)]
+    return [f"{LEADS[one.severity]}{one.sentence(paper=paper)}." for one in chosen]
 
 
 def finding_summary(findings: Iterable[Finding], severity: Severity, *, most: int) -> list[str]:
-    """The first findings of one severity in one line that counts the others; empty without any."""
+    """One line of the first findings of one severity and the number of the others; empty without any."""
     texts = [one.sentence() for one in by_severity(findings) if one.severity == severity]
     return first_texts(texts, most=most, lead=LEADS[severity])
 
 
 def first_texts(texts: Sequence[str], *, most: int, lead: str) -> list[str]:
-    """The first texts in one line after `lead`, which counts the others; empty without any."""
+    """One line of `lead`, the first texts and the number of the others; empty without any text."""
     more = f" (and {len(texts) - most} more)" if len(texts) > most else ""
     return [f"{lead}{'; '.join(texts[:most])}{more}."] if texts else []
 
 
-def findings_in(listed: object) -> tuple[Finding, ...]:
-    """Findings as files have them; anything else is a `BadDataError`."""
-    return from_plain(tuple[Finding, ...], listed, where="findings")
+def findings_in(document: object) -> tuple[Finding, ...]:
+    """Findings of a file's plain data; `BadDataError` for anything else."""
+    return from_plain(tuple[Finding, ...], document, where="findings")
 
 
 def capitalised(text: str) -> str:
-    """A text that begins a sentence."""
+    """The text with a capital letter, to begin a sentence."""
     return f"{text[0].upper()}{text[1:]}"

@@ -39,16 +39,16 @@ PRIORS: Final = BumpPrior.__struct_fields__
 
 MOST_PATIENTS: Final = 10_000  #: Of a plan.
 MOST_ITEMS: Final = 1_000_000  #: Of a batch: memory holds a name and an outcome for each.
-IN_FILE: Final = Meta(extra={"file": True})  #: Of a setting in the file of `--settings`, not on the command line.
+IN_FILE: Final = Meta(extra={"file": True})  #: Marks a setting of the file of `--settings` that is no option.
 
 
 def cli_meta(metavar: str, *, option: str = "", also: str = "", **rules: Any) -> Meta:
-    """Rules of an option whose value has a name in the help.
+    """Rules of an option with the name of its value in the help.
 
-    `option` and `also` name it on the command line, if not by its field, and a second time.
+    `option` names it on the command line, by default its field's name; `also` is a second name.
     """
-    held = {"metavar": metavar, "option": option, "also": also}
-    return Meta(extra={name: value for name, value in held.items() if value}, **rules)
+    names = {"metavar": metavar, "option": option, "also": also}
+    return Meta(extra={key: name for key, name in names.items() if name}, **rules)
 
 
 Positive = Annotated[float, Meta(gt=0)]
@@ -118,12 +118,12 @@ class FitSettings(BumpPrior, kw_only=True):
 
     @property
     def correlated(self) -> bool:
-        """Whether the model has correlated errors; least squares then only finds the place."""
+        """True if the model has correlated errors; least squares then only finds the place."""
         return self.noise == "field"
 
 
 class MapOptions(Options):
-    """How a map is built of scans."""
+    """Options of building a map from scans."""
 
     cell_mm: Annotated[float, Meta(ge=0.01, le=50), "Side of the square cells, mm."] = presets.CELL_MM
     pressure_window_kpa: Annotated[
@@ -167,11 +167,11 @@ class MapOptions(Options):
 
 
 GROWTH_SHARES: Final = (0.2,)
-"""Shares of the diameter that a growth's probability is told for; 20 % is the step of RECIST 1.1."""
+"""Growth of the diameter, as shares, whose probability is reported; 20 % is the step of RECIST 1.1."""
 
 
 class CompareOptions(Options):
-    """How visits are compared."""
+    """Options of comparing visits."""
 
     days: Annotated[
         tuple[float, ...] | None, "Time of each visit in days, the first at 0; None where it is not known."
@@ -187,12 +187,12 @@ class CompareOptions(Options):
     ] = presets.REGISTRATION_MM
 
     def check_visits(self, visits: int) -> None:
-        """Refuse days that are no times of so many visits."""
+        """Refuse days that are not one for each visit, or do not rise."""
         if self.days is None:
             return
         if len(self.days) != visits:
-            given, later = len(self.days) - 1, visits - 1
-            raise UsageError(f"times are given for {given} later visits, and there are {later}; give one for each")
+            times, later = len(self.days) - 1, visits - 1
+            raise UsageError(f"times are given for {times} later visits, and there are {later}; give one for each")
         if any(after <= before for before, after in zip(self.days, self.days[1:], strict=False)):
             listed = ", ".join(f"{day:g}" for day in self.days)
             raise UsageError(f"the visits' days are {listed}; give them in order, each later than the one before")
@@ -236,7 +236,7 @@ class PlanErrors(Options):
 
 
 class PlanOptions(Options, kw_only=True):
-    """Designs of a trial that are simulated, or what the number of patients is to reach instead of being given."""
+    """Designs of a trial to simulate, or a power or precision that sets the number of patients."""
 
     patients: Annotated[
         tuple[Annotated[int, Meta(ge=8, le=MOST_PATIENTS)], ...], "Number of patients, one mass each."
@@ -268,7 +268,7 @@ class PlanOptions(Options, kw_only=True):
 
 
 class CampaignOptions(Options, kw_only=True):
-    """How the exams of a table are mapped and matched, and what is done with them."""
+    """Options of a campaign: how the exams of a table are mapped and matched, and what is written."""
 
     excision: Annotated[Path | None, cli_meta("EX.csv"), "Sizes measured after excision: adds the trial's report."] = (
         None
@@ -334,7 +334,7 @@ Baud = Annotated[int, Meta(ge=300)]
 
 
 class RecordOptions(Options, kw_only=True):
-    """Options of one recording, as given."""
+    """Options of one recording."""
 
     output: Path
     head_url: str
@@ -437,7 +437,7 @@ class CaseOptions(Options, kw_only=True):
 
 
 class StudyOptions(CaseOptions, kw_only=True):
-    """How the forward study is run."""
+    """Options of the forward study."""
 
     model: Annotated[
         Literal["plane-strain", "solid"],
@@ -480,7 +480,7 @@ class TissueOptions(Options, kw_only=True):
 
 
 class PopulationOptions(Options, kw_only=True):
-    """How many bodies are simulated, and how their maps are made."""
+    """Number of simulated bodies and exams, and how their maps are made."""
 
     masses: Annotated[int, Meta(ge=1, le=MOST_ITEMS), "Number of bodies, one lump each."] = 400
     centred: Annotated[
@@ -498,7 +498,7 @@ class PopulationOptions(Options, kw_only=True):
 
 
 class SbcOptions(Options, kw_only=True):
-    """How simulation-based calibration is run."""
+    """Options of simulation-based calibration."""
 
     maps: Annotated[int, Meta(ge=1, le=MOST_ITEMS), "Maps to simulate."] = 200
     method: Annotated[
@@ -512,7 +512,7 @@ class SbcOptions(Options, kw_only=True):
 
 
 class LearnOptions(Options, kw_only=True):
-    """How a size calibration is learned from a table."""
+    """Options of learning a size calibration from a table."""
 
     form: Annotated[
         Literal["eq6", "eq6-residual"],

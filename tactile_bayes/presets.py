@@ -65,9 +65,7 @@ Background = Literal["fixed", "free"]
 Rotation = Literal["auto", "off", "on"]
 SceneName = Literal["auto", "none", "round", "ellipse", "rotated", "second-lump", "rib"]
 INTERVAL: Final = 0.95
-HELD_OUT_PROBABILITY: Final = (
-    0.9  #: Probability of the intervals of a size calibration that are held against bodies left out.
-)
+HELD_OUT_PROBABILITY: Final = 0.9  #: Probability of the intervals whose coverage of held-out bodies is tested.
 # Along each axis, of a map's noise field. Fewer are faster; what is finer than they resolve counts as independent.
 # A narrow bump gets more than these by itself, up to the second number.
 FIELD_COSINES: Final = 18
@@ -78,7 +76,7 @@ REGISTRATION_MM: Final = 5.0
 """SD each way of a mass's place in the patient between two visits; an assumption, see record 0115."""
 
 MATCH_MM: Final = 15.0
-"""Default distance for matching a mass by its place: half of what lies between two masses that are told apart."""
+"""Default distance for matching a mass by its place: half the distance at which two masses are told apart."""
 VIRIDIS: Final = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
 """Colours from low to high: five of viridis (van der Walt & Smith 2015), which also read in grey."""
 CORRECTIONS: Final = {
@@ -93,4 +91,4 @@ CORRECTIONS: Final = {
     "scalar-last": "the quaternions are scalar last",
     "inverse-rotation": "the quaternions are of the inverse rotation",
 }
-"""What of a scan's arrangement can be corrected at its import, and what is wrong where it has to be, in words."""
+"""Faults of a scan's arrangement, in words, by the correction at its import."""

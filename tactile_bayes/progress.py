@@ -1,11 +1,11 @@
-"""Progress of work that is counted: what is done of how much."""
+"""Progress of counted work: how many items of how many are done."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-Progress = Callable[[int, int], None]  #: Called with what is done and how much there is.
+Progress = Callable[[int, int], None]  #: Called with the number done and the total.
 
 
 def no_progress(_done: int, _total: int) -> None:
-    """Progress that nobody watches."""
+    """Report no progress."""

@@ -1,4 +1,4 @@
-"""The process and its terminal: text in lines and colours that fit it, readers that leave, Ctrl-C, progress."""
+"""The process and its terminal: lines and colours that fit it, pipes closed early, Ctrl-C, progress."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ STYLES: Final = {
         *("No common size", "largest size ", "No estimate: ", "No lump found", "No size: "),
     ),
 }
-LEAST_COLUMNS: Final = 20  #: Below it nothing is wrapped: a terminal without a size says 0.
-MOST_NAME: Final = 40  #: Columns of a row's name up to which the text beside it stays in its own column.
-COMMAND_END: Final = " \\"  #: Of a line of a command that goes on in the next one, as shells read it.
+LEAST_COLUMNS: Final = 20  #: No line is wrapped on a narrower terminal: one without a size says 0.
+MOST_NAME: Final = 40  #: The text beside a row's name is wrapped within its own column if that begins by here.
+COMMAND_END: Final = " \\"  #: Ends a line of a command that goes on in the next one, as shells read it.
 _UNIT: Final = r"(?<=\d) (?=(?:%|mm|cm2?|kPa|ms|s|Hz|deg)(?![\w-]))|(?<=\bp) (?=[<.\d])"
 """The blank before a unit, or of a p value, where no line breaks."""
-_JOINED: Final = "\x1f"  #: Stands for that blank, as it is printable in no text here.
-_WIDE: Final = "\x1e"  #: Stands behind a letter of two columns while a line is broken, and is printable in no text.
+_JOINED: Final = "\x1f"  #: Replaces that blank while a line is wrapped; no printed text holds it.
+_WIDE: Final = "\x1e"  #: Follows a letter of two columns while a line is wrapped; no printed text holds it.
 _HANGING: Final = 2  #: Columns by which the further lines of a sentence are indented.
 
 
 def text_width(text: str) -> int:
-    """Columns that a text takes: two for each wide letter (East Asian), none for what stands on another."""
+    """Columns that a text takes: two for a wide letter (East Asian), none for a combining one."""
     return sum(0 if unicodedata.combining(letter) else 1 + _is_wide(letter) for letter in text)
 
 
 def padded(text: str, columns: int) -> str:
-    """The text with blanks behind it to so many columns."""
+    """The text padded with blanks to so many columns."""
     return text + " " * (columns - text_width(text))
 
 
@@ -57,7 +57,7 @@ def _is_wide(letter: str) -> bool:
 
 
 def terminal_columns(stream: TextIO) -> int:
-    """Columns of the terminal that the stream writes to, or as COLUMNS states them; 0 where it is none."""
+    """Columns of the stream's terminal, or as COLUMNS states them; 0 where it is no terminal."""
     try:
         if not stream.isatty():
             return 0
@@ -68,18 +68,18 @@ def terminal_columns(stream: TextIO) -> int:
 
 
 def can_redraw() -> bool:
-    """Whether the view has a terminal whose lines it can draw over; what others write there is lost."""
+    """True if stderr is a terminal whose lines can be redrawn; other output there is then overwritten."""
     return sys.stderr.isatty() and os.environ.get("TERM", "dumb") not in ("dumb", "")
 
 
 def has_styles(environment: Mapping[str, str] = os.environ) -> bool:
-    """Whether terminals get bold and colours: not with NO_COLOR (no-color.org), nor on one that cannot."""
-    can = os.name == "posix" or "WT_SESSION" in environment
-    return can and not environment.get("NO_COLOR") and environment.get("TERM", "dumb") not in ("dumb", "")
+    """True if terminals get bold and colours: not with NO_COLOR (no-color.org), nor on a dumb one."""
+    capable = os.name == "posix" or "WT_SESSION" in environment
+    return capable and not environment.get("NO_COLOR") and environment.get("TERM", "dumb") not in ("dumb", "")
 
 
 def fit_terminal(text: str, *, columns: int, styles: bool) -> str:
-    """The text for a terminal of that width, in lines that break between words; JSON, read by programs, as it is."""
+    """Wrap a text between words for a terminal of that width, and style its lines; JSON is left as it is."""
     if columns < LEAST_COLUMNS or text.lstrip()[:1] in ("{", "["):
         return text
     return "\n".join(_fit_line(line, columns, styles=styles) for line in text.split("\n"))
@@ -96,15 +96,15 @@ def _fit_line(line: str, columns: int, *, styles: bool) -> str:
             replace_whitespace=False,
             expand_tabs=False,
         )
-        filled = "".join(letter + _WIDE * _is_wide(letter) for letter in line)
-        whole = wrapper.wrap(re.sub(_UNIT, _JOINED, filled))
-        line = f"{end}\n".join(whole).replace(_JOINED, " ").replace(_WIDE, "")
+        marked = "".join(letter + _WIDE * _is_wide(letter) for letter in line)
+        parts = wrapper.wrap(re.sub(_UNIT, _JOINED, marked))
+        line = f"{end}\n".join(parts).replace(_JOINED, " ").replace(_WIDE, "")
     style = next((style for style, leads in STYLES.items() if line.startswith(leads)), "") if styles else ""
     return "\n".join(f"\x1b[{style}m{part}\x1b[0m" for part in line.split("\n")) if style else line
 
 
 def _indent(line: str) -> int:
-    """Columns to the text of a row beside its name, or a little more than those before a sentence."""
+    """Columns by which a line's wrapped parts are indented: to the text beside a row's name, or a hanging indent."""
     margin = len(line) - len(line.lstrip())
     name, gap, rest = line[margin:].partition("  ")
     beside = margin + text_width(name) + len(gap) + len(rest) - len(rest.lstrip())
@@ -124,49 +124,49 @@ class ReaderGoneError(Exception):
 def printable(text: str) -> str:
     r"""The text with each control character as its escape, for example ``\x1b``; tabs and newlines stay.
 
-    What a file holds may reach a terminal only so: control characters can move its cursor, rename its window or hide
-    what was printed before.
+    Text from a file is printed only in this form: control characters can move a terminal's cursor, rename its window
+    or hide earlier output.
     """
     return _CONTROL.sub(lambda control: ascii(control[0])[1:-1], text)
 
 
 class PrintableStream:
-    """A text stream that escapes control characters and, on a terminal, fits its width; else as the one underneath.
+    """A text stream that escapes control characters and, on a terminal, wraps lines; otherwise as the one underneath.
 
-    A failed write is an error where `required` (standard output), else let go (standard error: no one could be told).
+    A failed write is an error where `required` (standard output), else ignored (standard error: nowhere to report it).
     """
 
     def __init__(self, stream: TextIO, *, required: bool) -> None:
         self._stream = stream
         self._required = required
-        self._failure: Exception | None = None  # told again at the next call: whoever printed may have let it go
+        self._failure: Exception | None = None  # raised again at the next call: the caller may have caught it
 
     @property
     def encoding(self) -> str:
-        """UTF-8 in any locale: click writes past a stream that says it is ASCII, and past what is escaped here."""
+        """UTF-8 in any locale: click would write past a stream that says it is ASCII, and so past the escapes."""
         return "utf-8"
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
-        shown = printable(text)
+        safe = printable(text)
         if columns := terminal_columns(self._stream):
-            shown = fit_terminal(shown, columns=columns, styles=has_styles())
-        self._try(self._stream.write, shown)
+            safe = fit_terminal(safe, columns=columns, styles=has_styles())
+        self._try(self._stream.write, safe)
         return len(text)
 
     def flush(self) -> None:
-        """Flush the stream underneath: `UsageError` if it cannot take it, `ReaderGoneError` if its reader has gone."""
+        """Flush the stream underneath: `UsageError` if that fails, `ReaderGoneError` if its reader has gone."""
         self._try(self._stream.flush)
 
     def _try(self, action: Callable[..., object], *arguments: object) -> None:
         try:
             action(*arguments)
         except OSError as error:
-            nowhere = os.open(os.devnull, os.O_WRONLY)  # else Python tries again at exit and prints a traceback
-            os.dup2(nowhere, self._stream.fileno())
-            os.close(nowhere)
+            null = os.open(os.devnull, os.O_WRONLY)  # else Python tries again at exit and prints a traceback
+            os.dup2(null, self._stream.fileno())
+            os.close(null)
             full = f"the standard output cannot be written ({error.strerror}); make room, or send it elsewhere"
             failure = ReaderGoneError() if error.errno == errno.EPIPE else UsageError(full)
             self._failure = failure if self._required else None
@@ -175,7 +175,7 @@ class PrintableStream:
 
 
 def protect_streams() -> None:
-    """Make the standard streams of this process printable, in any locale; where one is closed, nothing is there."""
+    """Make the standard streams of this process printable in any locale; a closed one becomes the null device."""
     if sys.stdin is None:
         sys.stdin = open(os.devnull)  # noqa: PTH123, SIM115 (it stays open)
     for name, required in (("stdout", True), ("stderr", False)):
@@ -189,9 +189,9 @@ def protect_streams() -> None:
 
 
 def _buffered(stream: io.TextIOWrapper) -> io.TextIOWrapper:
-    """The stream with a buffer and without an error of encoding.
+    """The stream with a buffer and with escapes in place of encoding errors.
 
-    Without a buffer (``PYTHONUNBUFFERED=1``, as in many containers) Python drops what a nearly full disk does not take.
+    Without a buffer (``PYTHONUNBUFFERED=1``, as in many containers) Python drops text that a full disk does not take.
     """
     if isinstance(stream.buffer, io.RawIOBase):
         raw = io.FileIO(stream.fileno(), "w", closefd=False)
@@ -220,7 +220,7 @@ _interrupted = False
 def interrupt_on_signals() -> Iterator[None]:
     """Let SIGTERM (`kill`, `timeout`, a batch system) and SIGHUP (a closed terminal) interrupt as Ctrl-C does.
 
-    What is ignored stays so: `nohup` ignores SIGHUP.
+    A signal that is ignored stays ignored: `nohup` ignores SIGHUP.
     """
     global _interrupted
     _interrupted = False
@@ -238,7 +238,7 @@ def interrupt_on_signals() -> Iterator[None]:
 
 
 def raise_if_interrupted() -> None:
-    """Raise `KeyboardInterrupt` again where code of others dropped it, as compiled modules do while being imported."""
+    """Raise `KeyboardInterrupt` again where other code swallowed it, as compiled modules do while being imported."""
     if _interrupted:
         raise KeyboardInterrupt
 
@@ -269,9 +269,8 @@ def progress_bar(
 ) -> Iterator[Progress]:
     """Give a ``progress(done, total)`` callback; the bar is erased when the block ends.
 
-    The `label` is what is counted. By default it is drawn on stderr, so that output can be piped. Where the stream is
-    no terminal there is a line every `log_every_s`, if at all. The time left is told for work whose parts take equally
-    long.
+    The `label` names the items counted. The bar is drawn on stderr by default, so that output can be piped. A stream
+    that is no terminal gets a line every `log_every_s`, or nothing. `time_left` is for items that take equally long.
     """
     out = raw_stream(sys.stderr) if stream is None else stream
     bar = out.isatty()
@@ -281,9 +280,9 @@ def progress_bar(
         return
     begun, drawn = clock(), 0
     due = begun + (QUIET_S if bar else every_s)
-    first: int | None = None  # what a resumed run had before it began
+    first: int | None = None  # items that a resumed run had before it began
 
-    def tell(done: int, total: int) -> None:
+    def update(done: int, total: int) -> None:
         nonlocal first, due, drawn
         now, first = clock(), done if first is None else first
         if now < due or total <= 0:
@@ -301,7 +300,7 @@ def progress_bar(
         out.flush()
 
     try:
-        yield tell
+        yield update
     finally:
         if drawn:
             out.write("\r" + " " * drawn + "\r")

@@ -66,7 +66,7 @@ def estimate_command() -> None:
     """
 
 
-# --- A command with groups of files: what follows ``--with`` up to the next option is one group.
+# --- A command with groups of files: the words after ``--with`` up to the next option are one group.
 
 WITH: Final = "--with"
 
@@ -86,22 +86,22 @@ class VisitsCommand(click.Command):
 
 
 def numbered(args: Sequence[str], *, strict: bool = True) -> list[str]:
-    """The words with every file after ``--with`` as an option of its own, with the number of its group.
+    """The words with each file after ``--with`` as ``--with GROUP FILE``, groups numbered from 1.
 
-    A ``--with`` that no file follows is refused where `strict`; a shell that completes words leaves it out.
+    With `strict` a ``--with`` without a file is refused; a shell that completes words drops it.
     """
-    found: list[str] = []
+    words: list[str] = []
     group, files = 0, -1  # files of the group so far; -1 outside one
     for word in [*args, ""]:
         if files >= 0 and word and not word.startswith("-"):
-            found += [WITH, str(group), word]
+            words += [WITH, str(group), word]
             files += 1
             continue
         if files == 0 and strict:
             raise UsageError(f"{WITH} names no map; give the maps of a later visit after it")
         group, files = (group + 1, 0) if word == WITH else (group, -1)
-        found += [word] if word not in (WITH, "") else []
-    return found
+        words += [word] if word not in (WITH, "") else []
+    return words
 
 
 _PERCENT = tuple(100 * share for share in GROWTH_SHARES)

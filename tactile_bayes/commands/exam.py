@@ -84,12 +84,12 @@ def import_command() -> None:
     """
 
 
-_HEADING = "Arrays of a scan, in mm, kPa and s, for n frames and m poses:"
-_MORE = (
+_ARRAYS_HEADING = "Arrays of a scan, in mm, kPa and s, for n frames and m poses:"
+_OTHER_ARRAYS = (
     "Frames may also be called `frames`, and poses be homogeneous matrices, `pose_matrix` (m, 4, 4). Other names stand "
     "in MAP.toml."
 )
-_ARRAYS = "\n".join([_HEADING, "", "\b", *layout_lines(), "", _MORE])
+_ARRAYS = "\n".join([_ARRAYS_HEADING, "", "\b", *layout_lines(), "", _OTHER_ARRAYS])
 import_command.help = f"{cleandoc(import_command.help or '')}\n\n{_ARRAYS}"
 
 

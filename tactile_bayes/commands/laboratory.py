@@ -341,9 +341,9 @@ def compare_model_command() -> None:
     """
 
 
-# --- What `tradeoff estimate` and `tradeoff map` share: options, the forecast on stderr, and the output.
+# --- Options that the trade-off commands share.
 
-_OF_RUNS = click.IntRange(1, 1000)
+_RUN_COUNT = click.IntRange(1, 1000)
 _TOLERANCE = options.number(
     "--tolerance-mm",
     _ABOVE_0,
@@ -351,7 +351,7 @@ _TOLERANCE = options.number(
     "Error of the size interval's ends below which more accuracy is not worth its cost.",
 )
 _RUNS = options.number(
-    "--runs", _OF_RUNS, 3, "Number of runs of each setting: the least time counts, errors are averaged."
+    "--runs", _RUN_COUNT, 3, "Number of runs of each setting: the least time counts, errors are averaged."
 )
 
 
@@ -373,7 +373,7 @@ def tradeoff_command() -> None:
 )
 @options.figure("Draw error in size against time.")
 @options.number("--tolerance-percent", _ABOVE_0, 0.5, "Error in size below which more accuracy is not worth its cost.")
-@options.number("--runs", _OF_RUNS, 1, "Number of runs; the shortest time counts.")
+@options.number("--runs", _RUN_COUNT, 1, "Number of runs; the shortest time counts.")
 @options.JSON
 @options.FORCE
 def tradeoff_forward_command() -> None:

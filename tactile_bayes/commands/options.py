@@ -26,22 +26,22 @@ from tactile_bayes.report import figure_file
 WRITTEN: Final = frozenset(
     {"output", "figure", "map_figure", "fit_figure", "figures", "html", "pdf", "trace", "rank", "corner", "dictionary"}
 )
-"""The options that name what a command writes; every other path is read."""
+"""Options that name a command's outputs; every other path is an input."""
 _SEEN: Final = "tactile_bayes.paths"
 
 
 class FilePath(click.Path):
     """Path that is checked against the other paths of the call before the command runs.
 
-    Symbolic and hard links to one file are that file. With `addresses` that of an object store may stand instead, and
-    stays a text. `writes` is the format of the output that it names, whose suffix it may have; such a file is `guarded`
-    by default: only overwritten with --force.
+    Symbolic and hard links to one file are that file. With `addresses` the address of an object store is allowed too,
+    and stays a text. `writes` is the format of an output, by which its suffix is checked; such a file is `guarded` by
+    default: it is only overwritten with --force.
     """
 
     def __init__(
         self, *, addresses: bool = False, writes: Format | Literal["figure"] | None = None, guarded: bool | None = None
     ) -> None:
-        super().__init__(path_type=Path, readable=False)  # its reader says it in one line
+        super().__init__(path_type=Path, readable=False)  # its reader reports it in one line
         self._addresses, self.writes = addresses, writes
         self.guarded = writes is not None if guarded is None else guarded
 
@@ -67,61 +67,61 @@ class FilePath(click.Path):
 
 
 def protect_inputs(*paths: Path | None) -> None:
-    """Refuse the call if one of its outputs is one of these further inputs."""
+    """Refuse the call if it would write one of these further inputs."""
     context = click.get_current_context(silent=True)
     seen: list[tuple[Path, bool]] = [] if context is None else context.meta.get(_SEEN, [])
     refuse_same([path for path, written in seen if written], paths)
 
 
 def typed_options() -> set[str]:
-    """Options given on the command line, not by default."""
+    """Names of the options on the command line, those by default left out."""
     context = click.get_current_context()
-    typed = click.core.ParameterSource.COMMANDLINE
-    return {name for name in context.params if context.get_parameter_source(name) is typed}
+    command_line = click.core.ParameterSource.COMMANDLINE
+    return {name for name in context.params if context.get_parameter_source(name) is command_line}
 
 
 def command(
     name: str, action: str, *, within: click.Group | None = None, kind: type[click.Command] = click.Command
 ) -> Callable[[Callable[[], None]], click.Command]:
-    """Make a command, of a group or alone, of its options and of a function that says its help and does nothing.
+    """Make a command, alone or within a group, of its options and of an empty function whose docstring is its help.
 
-    The `action` is a module of `tactile_bayes.actions`, imported when the command runs, and a function there that takes
-    the options by their names. A number that it returns is the exit code. Guarded outputs do not exist when it is
-    called, unless --force is given.
+    The `action` names a module of `tactile_bayes.actions`, imported when the command runs, and a function there that
+    takes the options by their names; a number that it returns is the exit code. It is called only if the guarded
+    outputs do not exist or --force is given.
     """
     module, function = action.split(".")
 
-    def made(described: Callable[[], None]) -> click.Command:
-        @wraps(described)
-        def body(**given: Any) -> None:
+    def make(documented: Callable[[], None]) -> click.Command:
+        @wraps(documented)
+        def run(**values: Any) -> None:
             context = click.get_current_context()
-            guarded = [one.name for one in context.command.params if getattr(one.type, "guarded", False)]
-            refuse_existing(*(given[str(one)] for one in guarded), force=given.get("force", False))
-            before = BY_OPTIONS.set(True)
+            guarded = [str(param.name) for param in context.command.params if getattr(param.type, "guarded", False)]
+            refuse_existing(*(values[name] for name in guarded), force=values.get("force", False))
+            token = BY_OPTIONS.set(True)
             try:
-                code = getattr(import_module(f"tactile_bayes.actions.{module}"), function)(**given)
+                code = getattr(import_module(f"tactile_bayes.actions.{module}"), function)(**values)
             finally:
-                BY_OPTIONS.reset(before)
+                BY_OPTIONS.reset(token)
             if code:
                 context.exit(code)
 
-        return (within or click).command(name, cls=kind)(body)
+        return (within or click).command(name, cls=kind)(run)
 
-    return made
+    return make
 
 
 class CommandGroup(click.Group):
-    """A group whose help has the first sentence of each of its commands, whole."""
+    """A group whose help has the whole first sentence of each of its commands."""
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        commands = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
-        whole = [(name, found.get_short_help_str(limit=1000)) for name, found in commands.items() if found is not None]
+        del ctx
+        rows = [(name, made.get_short_help_str(limit=1000)) for name, made in sorted(self.commands.items())]
         with formatter.section("Commands"):
-            formatter.write_dl(whole)
+            formatter.write_dl(rows)
 
 
 def head_option(default: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Make the option; its help ends with a sentence about the default."""
+    """``--head``; its help ends with a sentence about the default."""
     return click.option(
         "--head",
         type=click.Choice(HEADS),
@@ -131,7 +131,7 @@ def head_option(default: str) -> Callable[[Callable[..., Any]], Callable[..., An
 
 
 def make_settings(*, settings_file: Path | None = None, repeatability: Path | None = None, **options: Any) -> Settings:
-    """Make settings from options and from the files that they name, none of which may be an output of the call."""
+    """Settings from options and from the files that they name, none of which may be an output of the call."""
     from tactile_bayes.files.size_json import read_repeatability, size_calibration_path
 
     if (calibration := options.get("size_calibration")) is not None:
@@ -180,7 +180,7 @@ class FiniteRange(click.FloatRange):
 
 
 class NumberOr(_ParamType):
-    """A number, whole or not, or one of the words given."""
+    """A number, whole or not, or one of some words."""
 
     name = "number"
 
@@ -201,14 +201,13 @@ def record_options(record: type[Record], *names: str, **attributes: Any) -> Deco
     """The options of a command for some fields of a record, in this order; for all where none is named.
 
     Type, range, default and help come from the field's declaration, `metavar` and the name from its ``extra``;
-    `attributes` of `click.option` stand in place of them.
+    `attributes` of `click.option` replace them.
     """
+    return _chain(*(_option(record, name, attributes) for name in names or record.__struct_fields__))
 
-    return _several(*(_option(record, name, attributes) for name in names or record.__struct_fields__))
 
-
-def _several(*options: Decorator) -> Decorator:
-    """Options in the order of a command's help."""
+def _chain(*options: Decorator) -> Decorator:
+    """One decorator of several options, in the order of the command's help."""
 
     def add(command: Callable[..., Any]) -> Callable[..., Any]:
         for option in reversed(options):
@@ -220,36 +219,34 @@ def _several(*options: Decorator) -> Decorator:
 
 def _option(record: type[Record], name: str, attributes: Mapping[str, Any]) -> Decorator:
     kind, default = field_types(record)[name], default_of(record, name)
-    extra = extra_of(kind)
+    bare, extra = value_type(kind), extra_of(kind)
     flag = f"--{extra.get('option', name).replace('_', '-')}"
-    also = [f"--{extra['also']}"] if "also" in extra else []
-    of_field: dict[str, Any] = {"help": meaning_of(kind), "metavar": extra.get("metavar")}
+    second_name = [f"--{extra['also']}"] if "also" in extra else []
+    declared: dict[str, Any] = {"help": meaning_of(kind), "metavar": extra.get("metavar")}
     if default is False:
-        of_field["is_flag"] = True
-    elif value_type(kind) is bool:
-        flag, of_field["default"] = f"{flag}/--no-{flag[2:]}", None
+        declared["is_flag"] = True
+    elif bare is bool:
+        flag, declared["default"] = f"{flag}/--no-{flag[2:]}", None
     else:
-        bare = value_type(kind)
-        pairs = get_origin(bare) is tuple and get_args(bare)[1:] == (...,)
-        shown = default not in (None, (), "")
-        of_field |= {"type": _click_type(get_args(bare)[0] if pairs else kind)}
-        of_field |= {"multiple": True} if pairs else {}
-        of_field |= {"default": default, "show_default": True} if shown else {}
-        if isinstance(of_field["type"], NumberOr) and default is not None:
-            of_field["default"] = default if isinstance(default, str) else f"{default:g}"
-    of_field |= attributes
-    kind = of_field.get("type")
-    if isinstance(kind, click.Choice) and not of_field["metavar"] and len("|".join(kind.choices)) > MOST_CHOICES:
-        of_field["help"] += f" One of {', '.join(kind.choices)}."
-        of_field["metavar"] = name.rpartition("_")[2].upper()
-    return click.option(flag, *also, name, **of_field)
+        multiple = get_origin(bare) is tuple and get_args(bare)[1:] == (...,)
+        declared["type"] = _click_type(get_args(bare)[0] if multiple else kind)
+        declared |= {"multiple": True} if multiple else {}
+        declared |= {"default": default, "show_default": True} if default not in (None, (), "") else {}
+        if isinstance(declared["type"], NumberOr) and default is not None:
+            declared["default"] = default if isinstance(default, str) else f"{default:g}"
+    declared |= attributes
+    choices = getattr(declared.get("type"), "choices", ())
+    if not declared["metavar"] and len("|".join(choices)) > MOST_CHOICES:
+        declared["help"] += f" One of {', '.join(choices)}."
+        declared["metavar"] = name.rpartition("_")[2].upper()
+    return click.option(flag, *second_name, name, **declared)
 
 
-MOST_CHOICES: Final = 50  #: Letters of all the choices of an option up to which its help has them beside its name.
+MOST_CHOICES: Final = 50  #: Letters of an option's choices up to which its help lists them beside its name.
 
 
 def _click_type(kind: Any) -> Any:
-    """What click makes of a value, by what is declared for it."""
+    """The click type of a kind."""
     bare = value_type(kind)
     if words := [word for one in get_args(bare) if get_origin(one) is Literal for word in get_args(one)]:
         return NumberOr(*words, number=int if int in map(value_type, get_args(bare)) else float)
@@ -257,7 +254,7 @@ def _click_type(kind: Any) -> Any:
         return click.Choice([one for one in get_args(bare) if one])
     if get_origin(bare) is tuple:
         return tuple(map(_click_type, get_args(bare)))
-    if bare in (Path, Any):  # an object of Python's is in a file
+    if bare in (Path, Any):  # an object in Python is a file on the command line
         return FilePath()
     if bare not in (int, float):
         return str
@@ -273,9 +270,9 @@ FORCE = click.option("--force", is_flag=True, help="Overwrite existing outputs."
 def output(
     metavar: str, writes: Format | None, meaning: str, *, guarded: bool | None = None, **attributes: Any
 ) -> Decorator:
-    """``-o``: what a command writes, see `FilePath`; a folder, or a file of several formats, is of none."""
-    kind = FilePath(writes=writes, guarded=guarded)
-    return click.option("-o", "--output", metavar=metavar, type=kind, help=meaning, **attributes)
+    """``-o``: a command's output, see `FilePath`; `writes` is None for a folder or a file of several formats."""
+    path_type = FilePath(writes=writes, guarded=guarded)
+    return click.option("-o", "--output", metavar=metavar, type=path_type, help=meaning, **attributes)
 
 
 def figure(meaning: str, name: str = "--figure") -> Decorator:
@@ -296,9 +293,8 @@ def path_option(
 
 
 def page_options(metavar: str, title: str) -> Decorator:
-    """``--pdf``, ``--title`` and ``--name``: how a page is printed, and what is printed on it."""
-
-    return _several(
+    """``--pdf``, ``--title`` and ``--name`` of a page."""
+    return _chain(
         path_option("--pdf", metavar, PRINTED),
         click.option("--title", default="", help=f"Title of the page. Default: {title}."),
         click.option("--name", default="", help="Name to print on the page. Default: none."),
@@ -316,6 +312,6 @@ SPEED = number("--speed", FiniteRange(0.01, 100.0), 1.0, "Playback speed; 1 is r
 WORKERS = number("--workers", click.IntRange(min=0), 1, "Number of worker processes.")
 
 
-def scheduler_option(what: str) -> Decorator:
-    """``--scheduler``; `what` names the work that is sent to it."""
-    return click.option("--scheduler", metavar="ADDRESS", help=f"Send {what} to a dask scheduler (extra [cluster]).")
+def scheduler_option(items: str) -> Decorator:
+    """``--scheduler``; `items` names the work that is sent to it."""
+    return click.option("--scheduler", metavar="ADDRESS", help=f"Send {items} to a dask scheduler (extra [cluster]).")
