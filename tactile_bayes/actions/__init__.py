@@ -1,1 +1,1 @@
-"""What the commands do once their options are read: files in, calls of the API, lines out."""
+"""Actions of the commands: they read files, call the API, and print lines."""

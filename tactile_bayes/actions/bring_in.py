@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,34 +27,42 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.scans import Scan
 from tactile_bayes.shell import progress_bar
 
-_BESIDE: Final = {"head_geometry": head_source, "array_calibration": calibration_source, "landmarks": landmark_source}
+_SCAN_FILES: Final = {
+    "head_geometry": head_source,
+    "array_calibration": calibration_source,
+    "landmarks": landmark_source,
+}
 
 
 class ImportRequest(Record):
-    """What the call asks for, besides its files."""
+    """Options of an import besides its sources and output."""
 
     kind: str | None
     grid: GridOptions
     corrections: tuple[str, ...]
     session_file: Path | None
     arrays: ArrayMap
-    beside: dict[str, Path]  #: Files that complete a scan, by the option that names them.
+    scan_files: dict[str, Path]  #: Files that complete a scan, by the option that names them.
     force: bool
 
     @property
-    def of_a_scan(self) -> list[str]:
-        """Options that were given and that only scans have."""
-        given = {"session": self.session_file, "correct": self.corrections}
-        return [*(f"--{name}" for name, value in given.items() if value), *self.of_arrays]
+    def scan_options(self) -> list[str]:
+        """The options of this call that only scans have."""
+        values = {"session": self.session_file, "correct": self.corrections}
+        return [*(f"--{name}" for name, value in values.items() if value), *self.array_options]
 
     @property
-    def of_arrays(self) -> list[str]:
-        """Options that were given and that only scans from arrays or tables have."""
-        return [f"--{name.replace('_', '-')}" for name in (*self.beside, *self.arrays.given)]
+    def array_options(self) -> list[str]:
+        """The options of this call that only scans from arrays or tables have."""
+        return _flags([*self.scan_files, *self.arrays.given])
+
+
+def _flags(names: Iterable[str]) -> list[str]:
+    return [f"--{name.replace('_', '-')}" for name in names]
 
 
 def import_action(
-    *, sources: tuple[Path, ...], output: Path | None, template: bool, columns: Path | None, **given: Any
+    *, sources: tuple[Path, ...], output: Path | None, template: bool, columns: Path | None, **options: Any
 ) -> int:
     """Import scans, grids and images from other programs."""
     if template:
@@ -62,74 +71,73 @@ def import_action(
         return EXIT_DONE
     if not sources or output is None:
         raise UsageError(f"Missing {'option -o' if sources else 'argument SRC'}; `import --help` has examples")
-    stated = Stated(**{name: given.pop(name) for name in names_of(Stated)})
+    stated = Stated(**{name: options.pop(name) for name in names_of(Stated)})
     arrays = replace(ArrayMap() if columns is None else read_array_map(columns), **stated.given)
-    beside = {name: path for name in ("poses", *_BESIDE) if (path := given.pop(name)) is not None}
-    grid = GridOptions(**{name: given.pop(name) for name in names_of(GridOptions)})
-    wanted = ImportRequest(**given, grid=grid, arrays=arrays, beside=beside)
+    scan_files = {name: path for name in ("poses", *_SCAN_FILES) if (path := options.pop(name)) is not None}
+    grid = GridOptions(**{name: options.pop(name) for name in names_of(GridOptions)})
+    request = ImportRequest(**options, grid=grid, arrays=arrays, scan_files=scan_files)
     if len(sources) == 1 and not output.is_dir():
-        lines, failed = _import(sources[0], output, wanted), EXIT_DONE
+        lines, exit_code = _import(sources[0], output, request), EXIT_DONE
     else:
-        lines, failed = _import_each(sources, output, wanted)
+        lines, exit_code = _import_each(sources, output, request)
     click.echo("\n".join([*lines, RESEARCH_USE]))
-    return failed
+    return exit_code
 
 
-def _import_each(sources: tuple[Path, ...], folder: Path, wanted: ImportRequest) -> tuple[list[str], int]:
-    """Bring each in by itself: what was done, and the code of the first that failed."""
-    suffix = {source: ".mcap" if _kind(source, None, wanted) == "scan" else ".nc" for source in sources}
+def _import_each(sources: tuple[Path, ...], folder: Path, request: ImportRequest) -> tuple[list[str], int]:
+    """Import each source into the folder: lines to print, and the exit code of the first that failed."""
+    suffix = {source: ".mcap" if _kind(source, None, request) == "scan" else ".nc" for source in sources}
     targets = {source: folder / f"{source.name.partition('.')[0]}{suffix[source]}" for source in sources}
     if len(set(targets.values())) < len(sources):
         raise UsageError(f"two of the files would become one in {folder}; import them into different folders")
     refuse_same(targets.values(), sources)
     if folder.suffix.lower() in (".mcap", ".nc") and not folder.exists():
         raise UsageError(f"{len(sources)} files go into a folder, and {folder} names a file; give a folder")
-    made = not folder.exists()
+    is_new = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{folder} is no folder and cannot be made ({error.strerror})") from None
-    lines, failed = [], 0
+    lines, exit_code = [], EXIT_DONE
     for source, target in targets.items():
         try:
-            lines += _import(source, target, wanted)
+            lines += _import(source, target, request)
         except TactileBayesError as error:
             line = one_line(error)
             click.echo(line if str(source) in line else f"{source}: {line}", err=True)
-            failed = failed or error.exit_code
-    if made and not lines:
+            exit_code = exit_code or error.exit_code
+    if is_new and not lines:
         folder.rmdir()
-    return lines, failed
+    return lines, exit_code
 
 
-def _kind(source: Path, output: Path | None, wanted: ImportRequest) -> str:
-    """Scan or map: as asked, by the output's suffix, by options that only scans have, else by the source's."""
-    if wanted.kind is not None:
-        return wanted.kind
-    given, suffix = source.suffix.lower(), "" if output is None else output.suffix.lower()
-    arrays = suffix != ".nc" and (wanted.of_a_scan or given in ARRAY_SUFFIXES)
-    return "scan" if arrays or ".mcap" in (given, suffix) else "map"
+def _kind(source: Path, output: Path | None, request: ImportRequest) -> str:
+    """Scan or map: by ``--as``, the output's suffix, options that only scans have, or the source's suffix."""
+    if request.kind is not None:
+        return request.kind
+    suffix, written = source.suffix.lower(), "" if output is None else output.suffix.lower()
+    arrays = written != ".nc" and (request.scan_options or suffix in ARRAY_SUFFIXES)
+    return "scan" if arrays or ".mcap" in (suffix, written) else "map"
 
 
-def _import(source: Path, output: Path, wanted: ImportRequest) -> list[str]:
-    refuse_existing(output, force=wanted.force)
-    kind = _kind(source, output, wanted)
+def _import(source: Path, output: Path, request: ImportRequest) -> list[str]:
+    refuse_existing(output, force=request.force)
+    kind = _kind(source, output, request)
     check_suffix(output, "MCAP" if kind == "scan" else "netCDF")
-    if source.suffix.lower() == ".mcap" and wanted.of_arrays:
-        given = " and ".join(wanted.of_arrays)
-        raise UsageError(f"{given}: for arrays and tables; {source} is a scan already: leave out")
-    if kind == "scan" and wanted.grid != GridOptions():
-        changed = [name for name, value in as_dict(wanted.grid).items() if value != getattr(GridOptions(), name)]
-        given = " and ".join(f"--{name.replace('_', '-')}" for name in changed)
-        raise UsageError(f"{given}: for maps only; leave out or give --as map")
-    if kind == "map" and wanted.of_a_scan:
-        unit = " (a map's unit is --units)" if wanted.arrays.unit else ""
-        raise UsageError(f"{' and '.join(wanted.of_a_scan)}: for scans only; leave out or give --as scan{unit}")
-    lines = _import_scan(source, output, wanted) if kind == "scan" else _import_map(source, output, wanted)
+    if source.suffix.lower() == ".mcap" and request.array_options:
+        flags = " and ".join(request.array_options)
+        raise UsageError(f"{flags}: for arrays and tables; {source} is a scan already: leave out")
+    if kind == "scan" and request.grid != GridOptions():
+        changed = [name for name, value in as_dict(request.grid).items() if value != getattr(GridOptions(), name)]
+        raise UsageError(f"{' and '.join(_flags(changed))}: for maps only; leave out or give --as map")
+    if kind == "map" and request.scan_options:
+        unit = " (a map's unit is --units)" if request.arrays.unit else ""
+        raise UsageError(f"{' and '.join(request.scan_options)}: for scans only; leave out or give --as scan{unit}")
+    lines = _import_scan(source, output, request) if kind == "scan" else _import_map(source, output, request)
     return [f"{output}: {kind}", *lines]
 
 
-def _import_scan(source: Path, output: Path, wanted: ImportRequest) -> list[str]:
+def _import_scan(source: Path, output: Path, request: ImportRequest) -> list[str]:
     lost: tuple[str, ...] = ()
     notes: list[str] = []
     truth = None
@@ -137,18 +145,20 @@ def _import_scan(source: Path, output: Path, wanted: ImportRequest) -> list[str]
         file = read_scan_report(source)
         scan, lost, truth = file.scan, file.lost, file.truth
     else:
-        files = wanted.beside.items()
-        beside = [pose_source(path, wanted.arrays) if name == "poses" else _BESIDE[name](path) for name, path in files]
-        scan, notes = import_arrays(source, wanted.arrays, beside)
-    settings = {"as": "scan", "lost": list(lost), "correct": list(wanted.corrections), **wanted.arrays.given}
-    scan = corrected(with_session(scan, wanted.session_file), wanted.corrections)
-    inputs = hash_inputs(source=source, session=wanted.session_file, **wanted.beside)
-    write_scan(output, scan, provenance=Provenance("import", settings, inputs), truth=truth, force=wanted.force)
+        files = request.scan_files.items()
+        parts = [
+            pose_source(path, request.arrays) if name == "poses" else _SCAN_FILES[name](path) for name, path in files
+        ]
+        scan, notes = import_arrays(source, request.arrays, parts)
+    settings = {"as": "scan", "lost": list(lost), "correct": list(request.corrections), **request.arrays.given}
+    scan = corrected(with_session(scan, request.session_file), request.corrections)
+    inputs = hash_inputs(source=source, session=request.session_file, **request.scan_files)
+    write_scan(output, scan, provenance=Provenance("import", settings, inputs), truth=truth, force=request.force)
     return [*describe_scan(scan), *notes, *(f"lost: {line}" for line in lost), *_arrangement_lines(scan)]
 
 
 def _arrangement_lines(scan: Scan) -> list[str]:
-    """What its frames say of the scan; one that no map could be made of is imported all the same."""
+    """Findings of the scan's frames, a line each; a caution where no map can be made of it."""
     try:
         check = check_scan(scan, thorough=False)
     except BadDataError as error:
@@ -156,12 +166,12 @@ def _arrangement_lines(scan: Scan) -> list[str]:
     return [*finding_lines(check.doubts), *(finding_lines(check.findings_of(scan)) or [check.words])]
 
 
-def _import_map(source: Path, output: Path, wanted: ImportRequest) -> list[str]:
+def _import_map(source: Path, output: Path, request: ImportRequest) -> list[str]:
     with progress_bar("steps", time_left=False) as progress:
-        tactile_map, notes = import_grid(source, wanted.grid, progress=progress)
-        asked = {**as_dict(wanted.grid), "spacing_mm": tactile_map.recipe.cell_mm}
-        provenance = Provenance("import", {"as": "map", **asked, "notes": notes}, inputs=hash_inputs(source=source))
-        write_map(output, tactile_map, provenance=provenance, force=wanted.force)
+        tactile_map, notes = import_grid(source, request.grid, progress=progress)
+        settings = {"as": "map", **as_dict(request.grid), "spacing_mm": tactile_map.recipe.cell_mm, "notes": notes}
+        provenance = Provenance("import", settings, inputs=hash_inputs(source=source))
+        write_map(output, tactile_map, provenance=provenance, force=request.force)
     ny, nx = tactile_map.mean.shape
     low, high = np.nanmin(tactile_map.mean), np.nanmax(tactile_map.mean)
     unit = tactile_map.recipe.value_unit

@@ -39,27 +39,27 @@ def calibrate_array_action(
     measured = day.date() if day else date.today()
     scans = [read_scan(path) for _, path in steps]
     head = head_id or _one_head(scans)
-    full = scans[0].element_calibration.saturation_count
+    saturation = scans[0].element_calibration.saturation_count
     levels = []
     for (kpa, path), scan in zip(steps, scans, strict=True):
         with in_file(path):
-            levels.append(BladderStep.of(kpa, scan.frames.counts, saturation_count=full))
-    fit = fit_array(levels, saturation_count=full)
+            levels.append(BladderStep.of(kpa, scan.frames.counts, saturation_count=saturation))
+    fit = fit_array(levels, saturation_count=saturation)
     inputs = hash_inputs(**{f"step_{number}": path for number, (_, path) in enumerate(steps, start=1)})
-    made = Provenance("calibrate array", {"pressure_kpa": [kpa for kpa, _ in steps]}, inputs)
+    provenance = Provenance("calibrate array", {"pressure_kpa": [kpa for kpa, _ in steps]}, inputs)
     content = ArrayCalibrationFile(
-        head_id=head, day=measured, quality=_quality(fit), provenance=made.as_dict(), **as_dict(fit.calibration)
+        head_id=head, day=measured, quality=_quality(fit), provenance=provenance.as_dict(), **as_dict(fit.calibration)
     )
     write_array_calibration(output, content, force=force)
-    click.echo(_text(fit, head, output), nl=False)
+    click.echo(_fit_text(fit, head, output), nl=False)
 
 
 def _one_head(scans: list[Scan]) -> str:
-    found = {scan.session.get("head_id", "") for scan in scans}
+    heads = {scan.session.get("head_id", "") for scan in scans}
     shapes = {scan.head.shape for scan in scans}
-    if len(found) > 1 or len(shapes) > 1:
+    if len(heads) > 1 or len(shapes) > 1:
         raise BadDataError("the steps are of two heads or more", way_out="give steps of one head, or --head-id")
-    (head,) = found
+    (head,) = heads
     if not head:
         raise BadDataError("the steps do not say which head they are of", way_out="give --head-id")
     return head
@@ -79,12 +79,12 @@ def _quality(fit: ArrayFit) -> dict[str, Any]:
     }
 
 
-def _text(fit: ArrayFit, head: str, output: Path) -> str:
+def _fit_text(fit: ArrayFit, head: str, output: Path) -> str:
     gain = fit.calibration.gain_kpa_per_count
     lines = [f"{output}: {gain.size} taxels of head {head}, {len(fit.pressure_kpa)} steps"]
     for name, taxels in (("dead", fit.dead), ("hot", fit.hot)):
-        places = ", ".join(f"row {row} column {column}" for row, column in taxels)
-        lines.append(f"{name} taxels: {places or 'none'}")
+        positions = ", ".join(f"row {row} column {column}" for row, column in taxels)
+        lines.append(f"{name} taxels: {positions or 'none'}")
     for kpa, line, curve in zip(fit.pressure_kpa, fit.nonuniformity, fit.curved_nonuniformity, strict=True):
         if line == line:
             lines.append(f"{kpa:g} kPa: residual non-uniformity {100 * line:.2f} %, with curvature {100 * curve:.2f} %")
@@ -114,8 +114,8 @@ def calibrate_size_action(
         return
     if figure is not None and learned.lumps is not None:
         eq6_figure(calibration, learned.lumps, figure, title=table.name, force=force)
-    words = calibration_text(calibration, not_left_out=learned.not_left_out, other_fit=learned.other_fit)
-    click.echo(words, nl=False)
+    text = calibration_text(calibration, not_left_out=learned.not_left_out, other_fit=learned.other_fit)
+    click.echo(text, nl=False)
 
 
 def calibrate_repeatability_action(folder: Path, output: Path, size_calibration: str | None, force: bool) -> None:

@@ -24,43 +24,43 @@ from tactile_bayes.options import CampaignOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.shell import progress_bar
 
-_LOG_EVERY_S = 60.0  #: Where stderr is no terminal, progress is a line so often.
+_LOG_EVERY_S = 60.0  #: Interval of progress lines where stderr is no terminal.
 
 
 def campaign_init_action(folder: Path | str, output: Path, names: str | None, add: bool, force: bool) -> None:
     """Write the table of exams from a folder of scans and what they carry."""
     if add and force:
         raise UsageError("--add keeps the rows of a table, --force writes it anew; give one of them")
-    before = read_rows(output) if add and output.exists() else None
+    table = read_rows(output) if add and output.exists() else None
     if output.exists() and not (add or force):
         raise UsageError(f"{output} exists; --add keeps its rows and adds other files, --force writes it anew")
     refuse_existing(output, force=force or add)
-    found = find_exams(folder, output, listed=before.rows if before else (), names=names)
-    for line in found.skipped:
+    search = find_exams(folder, output, listed=table.rows if table else (), names=names)
+    for line in search.skipped:
         click.echo(f"left out: {line}", err=True)
-    if before is None:
-        if not found.rows:
+    if table is None:
+        if not search.rows:
             what, way_out = f"holds no scan ({', '.join(SCANS)}) and no map (.nc)", "give the folder of the scans"
-            if found.skipped:
+            if search.skipped:
                 what, way_out = "holds no file that can be an exam", "see why each was left out"
             raise BadDataError(what, way_out=way_out, path=str(folder))
-        write_manifest(output, found.rows, force=force)
-    elif found.rows:
-        add_rows(before, found.rows)
-    _print_table_summary(found, output, before.rows if before else None)
+        write_manifest(output, search.rows, force=force)
+    elif search.rows:
+        add_rows(table, search.rows)
+    _print_table_summary(search, output, table.rows if table else None)
 
 
-def _print_table_summary(found: Found, output: Path, before: Sequence[Mapping[str, str]] | None) -> None:
-    """What the table holds now, what is to be looked at, and the next command."""
-    rows = [*(before or ()), *found.rows]
+def _print_table_summary(search: Found, output: Path, kept: Sequence[Mapping[str, str]] | None) -> None:
+    """Print the number of exams and patients, gaps and faults of the table, and the next command."""
+    rows = [*(kept or ()), *search.rows]
     patients = {row["patient"].casefold() for row in rows} - {""}
-    added = "" if before is None else f" ({len(found.rows)} added, {len(before)} kept)"
+    added = "" if kept is None else f" ({len(search.rows)} added, {len(kept)} kept)"
     click.echo(f"{output}: {len(rows)} exams of {len(patients)} patients{added}")
-    for line in (*found.spelled, *names_line("listed, and not there any more", found.gone)):
+    for line in (*search.spelled, *names_line("listed, and not there any more", search.gone)):
         click.echo(line)
-    if found.others:
-        kinds = ", ".join(sorted(found.others))
-        click.echo(f"passed over: {sum(found.others.values())} other files ({kinds})")
+    if search.others:
+        kinds = ", ".join(sorted(search.others))
+        click.echo(f"passed over: {sum(search.others.values())} other files ({kinds})")
     nameless = sum(not row["patient"] for row in rows)
     if nameless:
         click.echo(f"{nameless} of them do not say whose they are: fill in the column patient")
@@ -78,16 +78,16 @@ def campaign_run_action(
     exams: Path, output: Path, settings_file: Path | None, repeatability: str | None, **options: Any
 ) -> None:
     """Map, estimate and pool the exams of a table, and report the trial."""
-    asked = {name: options.pop(name) for name in names_of(CampaignOptions)}
-    given = None if repeatability in (None, NONE) else Path(str(repeatability))
-    estimate = make_settings(settings_file=settings_file, repeatability=given, **options)
-    found = run_campaign(
+    campaign = {name: options.pop(name) for name in names_of(CampaignOptions)}
+    site = None if repeatability in (None, NONE) else Path(str(repeatability))
+    estimate = make_settings(settings_file=settings_file, repeatability=site, **options)
+    result = run_campaign(
         exams,
         output,
-        CampaignSettings(**asked, estimate=estimate, own_repeatability=repeatability is None),
-        read=[path for path in (settings_file, given) if path],
+        CampaignSettings(**campaign, estimate=estimate, own_repeatability=repeatability is None),
+        read=[path for path in (settings_file, site) if path],
         bar=partial(progress_bar, log_every_s=_LOG_EVERY_S, time_left=False),
     )
-    for line in () if asked["dry_run"] else found.failed:
+    for line in () if campaign["dry_run"] else result.failed:
         click.echo(f"failed: {line}", err=True)
-    click.echo(found.text, nl=False)
+    click.echo(result.text, nl=False)

@@ -43,20 +43,20 @@ from tactile_bayes.scans import Scan
 
 
 def emulate_action(
-    *, kind: str, scan: Path, protocol: str, tcp: str | None, once: bool, speed: float, seed: int, **given: Any
+    *, kind: str, scan: Path, protocol: str, tcp: str | None, once: bool, speed: float, seed: int, **fault_options: Any
 ) -> None:
     """Serve a scan as a scan head or a tracker would send it, or as both, at its own rate, with faults on request."""
     roles = ("head", "tracker") if kind == "both" else (kind,)
-    faults = Faults(**given)
-    stage, data = Stage(speed=speed), read_scan(scan)
+    faults = Faults(**fault_options)
+    stage, loaded = Stage(speed=speed), read_scan(scan)
     spoilt = faults.drop or faults.corrupt or faults.stall or faults.disconnect_s is not None
     if protocol == "ndi" and "tracker" in roles and (spoilt or once):
         raise UsageError(
             "an NDI tracker sends nothing by itself: --drop, --corrupt, --stall, --disconnect and --once have nothing "
             "to act on; leave them out, or emulate another protocol"
         )
-    held = stage if kind == "both" else None
-    devices = [_device(role, data, protocol, faults, path=scan, held=held) for role in roles]
+    shared = stage if kind == "both" else None
+    devices = [_device(role, loaded, protocol, faults, path=scan, shared=shared) for role in roles]
     emulators = [
         Emulator(
             device,
@@ -70,7 +70,7 @@ def emulate_action(
     ]
     for role, emulator in zip(roles, emulators, strict=True):
         click.echo(f"{role} {emulator.link.url}" if kind == "both" else emulator.link.url)
-    ask_for_priority()  # a real device does not wait for this computer's other programs
+    ask_for_priority()  # a real device does not wait for other programs
     others = [Thread(target=one.run, kwargs={"once": once}, daemon=True) for one in emulators[1:]]
     try:
         with contextlib.suppress(KeyboardInterrupt):  # which the other signals are, too
@@ -85,20 +85,20 @@ def emulate_action(
             click.echo(f"{role}: {words}" if kind == "both" else words, err=True)
 
 
-def _device(kind: str, scan: Scan, protocol: str, faults: Faults, *, path: Path, held: Stage | None) -> Device:
+def _device(kind: str, scan: Scan, protocol: str, faults: Faults, *, path: Path, shared: Stage | None) -> Device:
     """Make the emulated device; an NDI tracker, which only answers, follows a shared stage itself."""
     if not len(scan.frames if kind == "head" else scan.poses):
-        what = "frames" if kind == "head" else "poses"
-        raise BadDataError(f"holds no {what}", way_out="give another scan", path=str(path))
+        missing = "frames" if kind == "head" else "poses"
+        raise BadDataError(f"holds no {missing}", way_out="give another scan", path=str(path))
     if kind == "head":
         return EmulatedHead(scan)
     if protocol == "ndi":
-        return EmulatedNdi(scan.poses, faults=faults, elapsed=None if held is None else lambda: held.now()[1])
+        return EmulatedNdi(scan.poses, faults=faults, elapsed=None if shared is None else lambda: shared.now()[1])
     return EmulatedTracker(scan.poses, protocol=protocol, faults=faults)
 
 
 def _link(tcp: str | None, *, after: int) -> Link:
-    """Make a device's link; the one `after` others listens on a port that many numbers higher."""
+    """Make a device's link; `after` is the number of earlier devices, added to its port."""
     if tcp is None:
         return PtyLink()
     host, colon, port = tcp.rpartition(":")
@@ -131,8 +131,8 @@ def _pivot(url: str, protocol: str, tool: str | None, duration_s: float) -> None
         parser, follower, end = answer.parser(), Follower(answer.tool), time.monotonic() + duration_s
         poses = []
         while time.monotonic() < end:
-            found = [one for one in parser.feed(port.read_some(0.1)) if isinstance(one, ToolReading)]
-            followed = [one for reading in found for one, _ in follower.take(reading, 0)]
+            readings = [one for one in parser.feed(port.read_some(0.1)) if isinstance(one, ToolReading)]
+            followed = [one for reading in readings for one, _ in follower.take(reading, 0)]
             poses += [one for one in followed if isinstance(one, PoseReading) and not one.flags]
         port.write(driver.stop)
     finally:
@@ -144,34 +144,34 @@ def _pivot(url: str, protocol: str, tool: str | None, duration_s: float) -> None
     click.echo(f"{len(poses)} poses, turned by {sense.turn_deg:.0f} degrees: {sense}")
 
 
-def replay_action(*, scan: Path, output: Path | None, speed: float, **given: Any) -> int:
+def replay_action(*, scan: Path, output: Path | None, speed: float, **record_options: Any) -> int:
     """Replay a scan through emulated devices, recorder and live view, as if it were being recorded."""
-    found = read_scan(scan)
-    with tempfile.TemporaryDirectory() as folder, _emulated(scan, speed, poses=bool(len(found.poses))) as urls:
-        options = {"like": scan, "clock": "shared", "at_once": True, "replayed": dict(found.session), **given}
-        options |= {f"{role}_url": url for role, url in urls.items()} | {"tracker_protocol": "open"}
-        if found.landmarks is not None:
+    original = read_scan(scan)
+    with tempfile.TemporaryDirectory() as folder, _emulated(scan, speed, poses=bool(len(original.poses))) as urls:
+        options = {"like": scan, "clock": "shared", "at_once": True, "replayed": dict(original.session)}
+        options |= record_options | {f"{role}_url": url for role, url in urls.items()} | {"tracker_protocol": "open"}
+        if original.landmarks is not None:
             options["landmarks"] = scan
         return record_action(output or Path(folder) / "replayed.mcap", **options)
 
 
 @contextmanager
 def _emulated(scan: Path, speed: float, *, poses: bool) -> Iterator[dict[str, str]]:
-    """Start emulated devices that play one scan together, in one process; gives their URLs by role."""
+    """Start a process of emulated devices that play one scan together; yields their URLs by role."""
     words = ["emulate", "both" if poses else "head", str(scan), "--speed", str(speed)]
     process = subprocess.Popen(
         [sys.executable, "-m", "tactile_bayes", *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,
-        start_new_session=True,  # Ctrl-C and what `timeout` sends are for the recorder: a device goes on meanwhile
+        start_new_session=True,  # Ctrl-C and the signal of `timeout` are for the recorder: a device goes on meanwhile
     )
     assert process.stdout is not None
     try:
-        told = [process.stdout.readline().split() for _ in range(1 + poses)]
-        if not all(told):
+        lines = [process.stdout.readline().split() for _ in range(1 + poses)]
+        if not all(lines):
             raise DeviceError(f"the emulated devices did not start; try `tactile-bayes {' '.join(words[:3])}`")
-        yield {role: line[-1] for role, line in zip(("head", "tracker"), told, strict=False)}
+        yield {role: line[-1] for role, line in zip(("head", "tracker"), lines, strict=False)}
     finally:
         process.terminate()
         process.wait()
@@ -186,8 +186,8 @@ def repair_action(*, scan: Path, output: Path | None, force: bool) -> None:
     if file.complete and output is None:
         click.echo(f"{scan}: is whole, nothing to repair")
         return
-    made = {"was": dict(file.provenance), "lost": list(file.lost)}
-    provenance = Provenance("repair", made, inputs=hash_inputs(scan=scan))
+    settings = {"was": dict(file.provenance), "lost": list(file.lost)}
+    provenance = Provenance("repair", settings, inputs=hash_inputs(scan=scan))
     target = output or scan
     write_scan(target, file.scan, provenance=provenance, truth=file.truth, force=force or output is None)
     for line in (f"{target}: scan", *describe_scan(file.scan), *(f"lost: {one}" for one in file.lost), RESEARCH_USE):
