@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from tactile_bayes.shell import progress_bar
 Answers = Sequence[Answer | Failure]
 
 
-def estimate_pool(
+def _pool(
     maps: tuple[Path, ...],
     answers: Answers,
     settings: Settings,
@@ -41,27 +41,28 @@ def estimate_pool(
 ) -> int:
     """Pool the maps, print and write the result; return the exit code.
 
-    A map that could not be read stops it: its error is printed, for a mass is not sized from what is left by accident.
+    If one of the maps cannot be read, its error is printed and nothing is pooled.
     """
-    if failed := [one for one in answers if isinstance(one, Failure)]:
-        for one in failed:
-            click.echo(one.text, err=True)
-        return failed[0].exit_code
-    same = [one for one in answers if isinstance(one, Answer)]
+    if failures := [one for one in answers if isinstance(one, Failure)]:
+        for failure in failures:
+            click.echo(failure.text, err=True)
+        return failures[0].exit_code
+    exams = [one for one in answers if isinstance(one, Answer)]
     if settings.centre_mm is None:
-        for i, place in elsewhere([one.report for one in same]).items():
-            same[i] = estimate_file(maps[i], replace(settings, centre_mm=place)).answer
-    found = pool_answers(same, settings, names=[str(one) for one in maps], files=maps)
-    report = found.pooled_report.checked()
+        for i, place in elsewhere([one.report for one in exams]).items():
+            exams[i] = estimate_file(maps[i], replace(settings, centre_mm=place)).answer
+    result = pool_answers(exams, settings, names=[str(path) for path in maps], files=maps)
+    report = result.pooled_report.checked()
     text_of = json_text if as_json else pooled_text if verbose else pooled_summary
+    sized = result.pooled.size is not None
     try:
-        if found.pooled.size is not None and output is not None:
-            found.write(output, force=force)
-        if found.pooled.size is not None and figure is not None:
-            found.plot(figure, force=force)
-    finally:  # what was computed is not lost with a file
+        if sized and output is not None:
+            result.write(output, force=force)
+        if sized and figure is not None:
+            result.plot(figure, force=force)
+    finally:  # a file that cannot be written loses no result
         click.echo(text_of(report), nl=False)
-    return EXIT_DONE if found.pooled.size is not None else EXIT_NO_ESTIMATE
+    return EXIT_DONE if sized else EXIT_NO_ESTIMATE
 
 
 def estimate_action(
@@ -76,10 +77,10 @@ def estimate_action(
     scheduler: str | None,
     force: bool,
     verbose: bool,
-    **asked: Any,
+    **options: Any,
 ) -> int:
     """Estimate a lump's size from tactile maps, with a credible interval."""
-    settings = make_settings(**asked)
+    settings = make_settings(**options)
     if len(maps) > 1:
         refuse_checkpoint(settings)
     if figure is not None and settings.size_calibration == "none":
@@ -95,63 +96,62 @@ def estimate_action(
         if map_figure or fit_figure:
             raise UsageError("--map-figure and --fit-figure draw one map; leave out --pool")
         answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
-        return estimate_pool(maps, answers, settings, output, figure, as_json=as_json, verbose=verbose, force=force)
+        return _pool(maps, answers, settings, output, figure, as_json=as_json, verbose=verbose, force=force)
     if len(maps) == 1:
         with progress_bar("effective draws") as progress:
-            found = estimate_file(
+            estimate = estimate_file(
                 maps[0], settings, progress=progress, notice=lambda line: click.echo(f"{maps[0]}: {line}", err=True)
             )
-        answers = [found.answer]
+        answers = [estimate.answer]
     else:
-        found = None
+        estimate = None
         try:
             answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
-        except BatchInterrupted as stop:
-            done = {one.key for one in stop.outcomes}
+        except BatchInterrupted as interrupt:
+            done = {one.key for one in interrupt.outcomes}
             finished = [path for path in maps if str(path) in done]
-            _print(finished, _answers(stop.outcomes), as_json=as_json, verbose=verbose, listed=True)
+            _print(finished, _answers(interrupt.outcomes), as_json=as_json, verbose=verbose, listed=True)
             raise
     try:
-        if found is not None and output and found.status == "estimate":
-            found.write(output, force=force)
-        if found is not None and found.tactile_map.covered.any():  # one without data cannot be drawn
-            for path, draw in zip(outputs[1:], (found.plot, found.plot_map, found.plot_fit), strict=True):
+        if estimate is not None and output and estimate.status == "estimate":
+            estimate.write(output, force=force)
+        if estimate is not None and estimate.tactile_map.covered.any():  # one without data cannot be drawn
+            for path, draw in zip(outputs[1:], (estimate.plot, estimate.plot_map, estimate.plot_fit), strict=True):
                 if path is not None:
                     draw(path, force=force)
-    finally:  # what was computed is not lost with a file
-        took_s = time.perf_counter() - begun
+    finally:  # a file that cannot be written loses no result
+        elapsed_s = time.perf_counter() - begun
         _print(maps, answers, as_json=as_json, verbose=verbose, listed=len(maps) > 1)
         if verbose:
-            click.echo(f"estimate: {took_s:.3f} s", err=True)
-    failed = [one.exit_code for one in answers if isinstance(one, Failure)]
-    return failed[0] if failed else max(one.exit_code for one in answers)
+            click.echo(f"estimate: {elapsed_s:.3f} s", err=True)
+    failures = [one.exit_code for one in answers if isinstance(one, Failure)]
+    return failures[0] if failures else max(one.exit_code for one in answers)
 
 
 def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, scheduler: str | None) -> Answers:
-    chosen = open_executor(workers=min(workers, len(maps)), cluster=scheduler)
-    with chosen as executor, progress_bar("maps") as progress:
-        outcomes = run_batch(
-            partial(answer_file, settings=settings), maps, key=str, executor=executor, progress=progress
-        )
-    return _answers(outcomes)
+    work = partial(answer_file, settings=settings)
+    with (
+        open_executor(workers=min(workers, len(maps)), cluster=scheduler) as executor,
+        progress_bar("maps") as progress,
+    ):
+        return _answers(run_batch(work, maps, key=str, executor=executor, progress=progress))
 
 
-def _answers(outcomes: Iterable[Outcome[Answer | Failure]]) -> Answers:
+def _answers(outcomes: Sequence[Outcome[Answer | Failure]]) -> Answers:
     """Answers for all maps; maps with the same error of the batch are named together in the first's answer."""
-    found = list(outcomes)
-    lines = dict(zip(dict.fromkeys(one.error for one in found if not one.ok), fault_lines(found), strict=True))
-    faults = (lines.pop(one.error, "") if not one.ok else "" for one in found)
+    lines = dict(zip(dict.fromkeys(one.error for one in outcomes if not one.ok), fault_lines(outcomes), strict=True))
+    faults = (lines.pop(one.error, "") if not one.ok else "" for one in outcomes)
     return [
         one.value if one.value is not None else Failure(f"error: {fault}" if fault else "", EXIT_FAULT)
-        for one, fault in zip(found, faults, strict=True)
+        for one, fault in zip(outcomes, faults, strict=True)
     ]
 
 
 def _print(maps: Sequence[Path], answers: Answers, *, as_json: bool, verbose: bool, listed: bool) -> None:
     """Print errors on stderr and answers on stdout: in full with `verbose`, `listed` for several maps."""
-    for one in answers:
-        if isinstance(one, Failure) and one.text:
-            click.echo(one.text, err=True)
+    for answer in answers:
+        if isinstance(answer, Failure) and answer.text:
+            click.echo(answer.text, err=True)
     if as_json:
         documents = [one.report.checked().document for one in answers if isinstance(one, Answer)]
         click.echo(dump_json(documents if listed else documents[0]), nl=False)
@@ -161,4 +161,4 @@ def _print(maps: Sequence[Path], answers: Answers, *, as_json: bool, verbose: bo
         for path, one in zip(maps, answers, strict=True)
         if isinstance(one, Answer)
     ]
-    click.echo("\n".join([*(one.replace(f"{RESEARCH_USE}\n", "") for one in texts[:-1]), *texts[-1:]]), nl=False)
+    click.echo("\n".join([*(text.replace(f"{RESEARCH_USE}\n", "") for text in texts[:-1]), *texts[-1:]]), nl=False)

@@ -26,14 +26,14 @@ from tactile_bayes.mapping.arrangement import check_scan
 from tactile_bayes.options import FitSettings
 from tactile_bayes.presets import RESEARCH_USE
 
-_OF_RECORDING: Final = ("data_lost", "recorder_noted", "times_apart")
-"""Findings of a phantom's scan that say nothing against its head."""
+_RECORDING_FINDINGS: Final = ("data_lost", "recorder_noted", "times_apart")
+"""Findings of a phantom's scan that do not speak against its head."""
 
 
 def check_action(
     *, scans: tuple[Path, ...], pressure_window_kpa: tuple[float, float], output: Path | None, force: bool
 ) -> None:
-    """Check that scans are what an exam can be, and array, lever arm and quaternions as they are stated."""
+    """Check that scans can be exams, and that array, lever arm and quaternions are as stated."""
     wrong = 0
     if output is not None:
         if len(scans) > 1:
@@ -47,16 +47,16 @@ def check_action(
             click.echo(f"  {line}")
         wrong += check.refused
         if output is not None:
-            if check.too_short or check.findings or any(one.kind not in _OF_RECORDING for one in check.doubts):
-                what = "the scan does not show that its head is right"
-                raise BadDataError(what, way_out="scan a phantom with a lump")
+            if check.too_short or check.findings or any(one.kind not in _RECORDING_FINDINGS for one in check.doubts):
+                fault = "the scan does not show that its head is right"
+                raise BadDataError(fault, way_out="scan a phantom with a lump")
             day = datetime.now(tz=UTC).date().isoformat()
             write_head(output, replace(scan.head, checked_on=day), force=force)
             click.echo(f"{output}: the head, checked on {day}")
     click.echo(RESEARCH_USE)
     if wrong:
-        which = f"{wrong} of {len(scans)} scans are" if len(scans) > 1 else "the scan is"
-        raise BadDataError(f"{which} not arranged as stated", way_out="correct what is named above")
+        subject = f"{wrong} of {len(scans)} scans are" if len(scans) > 1 else "the scan is"
+        raise BadDataError(f"{subject} not arranged as stated", way_out="correct what is named above")
 
 
 def diagnose_action(
@@ -64,11 +64,11 @@ def diagnose_action(
 ) -> None:
     """Check the draws of a posterior: R-hat, effective draws and Monte-Carlo errors of every size and width."""
     figures = {"rank": rank, "trace": trace, "corner": corner}  # ranks first: they may be refused
-    asked = {kind: path for kind, path in figures.items() if path is not None}
-    found = diagnose(posterior)
-    for kind, path in asked.items():
-        found.plot(kind, path, force=force)
-    click.echo(dump_json(found.document) if as_json else found.text, nl=False)
+    diagnosis = diagnose(posterior)
+    for kind, path in figures.items():
+        if path is not None:
+            diagnosis.plot(kind, path, force=force)
+    click.echo(dump_json(diagnosis.document) if as_json else diagnosis.text, nl=False)
 
 
 EMBEDDED = ("scan.mcap", "phantoms.csv", "trial.csv", "excision.csv", "scene.toml", "empty.toml")
@@ -78,19 +78,21 @@ PROGRAM = "tactile-bayes"
 def demo_action(output: Path, method: str, force: bool) -> None:
     """Run the main job on an embedded scan: map, estimate, and the report of a trial."""
 
-    def step(told: str, command: click.Command, *words: str) -> None:
-        """Run a step and print it as the command that does it by hand; typed again, that meets what the demo made."""
+    def step(title: str, command: click.Command, *words: str) -> None:
+        """Run a step and print its command; with --force, as the demo's own files exist when it is typed again."""
         typed = [str(Path(word.format(output))) for word in words]  # ./map.nc is map.nc
-        click.echo(f"\n{told}\n\n$ {PROGRAM} {shlex.join([str(command.name), *typed, '--force'])}")
+        click.echo(f"\n{title}\n\n$ {PROGRAM} {shlex.join([str(command.name), *typed, '--force'])}")
         with command.make_context(command.name, typed + ["--force"] * force) as context:
             command.invoke(context)
         click.echo()
 
     _prepare(output, force=force)
-    recorded = read_scan_report(output / "scan.mcap").truth
-    assert recorded is not None  # the embedded scan is simulated
-    truth = float(recorded["lumps"][0]["d_mm"])
-    click.echo(f"The scan is simulated: a ball of {truth:g} mm in a breast of fat and gland ({output / 'scene.toml'}).")
+    truth = read_scan_report(output / "scan.mcap").truth
+    assert truth is not None  # the embedded scan is simulated
+    true_mm = float(truth["lumps"][0]["d_mm"])
+    click.echo(
+        f"The scan is simulated: a ball of {true_mm:g} mm in a breast of fat and gland ({output / 'scene.toml'})."
+    )
     click.echo(f"Each step is printed as the command that repeats it by hand.{_how_to_type()}")
     step(
         "1. Build the tactile map: all readings of the scan, averaged in cells of 1 mm.",
@@ -112,15 +114,15 @@ def demo_action(output: Path, method: str, force: bool) -> None:
         "-o", "{}/trial.json", "--html", "{}/trial.html",
     )  # fmt: skip
     default, paper = (read_stated_size(output / f"{name}.nc") for name in ("posterior", "posterior_eq6"))
-    click.echo(_summary(truth, {"estimate, the default": default, "the paper's Eq 6": paper}))
-    click.echo(_apart(default, paper))
+    click.echo(_sizes_table(true_mm, {"estimate, the default": default, "the paper's Eq 6": paper}))
+    click.echo(_difference_words(default, paper))
     click.echo(f"Written to {output}: {', '.join(sorted(path.name for path in output.iterdir()))}.")
     click.echo(f"Your own data: `{PROGRAM} import --help` says how arrays, grids and images come in.")
     click.echo(RESEARCH_USE)
 
 
 def _prepare(output: Path, *, force: bool) -> None:
-    """Copy the embedded inputs to where the user can look at them."""
+    """Copy the embedded inputs to the output folder, which must be new or empty unless `force`."""
     if output.exists() and not output.is_dir():
         raise UsageError(f"{output} is a file; choose another name")
     if output.exists() and any(output.iterdir()) and not force:
@@ -134,7 +136,7 @@ def _prepare(output: Path, *, force: bool) -> None:
 
 
 def _how_to_type(which: Callable[[str], str | None] = shutil.which) -> str:
-    """Command to type where the program is not on the PATH, as after `make demo`; else empty."""
+    """The command to type where the program is not on the PATH, as after `make demo`; else empty."""
     if which(PROGRAM):
         return ""
     started = Path(sys.argv[0])
@@ -142,8 +144,8 @@ def _how_to_type(which: Callable[[str], str | None] = shutil.which) -> str:
     return f" {PROGRAM} is not on your PATH: type {typed} for it."
 
 
-def _apart(default: StatedSize | None, paper: StatedSize | None) -> str:
-    """How far the paper's road lies from the default, and why one would want either."""
+def _difference_words(default: StatedSize | None, paper: StatedSize | None) -> str:
+    """The difference of the paper's size from the default's in percent, and the use of either."""
     if default is None or paper is None:
         return "One of the two roads has no size; its reason is above."
     share = 100 * (paper.median / default.median - 1.0)
@@ -153,15 +155,15 @@ def _apart(default: StatedSize | None, paper: StatedSize | None) -> str:
     )
 
 
-def _summary(truth_mm: float, results: dict[str, StatedSize | None]) -> str:
+def _sizes_table(true_mm: float, results: dict[str, StatedSize | None]) -> str:
     lines = [
         f"{'Largest size of the lump':28}{'mm':>9}   95 % interval for exams of simulated bodies",
-        f"{'true':28}{truth_mm:>9.1f}",
+        f"{'true':28}{true_mm:>9.1f}",
     ]
     for name, size in results.items():
         if size is None:
             lines.append(f"{name:28}{'none':>9}")
             continue
-        covered = "covers the true size" if size.low <= truth_mm <= size.high else "misses the true size"
+        covered = "covers the true size" if size.low <= true_mm <= size.high else "misses the true size"
         lines.append(f"{name:28}{size.median:>9.1f}   {size.low:.1f} to {size.high:.1f} mm, {covered}")
     return "\n".join(lines)

@@ -34,31 +34,31 @@ def map_action(
             raise UsageError(f"{output} exists; name another with -o, or give --force")
         refuse_existing(output, force=force)
     settings = to_plain(MapOptions(**options), digits=EXACT)
-    marks = [("begun", time.perf_counter())]
+    times = [("begun", time.perf_counter())]
     loaded = [read_scan(path) for path in scans]
     facts = [scan_facts(scan, sha256(path)) for scan, path in zip(loaded, scans, strict=True)]
     inputs = {f"scan_{number}": fact["sha256"] for number, fact in enumerate(facts, start=1)}
     provenance = Provenance("map", settings, inputs, scans=facts)
     for later, earlier in repeated_scans([[facts] for facts in provenance.scans]).items():
         raise UsageError(f"{scans[later]} holds the recording of {scans[earlier]}; give each recording once")
-    marks.append(("read", time.perf_counter()))
+    times.append(("read", time.perf_counter()))
     with progress_bar("frames") as progress:
         tactile_map = build_map(loaded, **options, progress=progress)
-    marks.append(("map", time.perf_counter()))
+    times.append(("map", time.perf_counter()))
     write_map(output, tactile_map, provenance=provenance, force=force)
     try:
         if figure:
             title = f"Tactile map: {named_exam(output.stem, provenance.scans)}"
             map_figure(tactile_map, figure, title=title, force=force)
-        marks.append(("write", time.perf_counter()))
-    finally:  # the map is written, whatever becomes of the figure
+        times.append(("write", time.perf_counter()))
+    finally:  # a figure that cannot be written loses no text
         text = map_text(tactile_map) if verbose else map_summary(tactile_map, written=str(output))
         click.echo(text, nl=False)
         if verbose:
-            for (_, before), (step, after) in pairwise(marks):
+            for (_, before), (step, after) in pairwise(times):
                 click.echo(f"{step}: {after - before:.3f} s", err=True)
 
 
 def default_map_path(scan: Path) -> Path:
-    """Where the map of a scan is written if no one says so: in its folder, and named after it."""
+    """Default path of a scan's map: in the scan's folder and named after it."""
     return scan.parent / ("map.nc" if scan.stem == "scan" else f"{scan.stem}.nc")

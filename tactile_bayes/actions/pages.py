@@ -44,7 +44,7 @@ def compare_action(
     figure: Path | None,
     force: bool,
     verbose: bool,
-    **asked: Any,
+    **options: Any,
 ) -> int:
     """Compare the size of a mass at two visits and more."""
     comparing = CompareOptions(
@@ -53,7 +53,7 @@ def compare_action(
         same_mass=same_mass,
         registration_mm=registration_mm,
     )
-    settings = make_settings(**asked)
+    settings = make_settings(**options)
     visits = [first, *(tuple(path for _, path in group) for _, group in groupby(later, itemgetter(0)))]
     if twice := first_duplicate(path for maps in visits for path in maps):
         raise UsageError(f"{twice} is given twice; give each map once, at its own visit")
@@ -65,24 +65,24 @@ def compare_action(
     page = None if output is None else PageFiles(output, pdf, force)
     if page is not None:
         page.check()
-    done, total = list[list[SizeEstimate]](), sum(len(maps) for maps in visits)
+    estimates, total = list[list[SizeEstimate]](), sum(len(maps) for maps in visits)
     with progress_bar("maps") as progress:
         for maps in visits:
-            done.append([estimate_file(path, settings) for path in maps])
-            progress(sum(map(len, done)), total)
+            estimates.append([estimate_file(path, settings) for path in maps])
+            progress(sum(map(len, estimates)), total)
     names = [[str(path) for path in maps] for maps in visits]
-    found = compare_estimates(done, settings, comparing, names=names, files=visits)
-    found = replace(found, dates=split_dates(dates))
-    report = found.report.checked()
+    comparison = compare_estimates(estimates, settings, comparing, names=names, files=visits)
+    comparison = replace(comparison, dates=split_dates(dates))
+    report = comparison.report.checked()
     text_of = json_text if as_json else compare_text if verbose else compare_summary
     try:
         if page is not None:
-            page.write(found.page_text(title=title, name=name))
+            page.write(comparison.page_text(title=title, name=name))
         if figure is not None:
-            found.plot(figure, force=force)
-    finally:  # what was computed is not lost with the figure
+            comparison.plot(figure, force=force)
+    finally:  # a file that cannot be written loses no result
         click.echo(text_of(report), nl=False)
-    return found.exit_code
+    return comparison.exit_code
 
 
 def report_action(
@@ -94,16 +94,16 @@ def report_action(
     name: str,
     day: str,
     force: bool,
-    **asked: Any,
+    **options: Any,
 ) -> None:
     """Write one page of an exam: the map, the size with its intervals, the place, and how good the exam was."""
-    words, page = Given(title, name, day), PageFiles(output, pdf, force)
+    labels, page = Given(title, name, day), PageFiles(output, pdf, force)
     page.check()
-    typed = [name for name in asked if name in typed_options()]
-    found = exam_from_files(
-        files, lambda: make_settings(**asked), typed=typed, notice=lambda line: click.echo(line, err=True)
+    typed = [name for name in options if name in typed_options()]
+    exam = exam_from_files(
+        files, lambda: make_settings(**options), typed=typed, notice=lambda line: click.echo(line, err=True)
     )
-    exam = replace(found, given=words)
+    exam = replace(exam, given=labels)
     page.write(exam_page(exam))
     if exam.main.tactile_map is None:
         click.echo("note: without its map the page has no picture and no coverage; give MAP.nc too", err=True)
@@ -111,12 +111,12 @@ def report_action(
     click.echo(RESEARCH_USE)
 
 
-def export_action(*, files: tuple[Path, ...], output: Path | None, dictionary: Path | None, **given: Any) -> None:
+def export_action(*, files: tuple[Path, ...], output: Path | None, dictionary: Path | None, **options: Any) -> None:
     """Export maps and estimates as DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap)."""
-    written = export(files, output, dictionary=dictionary, **{name: value for name, value in given.items() if value})
+    written = export(files, output, dictionary=dictionary, **{name: value for name, value in options.items() if value})
     for path in written.paths:
-        is_dictionary = path == dictionary
-        click.echo(f"{path}: {'data dictionary for REDCap' if is_dictionary else f'{path.stat().st_size} bytes'}")
+        contents = "data dictionary for REDCap" if path == dictionary else f"{path.stat().st_size} bytes"
+        click.echo(f"{path}: {contents}")
     for note in written.notes:
         click.echo(f"note: {note}", err=True)
     click.echo(RESEARCH_USE)

@@ -49,17 +49,17 @@ from tactile_bayes.studies.estimate_tradeoff import (
 
 def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> tuple[PooledRow, ...]:
     """The size by the first map of one mass, by the first two, and so on."""
-    rows, found, spent = [], list[SizeEstimate](), 0.0
+    rows, estimates, estimating_s = [], list[SizeEstimate](), 0.0
     for number, path in enumerate(paths, start=1):
         begun = clock()
-        found.append(estimate_file(path, settings))
-        assert found[-1].answer.report is not None  # made here: its time is the estimate's, not the pooling's
-        spent += clock() - begun
+        estimates.append(estimate_file(path, settings))
+        assert estimates[-1].answer.report is not None  # made here: its time is the estimate's, not the pooling's
+        estimating_s += clock() - begun
         begun = clock()
-        together = pool_estimates(found, settings, names=[one.stem for one in paths[:number]])
-        found = list(together.maps)
-        pooling = clock() - begun
-        rows.append(PooledRow(number, spent + pooling, *_pooled_answer(together.pooled, settings)))
+        pool = pool_estimates(estimates, settings, names=[one.stem for one in paths[:number]])
+        estimates = list(pool.maps)
+        pooling_s = clock() - begun
+        rows.append(PooledRow(number, estimating_s + pooling_s, *_pooled_answer(pool.pooled, settings)))
     return tuple(rows)
 
 
@@ -67,8 +67,8 @@ def _pooled_answer(pooled: PooledEstimate, settings: Settings) -> tuple[SizeAnsw
     """The size of this exam, and half the width of the interval of another one."""
     if pooled.size is None:
         return no_number(pooled.reason), None
-    found = {SIZE: pooled.size.summarise(SIZE, probability=settings.interval)}
-    answer = SizeAnswer("", None, settings.method, intervals(found), pooled.size.variance_share)
+    size = {SIZE: pooled.size.summarise(SIZE, probability=settings.interval)}
+    answer = SizeAnswer("", None, settings.method, intervals(size), pooled.size.variance_share)
     if pooled.size.another_exam is None:
         return answer, None
     another = pooled.size.another_exam.summarise(SIZE, probability=settings.interval)
@@ -79,7 +79,7 @@ TIMES = 2
 
 
 def fresh_cpu_s(words: Sequence[str]) -> float | None:
-    """Least CPU seconds of a command in a fresh process, as its user waits for it; None where nobody tells them."""
+    """Least CPU seconds of a command in a fresh process, its start included; None where the system counts none."""
     spent = []
     for _ in range(TIMES):
         before = os.times()
@@ -97,11 +97,11 @@ def fresh_cpu_s(words: Sequence[str]) -> float | None:
 
 
 def forecast(seconds: float) -> None:
-    """Say on stderr how long it will take."""
+    """Print on stderr the CPU seconds to go."""
     click.echo(f"about {max(round(seconds), 1)} s of CPU to go", err=True)
 
 
-def show(
+def _show(
     ladders: Mapping[str, Ladder],
     *,
     varied: Varied,
@@ -110,17 +110,17 @@ def show(
     force: bool,
     provenance: Sequence[Provenance],
 ) -> int:
-    """Draw and print ladders, by their titles, each with its provenance; the exit code."""
+    """Draw and print ladders by their titles, each with its provenance; return the exit code."""
     try:
         if figure is not None:
             draw_ladders(ladders, figure, force=force)
-    finally:  # what was measured is not lost with the figure
+    finally:  # a figure that cannot be written loses no result
         if as_json:
-            found = [
-                to_plain(ladder_file(one, varied=varied, provenance=made.as_dict()), digits=DIGITS)
-                for one, made in zip(ladders.values(), provenance, strict=True)
+            documents = [
+                to_plain(ladder_file(ladder, varied=varied, provenance=record.as_dict()), digits=DIGITS)
+                for ladder, record in zip(ladders.values(), provenance, strict=True)
             ]
-            click.echo(dump_json(found[0] if len(found) == 1 else found), nl=False)
+            click.echo(dump_json(documents[0] if len(documents) == 1 else documents), nl=False)
         else:
             click.echo(tradeoff_text(ladders))
     return EXIT_DONE if all(one.reference.answer for one in ladders.values()) else EXIT_NO_ESTIMATE
@@ -147,27 +147,29 @@ def tradeoff_forward_action(
         drawn = Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)) if scene is None else read_scene(scene)
         case = tradeoffs.case_of(drawn, head=head)
     # a raster's frames are divided by their means
-    own = {tradeoffs.PLANE: "plane-strain", tradeoffs.SOLID: "solid-mean"}
-    rules = {model: _rule(case, model, size_calibration or name) for model, name in own.items()}
-    found = {model: _climbed(case, model, rule, tolerance_percent / 100, runs) for model, rule in rules.items()}
-    plane = found[tradeoffs.PLANE]
-    notes = (*plane.notes, tradeoffs.dimensions_note(case, plane, found[tradeoffs.SOLID], rules))
+    default_rules = {tradeoffs.PLANE: "plane-strain", tradeoffs.SOLID: "solid-mean"}
+    rules = {model: _rule(case, model, size_calibration or name) for model, name in default_rules.items()}
+    ladder_by_model = {
+        model: _measure_forward(case, model, rule, tolerance_percent / 100, runs) for model, rule in rules.items()
+    }
+    plane = ladder_by_model[tradeoffs.PLANE]
+    notes = (*plane.notes, tradeoffs.dimensions_note(case, plane, ladder_by_model[tradeoffs.SOLID], rules))
     warning = outside_range(case.d_mm, case.depth_ratio)
-    found[tradeoffs.PLANE] = replace(plane, notes=(*notes, f"{warning}.") if warning else notes)
+    ladder_by_model[tradeoffs.PLANE] = replace(plane, notes=(*notes, f"{warning}.") if warning else notes)
     lump = {name: getattr(case, name) for name in ("d_mm", "depth_ratio", "stiffness_ratio", "seat")}
     words = f"lump of {case.d_mm:g} mm, h/d {case.depth_ratio:g}, {case.stiffness_ratio:g} times as stiff as fat"
     ladders, provenance, inputs = {}, [], hash_inputs(scene=scene)
-    for model, ladder in found.items():
+    for model, ladder in ladder_by_model.items():
         shoulders, rule = case.of(model).head.shoulders, rules[model]
         ladders[f"{model}: {words}, {paper.seat_name(case.seat)}; head: {shoulders}"] = ladder
-        kept = {"model": model, **lump, "head": shoulders, "size_calibration": size_calibration}
-        kept |= {"sizes_by": rule.source, "sd_ln_d": finite(rule.scatter)}
-        kept |= {"tolerance_percent": tolerance_percent, "runs": runs}
-        provenance.append(Provenance("tradeoff forward", kept, inputs))
-    return show(ladders, varied="forward", figure=figure, as_json=as_json, force=force, provenance=provenance)
+        settings = {"model": model, **lump, "head": shoulders, "size_calibration": size_calibration}
+        settings |= {"sizes_by": rule.source, "sd_ln_d": finite(rule.scatter)}
+        settings |= {"tolerance_percent": tolerance_percent, "runs": runs}
+        provenance.append(Provenance("tradeoff forward", settings, inputs))
+    return _show(ladders, varied="forward", figure=figure, as_json=as_json, force=force, provenance=provenance)
 
 
-def _climbed(case: tradeoffs.LumpCase, model: str, rule: tradeoffs.SizeRule, share: float, runs: int) -> Ladder:
+def _measure_forward(case: tradeoffs.LumpCase, model: str, rule: tradeoffs.SizeRule, share: float, runs: int) -> Ladder:
     with progress_bar(f"settings, {model}") as progress:
         work = Work(time.process_time, share, runs, progress=progress)
         return tradeoffs.measure_forward(case, model, rule, share=share, work=work)
@@ -225,7 +227,7 @@ def tradeoff_estimate_action(
     kept = {"size_calibration": size_calibration, "tolerance_mm": tolerance_mm, "runs": runs}
     provenance = [Provenance("tradeoff estimate", kept, inputs, seed=seed)]
     ladders = {f"{maps[0].stem}: what more time for `estimate` buys": ladder}
-    return show(ladders, varied="estimate", figure=figure, as_json=as_json, force=force, provenance=provenance)
+    return _show(ladders, varied="estimate", figure=figure, as_json=as_json, force=force, provenance=provenance)
 
 
 def tradeoff_map_action(
@@ -244,4 +246,4 @@ def tradeoff_map_action(
     kept = {"tolerance_mm": tolerance_mm, "runs": runs}
     provenance = [Provenance("tradeoff map", kept, hash_inputs(scan=scan), seed=seed)]
     ladders = {f"{scan.stem}: what finer cells and more frames buy": ladder}
-    return show(ladders, varied="map", figure=figure, as_json=as_json, force=force, provenance=provenance)
+    return _show(ladders, varied="map", figure=figure, as_json=as_json, force=force, provenance=provenance)

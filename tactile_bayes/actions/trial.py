@@ -36,17 +36,17 @@ def validate_action(
     title, chosen = settings_by(protocol, settings, typed=typed_options())
     inputs = load_trial(trial, excision, columns)
     protect_inputs(*inputs.files.values())
-    found = analyse(inputs, chosen, protocol=protocol, title=title)
+    analysis = analyse(inputs, chosen, protocol=protocol, title=title)
     try:
         if output:
-            found.write_json(output, force=force)
+            analysis.write_json(output, force=force)
         if html:
-            found.write_html(html, pdf=pdf, force=force)
-    finally:  # what was computed is not lost with a file
+            analysis.write_html(html, pdf=pdf, force=force)
+    finally:  # a file that cannot be written loses no result
         if as_json:
-            for doubt in found.report.doubts:
+            for doubt in analysis.report.doubts:
                 click.echo(f"doubtful: {doubt}", err=True)
-        click.echo(dump_json(found.document) if as_json else found.told(methods=methods), nl=False)
+        click.echo(dump_json(analysis.document) if as_json else analysis.told(methods=methods), nl=False)
 
 
 def plan_action(
@@ -59,18 +59,18 @@ def plan_action(
     **options: Any,
 ) -> None:
     """Plan a trial: power, widths of intervals and the worth of more maps, by simulation."""
-    given = {name: options[name] for name in options.keys() & typed_options()}
-    read = read_pilot(pilot, excision, given.get("against"))
-    if read is not None:
-        protect_inputs(*read.trial.files.values())
-        for doubt in read.doubts():
+    typed = {name: options[name] for name in options.keys() & typed_options()}
+    errors = read_pilot(pilot, excision, typed.get("against"))
+    if errors is not None:
+        protect_inputs(*errors.trial.files.values())
+        for doubt in errors.doubts():
             click.echo(f"{pilot}: {doubt}", err=True)
     with progress_bar("designs") as progress:
-        found = planned(given, read, progress)
+        plan = planned(typed, errors, progress)
     try:
         if output:
-            found.write_json(output, force=force)
+            plan.write_json(output, force=force)
         if figure:
-            found.draw(figure, force=force)
-    finally:  # what was computed is not lost with the file
-        click.echo(dump_json(found.document) if as_json else found.text, nl=False)
+            plan.draw(figure, force=force)
+    finally:  # a file that cannot be written loses no result
+        click.echo(dump_json(plan.document) if as_json else plan.text, nl=False)
