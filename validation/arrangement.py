@@ -53,7 +53,7 @@ def mistaken(scan: Scan, mistake: str) -> Scan:
 def answered(scan: Scan, mistake: str) -> str:
     """Which of `ANSWERS` the check gives."""
     check = check_scan(mistaken(scan, mistake), thorough=False)
-    if check.too_short or (check.says_nothing and not check.contradicting):
+    if check.too_short or (check.inconclusive and not check.contradicting):
         return "not shown"
     if check.contradicting:
         return "contradiction"

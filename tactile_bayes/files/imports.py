@@ -24,7 +24,7 @@ from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.scan_text import is_identity, read_frames, read_poses, visible_poses
 from tactile_bayes.files.sequence_mha import is_sequence, read_sequence
 from tactile_bayes.geometry import FloatArray, check_rigid
-from tactile_bayes.mapping.select import other_units
+from tactile_bayes.mapping.select import unit_question
 from tactile_bayes.presets import KPA_PER_UNIT, MM_PER_UNIT, PRESSURE_RANGE_KPA, PRESSURE_WINDOW_KPA
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
@@ -370,7 +370,7 @@ def _pressure_note(kpa: FloatArray, unit: str, *, rounding: str) -> str:
     pressed = means[means >= means.max() / 2]
     low, high = np.quantile(pressed, [0.05, 0.95]) / KPA_PER_UNIT[unit]
     middle = float(np.median(pressed))
-    question = other_units(middle, unit, PRESSURE_WINDOW_KPA)
+    question = unit_question(middle, unit, PRESSURE_WINDOW_KPA)
     means_of = f"pressed ones have means of {low:.3g} to {high:.3g} {unit}"
     if middle >= PRESSURE_RANGE_KPA[1]:
         what = f"frames in {unit}: {means_of}, and an array's range ends at {PRESSURE_RANGE_KPA[1]:g} kPa"

@@ -16,7 +16,7 @@ from tactile_bayes.errors import DeviceError
 from tactile_bayes.geometry import FloatArray, inverse, rotation_from_quaternion
 from tactile_bayes.hardware import readings
 from tactile_bayes.hardware.ports import SILENT_S, Port, Stream
-from tactile_bayes.mapping.select import Jumps, Span, apart, overlap_cautions
+from tactile_bayes.mapping.select import Jumps, Span, disjoint, overlap_cautions
 
 # --- Summary of a recording: what arrived, what was lost, and what makes it unfit for use.
 
@@ -447,7 +447,7 @@ class Recorder:
         report.cautions += self._jumps.cautions()
         if self.head.parser.fault:
             report.cautions.append(f"the head's line: {self.head.parser.fault}")
-        if self.tracker is not None and report.frames and not report.fault and apart(*spans):
+        if self.tracker is not None and report.frames and not report.fault and disjoint(*spans):
             missing = f" ({report.poses_missing:,} missing: {report.missing_why})" if report.poses_missing else ""
             none = f"none of its {report.poses} poses was measured while frames came"
             report.fault = f"{self.tracker.port.name}: {none}{missing}"

@@ -14,7 +14,7 @@ from tactile_bayes.geometry import BoolArray, FloatArray, Plane, apply, inverse,
 from tactile_bayes.mapping import accumulate, latency, select
 from tactile_bayes.mapping.arrangement import check_arrangement
 from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, CellSums, HeadMoments, head_moments
-from tactile_bayes.mapping.convention import check_convention, convention_findings, hint
+from tactile_bayes.mapping.convention import check_convention, convention_findings, convention_way_out
 from tactile_bayes.mapping.map import FEW_READINGS, MapRecipe, TactileMap, broken_assumptions, handling_findings, smooth
 from tactile_bayes.mapping.plausibility import exam_figures, exam_findings, map_findings, with_cause
 from tactile_bayes.mapping.profile import evenness_figures, head_profile_figures, motion, pose_noise_figures
@@ -257,7 +257,7 @@ def _plane(selections: list[SelectedFrames]) -> Plane:
     except BadDataError as error:
         if "quaternion order" not in error.way_out:
             raise
-        raise BadDataError(error.what, way_out=hint(selections)) from None
+        raise BadDataError(error.what, way_out=convention_way_out(selections)) from None
 
 
 def _check_same_examination(scans: list[Scan]) -> None:

@@ -1,4 +1,4 @@
-"""Does a scan follow our conventions, and is it fine enough? Quaternions and coarse frames."""
+"""Frames averaged for comparison, strokes of the head, and the check of a tracker's rotation convention."""
 
 from __future__ import annotations
 
@@ -17,30 +17,27 @@ from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, Projection
 from tactile_bayes.mapping.select import SelectedFrames, chunks
 from tactile_bayes.scans import TrackerPoses
 
-# --- Frames averaged over 20 ms and over 2 x 2 taxels: all that finding shifts of a millimetre needs, in a tenth of it.
+# --- Frames averaged over 20 ms and over 2 x 2 taxels: enough to find shifts of a millimetre, in a tenth of the time.
 
 POOL_S = 0.02
 POOL_TAXELS = 2
-SHARED_S = 0.2  #: Neighbouring frames share errors over less than this.
-LEAST_REACH_MM = 10.0  #: A stroke is a run in one direction over at least this far.
+SHARED_S = 0.2  #: Frames further apart than this have independent errors.
+LEAST_REACH_MM = 10.0  #: Least length of a stroke, a run in one direction.
 _CHUNK = 512
 
 
 def stretches(time_s: FloatArray) -> IndexArray:
-    """(n,) which stretch of `POOL_S` each frame lies in, counting those that hold a frame; times rise.
-
-    Not by the clock: of frames that come regularly, but less often, every so-many-th stretch might hold none.
-    """
+    """(n,) number of the stretch of `POOL_S` of each frame, counting stretches with frames only; times rise."""
     return np.cumsum(np.diff(_slot(time_s), prepend=_slot(time_s[:1])) != 0)
 
 
 def thinning(times_s: Iterable[FloatArray], *, most: int) -> int:
-    """The n of "every nth stretch is averaged" so that scans with frames at these times give about `most` at most."""
-    return max(1, -(-sum(int(stretches(one)[-1]) + 1 for one in times_s if len(one)) // most))
+    """Least n so that every nth stretch of scans with frames at these times gives about `most` averages or fewer."""
+    return max(1, -(-sum(int(stretches(time)[-1]) + 1 for time in times_s if len(time)) // most))
 
 
 def every_stretch(time_s: FloatArray, every: int) -> IndexArray:
-    """Indices of the frames in every so-many-th of the `stretches`, at least of one; the clock says in which first."""
+    """Indices of the frames in every `every`-th of the `stretches`, at least one; the clock decides which is first."""
     number = stretches(time_s)
     chosen = (_slot(time_s[:1]) + number) % every == 0
     return np.flatnonzero(chosen if chosen.any() else number == 0)
@@ -51,22 +48,21 @@ def _slot(time_s: FloatArray) -> FloatArray:
 
 
 class CoarseFrames(Record, eq=False, dict=True):
-    """Some frames of one scan, averaged."""
+    """Frames of one scan, averaged over `POOL_S` and over blocks of taxels."""
 
     pressure: FloatArray
     """(m, k) array: Mean over a block of frames and a block of taxels, each frame over its own mean."""
-    frames: IndexArray  #: (n,) int array: The scan's frames that were averaged.
-    first: IndexArray  #: (m,) int array: Where each block of frames begins among them.
-    block: IndexArray  #: (m,) int array: Which stretch of `SHARED_S` each of these lies in.
+    frames: IndexArray  #: (n,) int array: Indices in the scan of the frames that are averaged.
+    first: IndexArray  #: (m,) int array: Index among them where each block of frames begins.
+    block: IndexArray  #: (m,) int array: Number of the stretch of `SHARED_S` of each block of frames.
     taxels: IndexArray  #: (t,) int array: Flat indices of the good taxels.
-    weight: FloatArray  #: (t, k) array: Share of each in each block of taxels; columns add up to 1.
-    row: IndexArray  #: (k,) int array: Which rows of the head a block of taxels is of.
-    basis: FloatArray  #: (k, 6) array: Orthonormal: a level, two slopes and three curvatures over the head's blocks.
+    weight: FloatArray  #: (t, k) array: Share of each taxel in each block of taxels; columns add up to 1.
+    row: IndexArray  #: (k,) int array: Number of the pair of the head's rows of each block of taxels.
+    basis: FloatArray  #: (k, 6) array: Orthonormal level, two slopes and three curvatures over the head's blocks.
 
     @classmethod
     def of(cls, selection: SelectedFrames, frames: IndexArray) -> CoarseFrames:
-        """Average the given frames of a scan, in the order of time; the few saturated readings count as their frame's
-        mean."""
+        """Average frames of a scan, in the order of time; the few saturated readings count as their frame's mean."""
         scan = selection.scan
         weight, row, basis = _taxel_blocks(selection.good_taxels)
         first = np.flatnonzero(np.diff(stretches(scan.frames.time_s[frames]), prepend=-1))
@@ -82,18 +78,15 @@ class CoarseFrames(Record, eq=False, dict=True):
 
     @cached_property
     def varying(self) -> FloatArray:
-        """(m, k) readings without what frames and taxels add: what they say of the breast, and noise."""
+        """(m, k) readings without the level and shape of each frame and the offset of each block of taxels."""
         return self.without_head(self.pressure)
 
     def without_head(self, values: FloatArray) -> FloatArray:
-        """(m, k) values without a level, slopes and curvatures of each frame and an offset of each block of taxels.
-
-        Both are projections and commute: together they take off the least-squares fit of the two.
-        """
-        return self.within_frames(values - values.mean(axis=0))
+        """(m, k) values less their least-squares fit by a quadratic per frame and an offset per block of taxels."""
+        return self.within_frames(values - values.mean(axis=0))  # both are projections, and commute
 
     def within_frames(self, values: FloatArray) -> FloatArray:
-        """(m, k) values without their level, slopes and curvatures in each frame."""
+        """(m, k) values less their least-squares fit by a quadratic over the head in each frame."""
         return np.asarray(values - (values @ self.basis) @ self.basis.T)
 
     def places_mm(self, projection: Projection) -> FloatArray:
@@ -115,12 +108,6 @@ def _taxel_blocks(good: BoolArray) -> tuple[FloatArray, IndexArray, FloatArray]:
     return weight, blocks // good.shape[1], np.linalg.qr(np.stack(terms, axis=1))[0]
 
 
-def numbered_on(blocks: Sequence[IndexArray]) -> IndexArray:
-    """The scans' blocks, counted on from one scan to the next."""
-    starts = np.cumsum([0, *(int(one.max()) + 1 for one in blocks)])
-    return np.concatenate([one + start for one, start in zip(blocks, starts, strict=False)])
-
-
 def block_means(values: FloatArray, first: IndexArray) -> FloatArray:
     """(m, k) means of the rows of (n, k) values from each `first` up to the next."""
     counts = np.diff(np.append(first, len(values)))
@@ -128,10 +115,7 @@ def block_means(values: FloatArray, first: IndexArray) -> FloatArray:
 
 
 def stroke_starts(x_mm: FloatArray) -> list[int]:
-    """Indices where runs in one direction begin along (n,) positions of the head, and the end of the last run.
-
-    A turn is part of the run before.
-    """
+    """Indices where runs in one direction begin along (n,) positions, and the last one's end; a turn ends a run."""
     ends, start, far = [0], 0, 0
     for i in range(len(x_mm)):
         rising = x_mm[far] >= x_mm[start]
@@ -146,41 +130,41 @@ def stroke_starts(x_mm: FloatArray) -> list[int]:
 
 
 def strokes_along(x_mm: FloatArray) -> list[tuple[int, int, int]]:
-    """First index, end and way of each stroke along (n,) positions of the head: +1 towards +x, else -1."""
+    """First index, end and direction (1 towards +x, else -1) of each stroke along (n,) positions of the head."""
     ends = pairwise(stroke_starts(x_mm))
     return [(a, b, 1 if x_mm[min(b, len(x_mm) - 1)] >= x_mm[a] else -1) for a, b in ends if b > a]
 
 
-def ways_along(x_mm: FloatArray) -> FloatArray:
-    """(n,) way of the stroke that each of (n,) positions is of."""
-    way = np.ones(len(x_mm))
+def directions_along(x_mm: FloatArray) -> FloatArray:
+    """(n,) direction of the stroke of each of (n,) positions."""
+    directions = np.ones(len(x_mm))
     for start, stop, direction in strokes_along(x_mm):
-        way[start:stop] = direction
-    return way
+        directions[start:stop] = direction
+    return directions
 
 
 # --- Check of a tracker's rotation convention (order and sense) against the motion of the head.
 
 DECLARED = "scalar first"
-# What a file may hold instead of (w, x, y, z) from the sensor to the base: which of `CORRECTIONS` make it ours.
+# Conventions of files for rotations, and the `CORRECTIONS` that turn each into ours: (w, x, y, z), from sensor to base.
 CONVENTIONS: Final[Mapping[str, tuple[str, ...]]] = {
     DECLARED: (),
     "scalar last": ("scalar-last",),
     "scalar first, of the inverse rotation": ("inverse-rotation",),
     "scalar last, of the inverse rotation": ("scalar-last", "inverse-rotation"),
 }
-# A head slides along its face: the mean normal of the face and the normal of the motion agree at least so well.
+# Least inner product of the mean normal of the face and the normal of the motion: a head slides along its face.
 AGREEMENT = 0.9
-# Strokes far round a curved breast turn the face by 45 degrees either way, which leaves this much of its mean normal.
+# The least in any convention: strokes far round a curved breast turn the face by 45 degrees either way.
 LEAST_AGREEMENT = 0.8
-# Another convention that agrees better by this, and nearly wholly, is reported: by chance that is rare.
+# Another convention is reported that agrees better by this and to more than that: by chance that is rare.
 BETTER_BY = 0.005
 NEARLY_WHOLE = 0.98
-LEAST_SPREAD_MM = 3.0  #: A motion narrower than this across its longest way (SD, mm) has no normal.
+LEAST_SPREAD_MM = 3.0  #: A motion narrower than this across its longest axis (SD, mm) has no normal.
 
 
 def corrected_quaternions(wxyz: FloatArray, corrections: Iterable[str]) -> FloatArray:
-    """(n, 4) quaternions once the corrections of a convention are made."""
+    """(n, 4) quaternions with the corrections of a convention made."""
     for name in corrections:
         wxyz = wxyz[:, [3, 0, 1, 2]] if name == "scalar-last" else wxyz * [1.0, -1.0, -1.0, -1.0]
     return wxyz
@@ -192,34 +176,23 @@ def import_again(corrections: Iterable[str]) -> str:
 
 
 def convention_agreement(selections: Sequence[SelectedFrames]) -> dict[str, float]:
-    """Absolute inner product of the sensor's and the motion's normal, under each of `CONVENTIONS`.
+    """Absolute inner product of the face's mean normal and the motion's normal, under each of `CONVENTIONS`.
 
-    Below `AGREEMENT` a convention cannot be the right one.
-
-    The motion's normal is that of the places of the head's apex at the used frames, which need the rotation for the
-    lever arm; over soft tissue a head sinks as far as it slides from line to line, so it may also be that of the
-    places less what is linear in the pressure. The sensor's normal is the mean of the face's, so that rotations that
-    contradict each other count against. Empty where the motion has no normal: too few poses, or all along a line.
+    Empty where the motion has no normal: too few poses, or all along a line (record 0048).
     """
-    poses = [(part, _near_used(part)) for part in selections]
-    if sum(len(one) for _, one in poses) < 3:
+    parts = [(part, _poses_near_used(part)) for part in selections]
+    if sum(len(poses) for _, poses in parts) < 3:
         return {}
-    agreement = {name: _agreement(poses, corrections) for name, corrections in CONVENTIONS.items()}
+    agreement = {name: _agreement(parts, corrections) for name, corrections in CONVENTIONS.items()}
     return agreement if np.isfinite(agreement[DECLARED]) else {}
 
 
 def check_convention(selections: Sequence[SelectedFrames]) -> dict[str, float]:
-    """Refuse rotations that cannot follow the declared convention; name the one that agrees best.
+    """Figures of a map on its rotations; those that cannot follow the declared convention are a `BadDataError`.
 
-    Gives ``normal_agreement`` of the rotations as declared, and ``other_convention`` (its number among `CONVENTIONS`)
-    and ``other_agreement`` where another one agrees better; nothing where the motion has no normal. `BadDataError` when
-    the head's face and its motion agree to less than `AGREEMENT` as declared and to more in another convention, or to
-    less than `LEAST_AGREEMENT`.
-
-    Of 900 scans read in a wrong convention, with the tracker mounted and the base turned at random, the refusal finds
-    76 to 90 % and the comparison all but 0 to 3 %; of 300 read rightly none was refused or doubted. With the face
-    leaning on its motion by 8 degrees 1 to 7 % are missed and 3 % doubted, by 15 degrees 11 to 21 and 11 %. Missed are
-    mounts for which the wrong reading, too, turns the face along its motion.
+    ``normal_agreement`` is that of the rotations as declared; where another convention agrees better,
+    ``other_convention`` is its number among `CONVENTIONS` and ``other_agreement`` its agreement. None where the motion
+    has no normal. Limits and rates of errors are in record 0048.
     """
     agreement = convention_agreement(selections)
     if not agreement:
@@ -234,15 +207,12 @@ def check_convention(selections: Sequence[SelectedFrames]) -> dict[str, float]:
     return figures
 
 
-def convention_findings(quality: Mapping[str, float], told: Iterable[Finding] = ()) -> tuple[Finding, ...]:
-    """Findings on a map's rotations from its figures, see `check_convention`; none of a map without a plane.
-
-    `told` is known already: where the frames ask for the same corrections, theirs is the finding.
-    """
+def convention_findings(quality: Mapping[str, float], others: Iterable[Finding] = ()) -> tuple[Finding, ...]:
+    """Findings on a map's rotations from its figures (`check_convention`); none where one of `others` says the same."""
     if "other_convention" in quality:
         other, agreement = list(CONVENTIONS)[int(quality["other_convention"])], quality["other_agreement"]
         options = [f"--correct {name}" for name in CONVENTIONS[other]]
-        if any(one.kind == "wrong_arrangement" and all(map(one.remedy.__contains__, options)) for one in told):
+        if any(one.kind == "wrong_arrangement" and all(map(one.remedy.__contains__, options)) for one in others):
             return ()
         text = "the tracker's rotations seem to be read the wrong way; size and place may be wrong"
         remedy = (
@@ -258,8 +228,8 @@ def convention_findings(quality: Mapping[str, float], told: Iterable[Finding] = 
     return ()
 
 
-def hint(selections: Sequence[SelectedFrames]) -> str:
-    """Sentence for a head that seems not to slide along its face: the convention under which it would."""
+def convention_way_out(selections: Sequence[SelectedFrames]) -> str:
+    """Way out for a head that seems not to slide along its face: the convention under which it would."""
     return _way_out(convention_agreement(selections) or {DECLARED: 0.0})
 
 
@@ -267,12 +237,12 @@ def _way_out(agreement: dict[str, float]) -> str:
     best = max(agreement, key=agreement.__getitem__)
     if best == DECLARED or agreement[best] < AGREEMENT:
         return "check the quaternion order (scalar first) and scanhead_from_tracker"
-    found = f"the quaternions seem to be {best} (agreement {agreement[best]:.2f} of 1)"
-    return f"{found}; {import_again(CONVENTIONS[best])}"
+    seems = f"the quaternions seem to be {best} (agreement {agreement[best]:.2f} of 1)"
+    return f"{seems}; {import_again(CONVENTIONS[best])}"
 
 
-def _near_used(part: SelectedFrames) -> TrackerPoses:
-    """Distinct poses about the used frames; poses before the head reached the skin say nothing."""
+def _poses_near_used(part: SelectedFrames) -> TrackerPoses:
+    """Distinct poses near a used frame, where the head is on the skin."""
     poses = part.fresh
     used = part.scan.frames.time_s[part.used]
     near = np.zeros(len(poses), dtype=bool)
@@ -284,7 +254,11 @@ def _near_used(part: SelectedFrames) -> TrackerPoses:
 
 
 def _agreement(parts: Sequence[tuple[SelectedFrames, TrackerPoses]], corrections: Iterable[str]) -> float:
-    """Absolute inner product of both normals; NaN where the apex hardly moves across its longest direction."""
+    """Absolute inner product of the face's and the motion's normal; NaN where the apex moves along a line.
+
+    The motion is that of the head's apex, and, since a head sinks as it slides over soft tissue, also without what is
+    linear in the pressure; the better counts.
+    """
     normals, places, levels = [], [], []
     for part, poses in parts:
         rotation = rotation_from_quaternion(corrected_quaternions(poses.quaternion_wxyz, corrections))
@@ -295,13 +269,13 @@ def _agreement(parts: Sequence[tuple[SelectedFrames, TrackerPoses]], corrections
         at_frames = part.scan.frames.time_s[known], part.level_kpa[known]
         levels.append(np.interp(poses.time_s, *at_frames) if known.any() else np.zeros(len(poses)))
     normal: FloatArray = np.concatenate(normals).mean(axis=0)
-    raw = np.concatenate(places)
-    agreements = [_along(normal, one) for one in (raw, _without_sinking(raw, np.concatenate(levels)))]
+    path = np.concatenate(places)
+    agreements = [_along(normal, one) for one in (path, _without_sinking(path, np.concatenate(levels)))]
     return float("nan") if np.isnan(agreements[0]) else float(np.nanmax(agreements))
 
 
 def _along(normal: FloatArray, places_mm: FloatArray) -> float:
-    """Absolute inner product with the normal of (n, 3) places; NaN where they lie along a line."""
+    """Absolute inner product of `normal` with the normal of (n, 3) places; NaN where they lie along a line."""
     variances, axes = np.linalg.eigh(np.cov(places_mm.T))
     if not variances[1] > LEAST_SPREAD_MM**2:
         return float("nan")
@@ -309,7 +283,7 @@ def _along(normal: FloatArray, places_mm: FloatArray) -> float:
 
 
 def _without_sinking(places_mm: FloatArray, level_kpa: FloatArray) -> FloatArray:
-    """(n, 3) places less what is linear in the pressure."""
+    """(n, 3) places less their regression on the pressure."""
     level = level_kpa - level_kpa.mean()
     slope = level @ (places_mm - places_mm.mean(axis=0)) / max(float(level @ level), 1e-9)
     return np.asarray(places_mm - level[:, None] * slope)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, Plane, apply, inverse, rotation_from_quaternion
-from tactile_bayes.mapping.convention import ways_along
+from tactile_bayes.mapping.convention import directions_along
 from tactile_bayes.mapping.select import SelectedFrames, chunks
 from tactile_bayes.presets import HEAD_PROFILE, POSE_NOISE
 
@@ -246,7 +246,7 @@ def _profiles(
     frames, marks = _marked(part)
     chosen = frames[marks < marks_limit(marks, MOST_FRAMES)]
     among = np.searchsorted(np.flatnonzero(part.used), chosen)
-    way, level = ways_along(place_mm[:, 0])[among, None], np.log(part.level_kpa[chosen])[:, None]
+    way, level = directions_along(place_mm[:, 0])[among, None], np.log(part.level_kpa[chosen])[:, None]
     design = np.hstack([np.ones_like(way), place_mm[among, :2] / SPAN_MM, way, level, axes[among, 2, :2]])
     stretch = np.floor(part.scan.frames.time_s[chosen] / _STRETCH_S).astype(np.int64) % _GROUPS
     return _read(part, chosen), design, stretch

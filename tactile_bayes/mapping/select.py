@@ -1,4 +1,4 @@
-"""Which frames take part: the pressure gate, timing, overlap, thinning."""
+"""Frames that go into a map: faulty taxels, regularity and overlap of the times, and the pressure gate."""
 
 from __future__ import annotations
 
@@ -20,21 +20,18 @@ from tactile_bayes.scans import PressureFrames, Scan, TrackerPoses
 
 # --- Detection of faulty taxels over a whole scan.
 
-# A taxel that reads this share of its row's and column's level, or less, is dead (its cable picks up noise only).
-DEAD_SHARE = 0.1
-# One that reads this many times its row's and column's level is hot; so is one that flickers this much more than most.
-HOT_RATIO = 2.0
+DEAD_SHARE = 0.1  #: Share of its row's and column's level below which a taxel is dead (its cable picks up noise only).
+HOT_RATIO = 2.0  #: Multiple of its row's and column's level above which a taxel is hot.
+# Multiple of the usual flicker, and its size in kPa, above which a taxel is hot.
 FLICKER_RATIO = 10.0
 FLICKER_KPA = 1.0
-SATURATED_SHARE = 0.1  #: One that is saturated in a larger share of the frames is left out of all of them.
-MIN_FRAMES = 10  #: Fewer frames than this say nothing about what never changes.
-# One that repeats its last count in a larger share of the frames, where most do so in less than half of that, is stuck.
-STILL_SHARE = 0.5
-# One that keeps a count through this share of the blocks of so many frames in which most taxels change dies on the way.
+SATURATED_SHARE = 0.1  #: Share of saturated frames above which a taxel is left out of all.
+MIN_FRAMES = 10  #: Fewest frames from which a taxel can be called stuck.
+STILL_SHARE = 0.5  #: Share of repeated counts above which a taxel is stuck, where most have less than half of that.
+# Share of the blocks of so many frames, of those in which most taxels change, through which a taxel keeps its count.
 LOST_SHARE = 0.05
 _BLOCK = 32
-# Below this level (kPa) the head is in the air, and a low reading is no fault.
-CONTACT_KPA = 1.0
+CONTACT_KPA = 1.0  #: Level below which the head is in the air, and a low reading is no fault.
 _CHUNK = 512
 
 
@@ -50,25 +47,23 @@ class TaxelFault(NamedTuple):
 
 
 def find_faults(scan: Scan) -> tuple[TaxelFault, ...]:
-    """Find the taxels to leave out of every frame of `scan`, in row order.
+    """Taxels to leave out of every frame of a scan, in row order.
 
-    - dead: gain 0, or never anything but one count while the level is next to nothing, or a level below a tenth of
-      both its row's and its column's median;
-    - stuck: one count throughout, while most taxels change; or one that repeats its last count in over half of the
-      frames, while most hardly ever do (it sticks for a time and comes back), or keeps it for long stretches, while
-      nine in ten change (it dies on the way);
-    - hot: over twice the level of its row and column, or flickering over ten times as much as most;
-    - saturated: full scale in over a tenth of the frames.
+    - dead: gain 0; one count throughout and next to no level; or a level below a tenth of its row's and column's median
+    - stuck: one count throughout while most change; a count repeated in over half of the frames while most hardly ever
+      do so; or a count kept for long stretches in which nine in ten change
+    - hot: over twice the level of its row and column, or ten times the usual flicker
+    - saturated: full scale in over a tenth of the frames
 
-    A level is compared along the row *and* the column, so that an edge that bears less is no fault.
+    Levels are compared along the row *and* the column: an edge that bears less is no fault.
     """
     if not len(scan.frames):
         return ()
     mean, flicker, still, lost, saturated = _element_levels(scan)
     lowest, highest = scan.frames.counts.min(axis=0), scan.frames.counts.max(axis=0)
     usual = float(np.median(mean))
-    of_row, of_column = np.median(mean, axis=1)[:, None], np.median(mean, axis=0)[None, :]
-    low, high = np.minimum(of_row, of_column), np.maximum(of_row, of_column)
+    row, column = np.median(mean, axis=1)[:, None], np.median(mean, axis=0)[None, :]
+    low, high = np.minimum(row, column), np.maximum(row, column)
     constant = (highest == lowest) & (len(scan.frames) >= MIN_FRAMES)
     moving = bool(np.median(highest - lowest) > 0)
     empty = constant & ((highest == 0) | (mean <= DEAD_SHARE * usual))
@@ -81,8 +76,7 @@ def find_faults(scan: Scan) -> tuple[TaxelFault, ...]:
     faults[(constant & moving) | (sticks & (len(scan.frames) >= MIN_FRAMES))] = "stuck"
     faults[saturated > SATURATED_SHARE] = "saturated"
     faults[(scan.element_calibration.gain_kpa_per_count == 0) | empty | weak] = "dead"
-    found = np.argwhere(faults != "").tolist()
-    return tuple(TaxelFault(row, column, str(faults[row, column])) for row, column in found)
+    return tuple(TaxelFault(*place, str(faults[*place])) for place in np.argwhere(faults != "").tolist())
 
 
 def _element_levels(scan: Scan) -> tuple[FloatArray, ...]:
@@ -96,10 +90,10 @@ def _element_levels(scan: Scan) -> tuple[FloatArray, ...]:
         steps += change.sum(axis=0)  # not squared: one spike is no flicker
         unchanged = change == 0
         still += unchanged.sum(axis=0)
-        whole = unchanged[: len(chunk) // _BLOCK * _BLOCK].reshape(-1, _BLOCK, *last.shape[1:]).all(axis=1)
-        most_move = whole.mean(axis=(1, 2)) < 0.1
-        kept = chunk[: len(whole) * _BLOCK : _BLOCK] < highest  # what stays at its highest count is saturated
-        lost += (whole & kept)[most_move].sum(axis=0)
+        constant = unchanged[: len(chunk) // _BLOCK * _BLOCK].reshape(-1, _BLOCK, *last.shape[1:]).all(axis=1)
+        most_move = constant.mean(axis=(1, 2)) < 0.1
+        # a taxel that stays at its highest count is saturated
+        lost += (constant & (chunk[: len(constant) * _BLOCK : _BLOCK] < highest))[most_move].sum(axis=0)
         moving += int(most_move.sum())
         saturated += (chunk >= calibration.saturation_count).sum(axis=0)
         last = chunk[-1:]
@@ -115,7 +109,7 @@ def _element_levels(scan: Scan) -> tuple[FloatArray, ...]:
 
 # --- Regularity of frames and poses: rates, jitter, repeats, gaps and missing records.
 
-_GAP_INTERVALS = 1.5  #: An interval longer than this many usual ones holds frames that never came.
+_GAP_INTERVALS = 1.5  #: Multiple of the usual interval above which frames are missing in it.
 
 
 def timing_figures(scans: Sequence[Scan]) -> dict[str, float]:
@@ -138,7 +132,7 @@ def timing_figures(scans: Sequence[Scan]) -> dict[str, float]:
 
 
 def intervals(times: list[FloatArray]) -> tuple[FloatArray, float]:
-    """Intervals above 0 between records, and the usual one; NaN without any."""
+    """Intervals above 0 between records, and their median; NaN without any."""
     steps = np.concatenate([np.diff(time) for time in times])
     steps = steps[steps > 0]
     return steps, float(np.median(steps)) if len(steps) else float("nan")
@@ -154,16 +148,16 @@ def _regularity(name: str, times: list[FloatArray]) -> dict[str, float]:
 
 
 def missing_records(time_s: FloatArray) -> int:
-    """Number of frames, or poses, missing in the gaps."""
+    """Number of frames, or poses, that are missing in the gaps."""
     steps, usual = intervals([time_s])
     return int(np.rint(steps[steps >= _GAP_INTERVALS * usual] / usual - 1).sum())
 
 
-# --- A scan with part of its frames: every so many-th, or those of its first seconds.
+# --- A scan with part of its frames: every n-th, or those of its first seconds.
 
 
 def every_nth(scan: Scan, every: int) -> Scan:
-    """The scan with one frame of every `every`, the first one included; all poses stay."""
+    """The scan with every `every`-th frame from the first on; all poses stay."""
     return scan if every == 1 else _with_frames(scan, slice(None, None, every))
 
 
@@ -173,15 +167,15 @@ def first_seconds(scan: Scan, duration_s: float) -> Scan:
     return _with_frames(scan, slice(0, int(np.searchsorted(time_s, time_s[0] + duration_s, side="right"))))
 
 
-def _with_frames(scan: Scan, kept: slice) -> Scan:
-    frames = PressureFrames(scan.frames.time_s[kept], np.ascontiguousarray(scan.frames.counts[kept]))
+def _with_frames(scan: Scan, chosen: slice) -> Scan:
+    frames = PressureFrames(scan.frames.time_s[chosen], np.ascontiguousarray(scan.frames.counts[chosen]))
     return replace(scan, frames=frames)
 
 
 # --- Overlap in time of a scan's poses and frames, and cautions where it is poor.
 
 TOLERATED_S: Final = 0.1  #: Shorter mismatches and gaps cost a few frames at most.
-_LONG_INTERVALS: Final = 5.0  #: Frames are missing where an interval is this many times the mean.
+_LONG_INTERVALS: Final = 5.0  #: Multiple of the mean interval above which frames are missing.
 
 
 @dataclass(slots=True)
@@ -193,7 +187,7 @@ class Span:
     last_s: float = 0.0
     gap_s: float = 0.0
     gap_at_s: float = 0.0
-    """`gap_s`, `gap_at_s`: Longest interval between two records, and when it began."""
+    """`gap_s`, `gap_at_s`: Longest interval between two records, and its beginning."""
 
     def add(self, time_s: float) -> None:
         """Add the next record's time, which must not be below the one before."""
@@ -212,10 +206,10 @@ class Span:
         return span
 
 
-# A hand moves slower than this between two poses, beside what a tracker's noise adds.
+# Fastest motion of a hand, and the most that a tracker's noise adds to a step.
 _HAND_MM_PER_S: Final = 5_000.0
 _NOISE_MM: Final = 30.0
-_OPPOSITE_SHARE: Final = 0.2  #: Of a step, what the two poses are apart from being opposite to each other.
+_OPPOSITE_SHARE: Final = 0.2  #: Poses are opposite whose sum is shorter than this share of the step between them.
 
 
 @dataclass(slots=True)
@@ -237,19 +231,19 @@ class Jumps:
         step_mm = math.dist(last, position_mm)
         if step_mm > _NOISE_MM + _HAND_MM_PER_S * passed_s:
             self.number, self.longest_mm = self.number + 1, max(self.longest_mm, step_mm)
-            middle_mm = math.hypot(*(a + b for a, b in zip(last, position_mm, strict=True)))
-            self.opposite += middle_mm < _OPPOSITE_SHARE * step_mm
+            sum_mm = math.hypot(*(a + b for a, b in zip(last, position_mm, strict=True)))
+            self.opposite += sum_mm < _OPPOSITE_SHARE * step_mm
 
     @classmethod
     def of(cls, poses: TrackerPoses) -> Jumps:
         """Jumps of a scan's poses."""
-        found = cls()
+        jumps = cls()
         for time_s, place_mm in zip(poses.time_s.tolist(), poses.position_mm.tolist(), strict=True):
-            found.add(time_s, place_mm)
-        return found
+            jumps.add(time_s, place_mm)
+        return jumps
 
     def cautions(self) -> list[str]:
-        """A line about them; none without any."""
+        """A line on their number, length and cause; empty without jumps."""
         if not self.number:
             return []
         cause = "two tools in one stream, damaged records, or metal near an electromagnetic tracker"
@@ -259,7 +253,7 @@ class Jumps:
         return [f"the poses jump {times}, by up to {self.longest_mm:.0f} mm, faster than a hand: {cause}"]
 
 
-def apart(frames: Span, poses: Span) -> bool:
+def disjoint(frames: Span, poses: Span) -> bool:
     """True where no frame was measured between the first pose and the last."""
     if not frames.number or not poses.number:
         return True
@@ -267,10 +261,7 @@ def apart(frames: Span, poses: Span) -> bool:
 
 
 def overlap_cautions(frames: Span, poses: Span) -> list[str]:
-    """Cautions about the times, one line each; empty when every frame has poses around it.
-
-    A scan without frames, or without poses, has no times to compare.
-    """
+    """Cautions about the times, a line each; empty where every frame has poses around it, or there is none of either."""
     cautions, usual_s = [], (frames.last_s - frames.first_s) / max(1, frames.number - 1)
     if frames.gap_s > max(TOLERATED_S, _LONG_INTERVALS * usual_s):
         cautions.append(f"no frame for {frames.gap_s:.2f} s from {frames.gap_at_s:.2f} s on (longest gap)")
@@ -290,12 +281,12 @@ def overlap_cautions(frames: Span, poses: Span) -> list[str]:
 
 
 def scan_findings(scan: Scan) -> tuple[Finding, ...]:
-    """Findings of a scan's file and recorder, and on its times."""
-    found = with_times(scan.findings, Span.of(scan.frames.time_s), Span.of(scan.poses.time_s))
-    jumps = Jumps.of(scan.poses).cautions()  # the recorder noted them too
-    kept = [one for one in found if one.text not in jumps]
+    """Findings of a scan's recorder, and on its times and poses; what the recorder noted too is given once."""
+    noted = with_times(scan.findings, Span.of(scan.frames.time_s), Span.of(scan.poses.time_s))
+    jumps = Jumps.of(scan.poses).cautions()
+    noted = tuple(one for one in noted if one.text not in jumps)
     frozen = (finding("times_apart", text) for text in _frozen_cautions(scan.poses))
-    return (*kept, *frozen, *(finding("poses_jump", text) for text in jumps))
+    return (*noted, *frozen, *(finding("poses_jump", text) for text in jumps))
 
 
 def _frozen_cautions(poses: TrackerPoses) -> list[str]:
@@ -304,26 +295,26 @@ def _frozen_cautions(poses: TrackerPoses) -> list[str]:
     if not len(fresh):
         return []
     ends = np.append(np.searchsorted(poses.time_s, fresh.time_s[1:]), len(poses)) - 1
-    stood_s = poses.time_s[ends] - fresh.time_s
-    long = (stood_s > TOLERATED_S) & np.append(cells.leaps(fresh), True)
+    repeated_s = poses.time_s[ends] - fresh.time_s
+    long = (repeated_s > TOLERATED_S) & np.append(cells.leaps(fresh), True)
     if not long.any():
         return []
-    longest = int(np.argmax(np.where(long, stood_s, 0.0)))
-    others = f" (longest of {long.sum()})" if long.sum() > 1 else ""
-    when = f"for {stood_s[longest]:.2f} s from {fresh.time_s[longest]:.2f} s on{others}"
+    longest = int(np.argmax(np.where(long, repeated_s, 0.0)))
+    number = f" (longest of {long.sum()})" if long.sum() > 1 else ""
+    when = f"for {repeated_s[longest]:.2f} s from {fresh.time_s[longest]:.2f} s on{number}"
     return [f"the tracker repeated one place or rotation {when}: frames of that time are left out"]
 
 
 def with_times(findings: Sequence[Finding], frames: Span, poses: Span) -> tuple[Finding, ...]:
-    """Findings of a scan's file, and of its times where its recorder did not note them."""
+    """`findings` of a scan's file followed by those on its times, each once."""
     cautions = overlap_cautions(frames, poses)
-    told = [one for one in findings if one.text not in cautions]
-    return (*told, *(finding("times_apart", text) for text in cautions))
+    others = [one for one in findings if one.text not in cautions]
+    return (*others, *(finding("times_apart", text) for text in cautions))
 
 
 # --- Selection of the frames that go into a map, and the reasons for leaving others out (paper step ii, the gate).
 
-VALID_SHARE = 0.9  #: A frame with a smaller share of valid taxels than this is dropped.
+VALID_SHARE = 0.9  #: Share of valid taxels below which a frame is left out.
 
 
 class SelectedFrames(Record, eq=False, dict=True):
@@ -348,15 +339,15 @@ class SelectedFrames(Record, eq=False, dict=True):
 
     @cached_property
     def readout(self) -> cells.Readout:
-        """The good taxels, and the conversion of their counts."""
+        """Conversion of the good taxels' counts."""
         return cells.Readout.of(self.scan.element_calibration, self.good_taxels)
 
     def pressure_kpa(self, frames: slice | IndexArray) -> tuple[FloatArray, BoolArray | None]:
-        """(f, k) pressures of the good taxels in some frames, and which are valid, see `Readout.pressure_kpa`."""
+        """(f, k) pressures of the good taxels, and a mask of the valid ones, see `Readout.pressure_kpa`."""
         return self.readout.pressure_kpa(self.readout.counts(self.scan.frames.counts[frames]))
 
     def projector(self, *, plane_from_base: FloatArray, cell_mm: float) -> cells.Projector:
-        """The projector of the good taxels."""
+        """Projector of the good taxels onto a plane."""
         good = self.good_taxels
         return cells.Projector(self.scan.head, plane_from_base=plane_from_base, taxels=good, cell_mm=cell_mm)
 
@@ -370,7 +361,7 @@ def good_taxels(shape: tuple[int, int], faults: Iterable[TaxelFault]) -> BoolArr
 
 
 def chunks(frames: int, size: int) -> Iterator[slice]:
-    """Split into stretches of `size` frames."""
+    """Slices of at most `size` frames."""
     for start in range(0, frames, size):
         yield slice(start, min(start + size, frames))
 
@@ -382,15 +373,14 @@ def select_frames(
     latency_ms: float = 0.0,
     max_pose_gap_ms: float = cells.MAX_POSE_GAP_MS,
 ) -> SelectedFrames:
-    """Decide for every frame of a scan whether it is used; a head without a working taxel is a `BadDataError`.
+    """Select the frames with a pose, nine valid taxels in ten, and a mean over these in the window, its ends included.
 
-    A frame is used when the tracker knew where it was, nine taxels in ten are valid, and the mean over the valid ones
-    lies in the window, its ends included.
+    A head without a working taxel is a `BadDataError`.
     """
     faults, taxels = find_faults(scan), scan.head.shape[0] * scan.head.shape[1]
     if len(faults) >= taxels > 0:
         kinds = ", ".join(sorted({fault.fault for fault in faults}))
-        way_out = _counts_asked([scan]) or "check the array's cable and its calibration"
+        way_out = _counts_question([scan]) or "check the array's cable and its calibration"
         raise BadDataError(f"none of the {taxels} taxels works ({kinds})", way_out=way_out)
     fresh = cells.distinct_poses(scan.poses)
     poses = cells.poses_at(fresh, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=max_pose_gap_ms)
@@ -405,14 +395,14 @@ def select_frames(
 def gate(
     known: BoolArray, level_kpa: FloatArray, valid_share: FloatArray, *, pressure_window_kpa: tuple[float, float]
 ) -> tuple[BoolArray, BoolArray, BoolArray]:
-    """Frames below the window, above it and within, ends of the window included."""
+    """(n,) masks of the frames below the window, above it and within it, its ends included."""
     candidate = known & (valid_share >= VALID_SHARE)
     low, high = candidate & (level_kpa < pressure_window_kpa[0]), candidate & (level_kpa > pressure_window_kpa[1])
     return low, high, candidate ^ (low | high)
 
 
 def refuse_without_frames(selections: list[SelectedFrames], *, pressure_window_kpa: tuple[float, float]) -> None:
-    """Raise `BadDataError` when no scan has a frame left, naming the step that took them and a remedy."""
+    """Raise `BadDataError` where no scan has a used frame, with the reason and a way out."""
     if any(selection.used.any() for selection in selections):
         return
     total = sum(len(selection.scan.frames) for selection in selections)
@@ -426,7 +416,7 @@ def refuse_without_frames(selections: list[SelectedFrames], *, pressure_window_k
         share = max(float(selection.valid_share.max()) for selection in selections)
         raise BadDataError(
             f"no frame has {100 * VALID_SHARE:g} % of its taxels valid (the best has {100 * share:.1f} %)",
-            way_out=_counts_asked([part.scan for part in selections])
+            way_out=_counts_question([part.scan for part in selections])
             or "repair the array, or press less hard if taxels are saturated",
         )
     raise _outside_window(selections, pressure_window_kpa)
@@ -448,19 +438,19 @@ def _outside_window(selections: list[SelectedFrames], window: tuple[float, float
     low, middle, high = np.quantile(levels, [0.05, 0.5, 0.95])
     session = selections[0].scan.session
     imported = session.get("source") == "imported"  # a recorder knows its unit
-    asked = other_units(float(middle), session.get("frames_unit", "kPa"), window) if imported else ""
-    more = "" if asked else _counts_asked([part.scan for part in selections])
+    question = unit_question(float(middle), session.get("frames_unit", "kPa"), window) if imported else ""
+    more = "" if question else _counts_question([part.scan for part in selections])
     return BadDataError(
         f"no frame's mean lies within {window[0]:g} to {window[1]:g} kPa ({len(levels)} frames, means "
-        f"{levels.min():.2f} to {levels.max():.2f} kPa, median {middle:.2f}{f': {asked}' if asked else ''})",
-        way_out=("import it again with the right --unit; " if asked else "")
+        f"{levels.min():.2f} to {levels.max():.2f} kPa, median {middle:.2f}{f': {question}' if question else ''})",
+        way_out=("import it again with the right --unit; " if question else "")
         + f"a window of {np.floor(low * 10) / 10:g} to {np.ceil(high * 10) / 10:g} kPa would keep nine in ten"
         + (f", but {more}" if more else ""),
     )
 
 
-def other_units(mean_kpa: float, stated: str, window: tuple[float, float]) -> str:
-    """Ask for the unit where frames are outside the window, and the same numbers in another unit would be in it."""
+def unit_question(mean_kpa: float, stated: str, window: tuple[float, float]) -> str:
+    """Question for the unit where a mean is outside the window but would be inside in another unit; else empty."""
     if window[0] <= mean_kpa <= window[1]:
         return ""
     number = mean_kpa / KPA_PER_UNIT.get(stated, 1.0)
@@ -471,8 +461,8 @@ def other_units(mean_kpa: float, stated: str, window: tuple[float, float]) -> st
 _SAMPLE_FRAMES = 200
 
 
-def _counts_asked(scans: Iterable[Scan]) -> str:
-    """Ask whether counts are shifted, pressures already or in another unit, where they would fit an exam so."""
+def _counts_question(scans: Iterable[Scan]) -> str:
+    """Question whether counts are shifted, already pressures or in another unit, where they would fit an exam then."""
     scan = max(scans, key=lambda one: len(one.frames))
     counts, calibration = scan.frames.counts[:: max(1, len(scan.frames) // _SAMPLE_FRAMES)], scan.element_calibration
     if not counts.size:
@@ -489,8 +479,8 @@ def _counts_asked(scans: Iterable[Scan]) -> str:
     if PRESSURE_WINDOW_KPA[0] <= middle <= PRESSURE_WINDOW_KPA[1]:
         return f"are the counts kPa already (median {middle:g})? then gain_kpa_per_count is 1 and offset_kpa 0"
     level = float(np.median(calibration.linear_kpa(counts)))
-    asked = other_units(level, "kPa", PRESSURE_WINDOW_KPA)
-    return f"{asked} gain_kpa_per_count and offset_kpa must give kPa (median {level:.4g})" if asked else ""
+    question = unit_question(level, "kPa", PRESSURE_WINDOW_KPA)
+    return f"{question} gain_kpa_per_count and offset_kpa must give kPa (median {level:.4g})" if question else ""
 
 
 # --- Figures of frames used and left out.
@@ -515,8 +505,8 @@ def frame_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
         ),
     }
     levels = np.concatenate([part.level_kpa[part.used] for part in selections])
-    felt = np.concatenate([part.level_kpa[part.used | part.low | part.high] for part in selections])
-    low, high = np.quantile(felt, [0.05, 0.95])
+    ungated = np.concatenate([part.level_kpa[part.used | part.low | part.high] for part in selections])
+    low, high = np.quantile(ungated, [0.05, 0.95])
     return {
         **{name: float(value) for name, value in figures.items()},
         "mean_pressure_kpa": float(levels.mean()),

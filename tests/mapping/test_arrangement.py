@@ -149,7 +149,7 @@ def test_frames_of_another_clock_contradict_each_other():
 
 def test_an_empty_breast_says_that_it_shows_nothing():
     check = checked(tb.simulate(Path(tb.__file__).parent / "demo" / "empty.toml").scan)
-    assert check.says_nothing
+    assert check.inconclusive
     assert not check.refused
     assert [one.kind for one in check.findings] == ["arrangement_unknown"]
 
@@ -160,7 +160,7 @@ def test_readings_that_differ_by_rounding_alone_say_nothing():
     gain = np.full(alike.shape[1:], 0.0137)
     calibration = ElementCalibration(gain, np.full_like(gain, 0.1), scan.element_calibration.saturation_count)
     found = checked(replace(scan, frames=PressureFrames(scan.frames.time_s, alike), element_calibration=calibration))
-    assert found.says_nothing
+    assert found.inconclusive
     assert found.best is found.stated
 
 
@@ -211,7 +211,7 @@ def test_what_the_strokes_drag_along_is_no_body_that_moves():
     """Over this lump a body that moves by 8 mm fits better by far; so does one that follows the strokes by a fifth."""
     scan = draw(6, seed=20294303).scan()
     check, given = checked(scan), overlap(scan)
-    moved, dragged = given.swaying(), given.dragged()
+    moved, dragged = given.fit_sway(), given.fit_drag()
     assert moved is not None
     assert moved.sway_mm > LEAST_SWAY_MM
     assert moved.gain_over(check.stated) > LEAST_SWAY_GAIN
@@ -253,14 +253,14 @@ def test_the_latency_that_is_stated_is_what_the_clock_is_held_against():
 def test_a_clock_that_is_no_better_than_those_beside_it_is_not_named():
     """Frames over uneven fat agree better the earlier their poses are said to be."""
     scan = draw(95, seed=20292303).scan()
-    check, early = checked(scan), overlap(scan).judged((), -500.0)
+    check, early = checked(scan), overlap(scan).judge((), -500.0)
     assert early.plausible
     assert early.gain_over(check.stated) > 0.15
     assert check.best is check.stated
 
 
 def test_frames_without_a_pose_by_another_clock_do_not_count():
-    never = overlap(lump()).judged((), 60_000.0)
+    never = overlap(lump()).judge((), 60_000.0)
     assert never.spread == never.explained == 0.0
     assert not never.plausible
     assert never.gain_over(checked(lump()).stated) < 0
@@ -277,7 +277,7 @@ def test_few_frames_rule_out_nothing_that_all_frames_do_not(late_ms):
     close, excluded = _screened(few, trials, stretches=all_frames.stretches)
     assert 0 < len(close) < len(trials) / 2
     for trial in set(trials) - set(close):
-        gain = all_frames.judged(*trial).gain_over(all_frames.still[0])
+        gain = all_frames.judge(*trial).gain_over(all_frames.stated_fit[0])
         assert gain < 0
         if trial[0]:
             assert -all_frames.stretches * gain - np.log(len(trials) + 1) > excluded[trial[0][0]] - 2.0
