@@ -261,13 +261,13 @@ def disjoint(frames: Span, poses: Span) -> bool:
 
 
 def overlap_cautions(frames: Span, poses: Span) -> list[str]:
-    """Cautions about the times, a line each; empty where every frame has poses around it, or there is none of either."""
+    """Cautions about the times, a line each; empty where every frame has poses around it, or one of both is empty."""
     cautions, usual_s = [], (frames.last_s - frames.first_s) / max(1, frames.number - 1)
     if frames.gap_s > max(TOLERATED_S, _LONG_INTERVALS * usual_s):
         cautions.append(f"no frame for {frames.gap_s:.2f} s from {frames.gap_at_s:.2f} s on (longest gap)")
     if not frames.number or not poses.number:
         return cautions
-    if apart(frames, poses):
+    if disjoint(frames, poses):
         when = f"{poses.first_s:.2f} to {poses.last_s:.2f} s, frames {frames.first_s:.2f} to {frames.last_s:.2f} s"
         return [*cautions, f"no frame has a pose: poses cover {when}"]
     late_s, early_s = poses.first_s - frames.first_s, frames.last_s - poses.last_s
