@@ -49,7 +49,7 @@ from tactile_bayes.scans import ElementCalibration, HeadGeometry
 from tactile_bayes.shell import can_redraw, has_styles
 
 DRAWINGS_PER_S = 10.0
-TAKEN_EVERY_S = 1 / DRAWINGS_PER_S / 2  #: Frames are added to the map some at a time, twice a drawing.
+BATCH_S = 1 / DRAWINGS_PER_S / 2  #: Frames are added to the map in batches, two for each drawing.
 _SHOW, _HIDE = "\x1b[?25h\x1b[?1049l", "\x1b[?1049h\x1b[?25l"
 
 
@@ -57,9 +57,9 @@ _SHOW, _HIDE = "\x1b[?25h\x1b[?1049l", "\x1b[?1049h\x1b[?25l"
 def live_view(
     head: HeadGeometry, calibration: ElementCalibration, *, terminal: bool, serve: str | None, size_calibration: str
 ) -> Iterator[Any]:
-    """Start the view's process; returns an observer for the recorder."""
+    """Start the view's process; yields an observer for the recorder."""
     if serve:
-        address_of(serve)  # report a mistake before anything is recorded
+        address_of(serve)  # an error before anything is recorded
     calibration_file = size_calibration_path(size_calibration)
     setup = {
         "head": head_document(head),
@@ -92,14 +92,14 @@ _calibration_of = cache(read_size_calibration)
 
 
 class LiveAnswer(NamedTuple):
-    """Result of one live estimate; empty where the previous one stays."""
+    """Result of one live estimate; without a text the previous one stays."""
 
     text: str = ""  #: The size in a line, or why there is none.
     lump_base_mm: FloatArray | None = None  #: Centre of the lump in `base`.
 
 
 class Estimator:
-    """Estimates the newest map's size repeatedly in a process of its own, which starts before there is a map."""
+    """Estimates the newest map's size again and again, in a process that starts before there is a map."""
 
     def __init__(self, calibration: str | None) -> None:
         self._calibration = calibration
@@ -108,10 +108,10 @@ class Estimator:
         self.answer = LiveAnswer()
         self.done = 0
 
-    def look(self, tactile_map: TactileMap | None) -> None:
-        """Take the answer if it has come, and start the next estimate."""
+    def poll(self, tactile_map: TactileMap | None) -> None:
+        """Take the answer of a finished estimate, and start the next one."""
         if self._running is not None and self._running.done():
-            with contextlib.suppress(Exception):  # the estimate's process died: the next one has another
+            with contextlib.suppress(Exception):  # the process died: the next estimate starts another
                 answer = self._running.result()
                 self.answer, self.done = answer if answer.text else self.answer, self.done + 1
             self._running = None
@@ -126,79 +126,79 @@ class Estimator:
 class RiseRotation:
     """Choice of the next rise to estimate, one at a time: most are no lump and each costs as much as a lump.
 
-    The one that was a lump last time, or else the next lower one; now and then the highest, which may be new. How wide
-    the lump was is where the next fit of it begins.
+    It is the rise that was last a lump, or else the next lower one; every `HIGHEST_EVERY` estimates it is the highest,
+    which may be new. The next fit of a lump starts from its last width.
     """
 
-    AGAIN = 8
+    HIGHEST_EVERY = 8
 
     def __init__(self) -> None:
-        self._home = self._now = self._asked = 0
+        self._lump = self._current = self._estimates = 0
         self._width_mm: float | None = None
 
-    def of(self, number: int) -> int:
+    def next_of(self, number: int) -> int:
         """Index of the next of `number` rises; 0 is the highest."""
-        self._asked += 1
-        self._home %= number
-        self._now = 0 if self._asked % self.AGAIN == 0 else self._home
-        return self._now
+        self._estimates += 1
+        self._lump %= number
+        self._current = 0 if self._estimates % self.HIGHEST_EVERY == 0 else self._lump
+        return self._current
 
     @property
     def width_mm(self) -> float | None:
-        """Width of the lump, when its turn has come again."""
-        return self._width_mm if self._now == self._home else None
+        """Last width of the lump if it is the current rise; else None."""
+        return self._width_mm if self._current == self._lump else None
 
-    def tell(self, *, lump: bool, width_mm: float | None = None) -> bool:
-        """Record an estimate's result; return whether to show it: not when a rise glanced at is no lump."""
-        glance = self._now != self._home
+    def record(self, *, lump: bool, width_mm: float | None = None) -> bool:
+        """Record an estimate's result; False if it is not to be shown: another rise was tried and is no lump."""
+        tried = self._current != self._lump
         if lump:
-            self._home, self._width_mm = self._now, width_mm
-        elif not glance:
-            self._home, self._width_mm = self._home + 1, None
-        return lump or not glance
+            self._lump, self._width_mm = self._current, width_mm
+        elif not tried:
+            self._lump, self._width_mm = self._lump + 1, None
+        return lump or not tried
 
 
-_TURN = RiseRotation()
+_RISES = RiseRotation()
 LIVE_DRAWS = 400
 
 
-def live_estimate(tactile_map: TactileMap, calibration_path: str | None, turn: RiseRotation = _TURN) -> LiveAnswer:
-    """Size by the fast method with the lump's place, or the reason why there is none."""
+def live_estimate(tactile_map: TactileMap, calibration_path: str | None, rises: RiseRotation = _RISES) -> LiveAnswer:
+    """Size by the fast method with the lump's place, or the reason for no size."""
     try:
         centres = candidate_centres(tactile_map)
         if not centres:
             return LiveAnswer("no estimate: nothing rises above the background")
-        centre = centres[turn.of(len(centres))]
+        centre = centres[rises.next_of(len(centres))]
         calibration = _calibration_of(Path(calibration_path)) if calibration_path else None
         # no test for rotation: it takes a third of the time and can be made afterwards
         options = SamplerSettings(
             method="laplace",
             rotation="off",
             centre_mm=centre,
-            start_width_mm=turn.width_mm,
+            start_width_mm=rises.width_mm,
             field_cosines=FIELD_COSINES,
             draws=LIVE_DRAWS,
         )
         if calibration is not None:
-            made = calibration.recipe
-            options = replace(options, background=made.background, fit_radius_mm=made.radius_mm, noise=made.noise)
-        found = estimate_map(tactile_map, calibration=calibration, options=options, rng=np.random.default_rng(1))
+            recipe = calibration.recipe
+            options = replace(options, background=recipe.background, fit_radius_mm=recipe.radius_mm, noise=recipe.noise)
+        estimate = estimate_map(tactile_map, calibration=calibration, options=options, rng=np.random.default_rng(1))
     except TactileBayesError as error:
-        return LiveAnswer(f"no estimate: {error}" if turn.tell(lump=False) else "")
-    width = None if found.fit is None else float(np.sqrt(np.prod(found.fit.widths()[:2])))
-    if not turn.tell(lump=found.status == "estimate", width_mm=width):
+        return LiveAnswer(f"no estimate: {error}" if rises.record(lump=False) else "")
+    width = None if estimate.fit is None else float(np.sqrt(np.prod(estimate.fit.widths()[:2])))
+    if not rises.record(lump=estimate.status == "estimate", width_mm=width):
         return LiveAnswer()
-    if found.status != "estimate" or found.map_posterior is None:
-        why = f"the rise near {centre[0]:.0f}, {centre[1]:.0f} mm is no lump that can be measured"
-        return LiveAnswer(f"no estimate: {found.reason if found.code == 'extrapolated' else why}")
+    if estimate.status != "estimate" or estimate.map_posterior is None:
+        reason = f"the rise near {centre[0]:.0f}, {centre[1]:.0f} mm is no lump that can be measured"
+        return LiveAnswer(f"no estimate: {estimate.reason if estimate.code == 'extrapolated' else reason}")
     lump = None
     if tactile_map.plane_from_base is not None:  # stays valid in `base` when the map's plane changes
-        centre_mm = [np.median(found.map_posterior.x_mm), np.median(found.map_posterior.y_mm), 0.0]
+        centre_mm = [np.median(estimate.map_posterior.x_mm), np.median(estimate.map_posterior.y_mm), 0.0]
         lump = apply(inverse(tactile_map.plane_from_base), np.array(centre_mm))
-    if found.size is not None:
-        cautions = finding_summary(found.findings, "caution", most=1)
-        return LiveAnswer(" ".join([*cautions, _interval("largest size", found.size.max_size_mm, INTERVAL)]), lump)
-    widths = np.maximum(found.map_posterior.sigma_x_mm, found.map_posterior.sigma_y_mm)
+    if estimate.size is not None:
+        cautions = finding_summary(estimate.findings, "caution", most=1)
+        return LiveAnswer(" ".join([*cautions, _interval("largest size", estimate.size.max_size_mm, INTERVAL)]), lump)
+    widths = np.maximum(estimate.map_posterior.sigma_x_mm, estimate.map_posterior.sigma_y_mm)
     return LiveAnswer(_interval("map width sigma", widths, INTERVAL), lump)
 
 
@@ -211,32 +211,32 @@ def _interval(name: str, draws: FloatArray, probability: float) -> str:
 def run(pipe: int, setup: dict[str, Any]) -> None:
     """Follow a recording until it ends."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # it ends the recording, and that ends the view
+        signal.signal(number, signal.SIG_IGN)  # the signal ends the recording, and that ends the view
     live = LiveMap(from_plain(HeadGeometry, setup["head"]), from_plain(ElementCalibration, setup["calibration"]))
     estimator = Estimator(setup["size_calibration"])
     with contextlib.ExitStack() as stack:
         stack.callback(estimator.close)
-        showing: list[Callable[[LiveState], None]] = []
+        displays: list[Callable[[LiveState], None]] = []
         if setup["serve"]:
             server = LiveServer(*address_of(setup["serve"]))
             stack.callback(server.close)
             print(f"live view: {server.url}", file=sys.stderr, flush=True)
-            showing.append(server.show)
+            displays.append(server.show)
         if setup["terminal"]:
-            showing.append(stack.enter_context(terminal_view(keys=setup["keys"])))
+            displays.append(stack.enter_context(terminal_view(keys=setup["keys"])))
         began = time.monotonic()
         drawn, drawings, newest = 0.0, 0, None
-        for seen in fed(pipe, TAKEN_EVERY_S):
-            live.take(seen)
-            estimator.look(newest)
+        for batch in fed(pipe, BATCH_S):
+            live.take(batch)
+            estimator.poll(newest)
             now = time.monotonic()
             if now - drawn < 1 / DRAWINGS_PER_S:
                 continue
             drawn, drawings = now, drawings + 1
             state = live.state(size=estimator.answer.text, lump_base_mm=estimator.answer.lump_base_mm)
             newest = state.tactile_map
-            for show in showing:
-                show(state)
+            for display in displays:
+                display(state)
         if not sys.stderr.isatty():
             seconds = time.monotonic() - began
             print(f"live view: {drawings} drawings and {estimator.done} estimates in {seconds:.1f} s", file=sys.stderr)
@@ -249,13 +249,13 @@ def terminal_view(*, keys: bool = False) -> Iterator[Callable[[LiveState], None]
     if not can_redraw():
         last = 0.0
 
-        def tell(state: LiveState) -> None:
+        def print_line(state: LiveState) -> None:
             nonlocal last
             if time.monotonic() - last >= 1.0:
                 last = time.monotonic()
                 print(live_line(state), file=out, flush=True)
 
-        yield tell
+        yield print_line
         return
     colour = has_styles()
 
@@ -278,8 +278,8 @@ def terminal_view(*, keys: bool = False) -> Iterator[Callable[[LiveState], None]
 _COLOURS: Final = np.array(VIRIDIS, dtype=np.float64)
 _SHADES: Final = " .:-=+*#%@"
 _FULL_BAR_KPA: Final = 20.0
-_SAID: Final = {"low": "press harder", "in": "in range", "high": "press less", "off": "waiting for the head"}
-_TINT: Final = {"low": "94", "in": "92", "high": "91", "off": "90"}
+_ADVICE: Final = {"low": "press harder", "in": "in range", "high": "press less", "off": "waiting for the head"}
+_TONE_COLOUR: Final = {"low": "94", "in": "92", "high": "91", "off": "90"}
 _EDGE_WORDS: Final = {"H": "H (head)", "F": "F (feet)"}
 _LEGEND_LINES: Final = 3
 _LEAST_ROWS: Final = 6
@@ -289,9 +289,9 @@ _STEPS: Final = 256
 
 
 def live_text(state: LiveState, *, columns: int, lines: int, colour: bool, keys: bool = False) -> str:
-    """One screen, its lines joined by newlines, none longer than `columns`.
+    """One screen of lines, none longer than `columns`.
 
-    `keys` says whether the recording's keys can be pressed on this terminal.
+    `keys` is true if the recording's keys can be pressed on this terminal.
     """
     above = [_pressure(state, columns, colour=colour), _figures(state)[:columns], state.size_words[:columns]]
     below = [*textwrap.wrap(state.landmark_words, columns), RESEARCH_USE[:columns]]
@@ -303,20 +303,20 @@ def live_text(state: LiveState, *, columns: int, lines: int, colour: bool, keys:
 
 def live_line(state: LiveState) -> str:
     """The live view in one line, for terminals that cannot be redrawn."""
-    pressure = f"{state.pressure_words} {_SAID[state.tone]}".strip()
+    pressure = f"{state.pressure_words} {_ADVICE[state.tone]}".strip()
     behind = f"view {state.latency_ms:.0f} ms behind"
     return f"{pressure}; {_figures(state)}; {state.size_words}; {behind}"
 
 
 def _pressure(state: LiveState, columns: int, *, colour: bool) -> str:
-    words = f" {state.pressure_words:>8}  {_SAID[state.tone]}"
+    words = f" {state.pressure_words:>8}  {_ADVICE[state.tone]}"
     width = max(10, min(40, columns - len(words) - 2))
     level = 0.0 if not np.isfinite(state.pressure_kpa) else state.pressure_kpa
     cells = ["#" if (i + 0.5) * _FULL_BAR_KPA / width <= level else "-" for i in range(width)]
     for limit in PRESSURE_WINDOW_KPA:
         cells[min(width - 1, int(limit / _FULL_BAR_KPA * width))] = "|"
     text = f"[{''.join(cells)}]{words}"[:columns]
-    return f"\x1b[{_TINT[state.tone]}m{text}\x1b[0m" if colour else text
+    return f"\x1b[{_TONE_COLOUR[state.tone]}m{text}\x1b[0m" if colour else text
 
 
 def _figures(state: LiveState) -> str:
@@ -324,7 +324,7 @@ def _figures(state: LiveState) -> str:
 
 
 def _picture(state: LiveState, columns: int, lines: int, *, colour: bool) -> list[str]:
-    """The map between labels of its edges, oriented by `orientation_of`, with a legend below."""
+    """The map between the labels of its edges, oriented by `orientation_of`, with a legend below."""
     if state.tactile_map is None:
         return ["no map yet: move the head over the lump within the pressure window"[:columns]]
     view, values = orientation_of(state.tactile_map), grey_levels(state.tactile_map.mean)

@@ -45,9 +45,9 @@ _PATHS = ("like", "head_geometry", "array_calibration", "landmarks")
 
 
 class Request(RecordOptions, kw_only=True):
-    """Options of one recording, and what of them its file stores."""
+    """Options of one recording, and the facts and settings that its file stores of them."""
 
-    replayed: dict[str, str] = field(default_factory=dict)  #: Session of the scan that is replayed: it stays as it is.
+    replayed: dict[str, str] = field(default_factory=dict)  #: Session of a scan that is replayed, kept unchanged.
 
     def facts(self) -> dict[str, str]:
         """Session facts as text: from the file, overridden by options."""
@@ -80,7 +80,7 @@ class Request(RecordOptions, kw_only=True):
 
 
 def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration, Landmarks | None]:
-    """Read geometry, calibration and landmarks from the files given; one missing or given twice is an error."""
+    """Geometry, calibration and landmarks, read from the files of the options; `UsageError` where one is missing."""
     like = read_scan(request.like) if request.like else None
     if request.head_geometry:
         head = read_head_geometry(request.head_geometry)
@@ -101,18 +101,18 @@ def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration, L
 
 
 def calibration_age(request: Request, *, head_id: str, today: date) -> dict[str, str]:
-    """Session fact on the age of the array calibration, in days; empty where it came from no calibration file.
+    """Session fact on the age of the array calibration, in days; empty without a calibration file.
 
-    One that is stale or of another head is a `UsageError`, unless it is accepted.
+    A calibration that is stale or of another head is a `UsageError`, unless it is accepted.
     """
     if not request.array_calibration or request.uncalibrated:
         return {}
-    found = read_array_calibration(request.array_calibration)
-    age, fault = (today - found.day).days, ""
-    if found.head_id != head_id:
-        fault = f"was measured on head {found.head_id!r}, this is {head_id!r}; calibrate this head"
+    calibration = read_array_calibration(request.array_calibration)
+    age, fault = (today - calibration.day).days, ""
+    if calibration.head_id != head_id:
+        fault = f"was measured on head {calibration.head_id!r}, this is {head_id!r}; calibrate this head"
     elif not 0 <= age <= request.calibration_days:
-        fault = f"is of {found.day}, {age} days ago (at most {request.calibration_days:g}); calibrate again"
+        fault = f"is of {calibration.day}, {age} days ago (at most {request.calibration_days:g}); calibrate again"
     if fault and not request.accept_calibration:
         raise UsageError(f"{request.array_calibration} {fault}, or give --accept-calibration")
     return {"array_calibration_days": str(age)}
@@ -126,24 +126,24 @@ def _landmarks(request: Request) -> Landmarks | None:
     scan = read_scan(request.landmarks)
     if scan.landmarks is None:
         raise UsageError(f"{request.landmarks} holds no landmarks; give a scan whose landmarks were touched")
-    theirs = scan.session.get("reference", "")
-    if bool(theirs) != bool(request.reference):
-        frame = f"relative to the tool {theirs!r}" if theirs else "of the tracker's own frame"
+    reference = scan.session.get("reference", "")
+    if bool(reference) != bool(request.reference):
+        frame = f"relative to the tool {reference!r}" if reference else "of the tracker's own frame"
         raise UsageError(f"the landmarks of {request.landmarks} are {frame}; record with the same --reference")
     return scan.landmarks
 
 
 @contextlib.contextmanager
 def noted_signals() -> Iterator[list[str]]:
-    """Names of the signals that have come to end the recording: Ctrl-C, SIGTERM or SIGHUP; they end nothing else."""
-    came: list[str] = []
+    """List the names of signals that are to end the recording (Ctrl-C, SIGTERM, SIGHUP) in place of their effect."""
+    names: list[str] = []
 
     def note(number: int, _frame: object) -> None:
-        came.append("Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name)
+        names.append("Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name)
 
     before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
-        yield came
+        yield names
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -153,7 +153,7 @@ def noted_signals() -> Iterator[list[str]]:
 class Keys:
     """Keys of a terminal for landmarks, start and stop; without a terminal there are none.
 
-    Nothing is printed where a `drawn` live view says it: it would draw over the words.
+    Nothing is printed where a live view is `drawn`: it shows the same facts and would overwrite the lines.
     """
 
     recorder: Recorder
@@ -164,7 +164,7 @@ class Keys:
 
     def __post_init__(self) -> None:
         self._terminal = sys.stdin.isatty()
-        self.waiting, self._told = self.wait and self._terminal, 0
+        self.waiting, self._printed_landmarks = self.wait and self._terminal, 0
 
     def __enter__(self) -> Keys:
         if self._terminal:
@@ -180,11 +180,11 @@ class Keys:
             with contextlib.suppress(termios.error):  # the terminal was closed
                 termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._settings)
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Act on the keys pressed since the last call, and report landmarks."""
-        for text in self.recorder.report.landmarks[self._told :]:
+        for text in self.recorder.report.landmarks[self._printed_landmarks :]:
             self._say(text)
-            self._told += 1
+            self._printed_landmarks += 1
         if not self._terminal or not select.select([sys.stdin], [], [], 0)[0]:
             return
         keys = b""
@@ -215,7 +215,7 @@ def record_action(output: Path, **options: Any) -> int:
     """Record a scan head and a tracker."""
     request = Request(output=output, **options)
     if request.size_calibration != default_of(RecordOptions, "size_calibration"):
-        from tactile_bayes.files.size_json import size_calibration_path  # with it comes what sizes a lump
+        from tactile_bayes.files.size_json import size_calibration_path  # slow to import: it brings the sizing
 
         protect_inputs(size_calibration_path(request.size_calibration))
     report, interrupted = make_recording(request)
@@ -226,7 +226,7 @@ def record_action(output: Path, **options: Any) -> int:
 
 
 def record_text(report: Report, *, output: str) -> str:
-    """Summary of a recording and its losses in a few lines."""
+    """Summary of a recording and its losses."""
     rate = (report.frames - 1) / report.duration_s if report.frames > 1 and report.duration_s > 0 else 0.0
     dropped = f" (the head dropped {report.head_dropped})" if report.head_dropped else ""
     lines = [
@@ -238,7 +238,7 @@ def record_text(report: Report, *, output: str) -> str:
         *([f"records of other tools left out: {report.other_tools}"] if report.other_tools else []),
         *report.landmarks,
     ]
-    odd = {
+    counts = {
         "times the head's counter of time wrapped": report.head_clock_wraps,
         "times the tracker's counter of time wrapped": report.tracker_clock_wraps,
         "poses without a time, left out": report.poses_without_time,
@@ -246,13 +246,13 @@ def record_text(report: Report, *, output: str) -> str:
         "bytes from the tracker that made no sense": report.tracker_garbage_bytes,
         "bytes this computer came too late for": report.overrun_bytes,
     }
-    lines += [f"{words}: {number}" for words, number in odd.items() if number]
+    lines += [f"{words}: {number}" for words, number in counts.items() if number]
     lines += [f"caution: {text}" for text in report.cautions]
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
 def make_recording(request: Request) -> tuple[Report, bool]:
-    """Check the devices, record and close the file; returns the account, and whether it was interrupted."""
+    """Check the devices, record and close the file; returns the report, and True if a signal ended it."""
     ndi = request.tracker_protocol == "ndi"
     for rom in request.tracker_rom:
         if not (ndi and rom.is_file()):
@@ -272,7 +272,7 @@ def make_recording(request: Request) -> tuple[Report, bool]:
         check_session(session, path=request.output)
         observer = Observer()
         if request.live or request.serve:
-            # it maps and estimates, which a recording alone does not pay for
+            # slow to import: it maps and estimates
             from tactile_bayes.actions.live_view import live_view
 
             view = live_view(
@@ -287,9 +287,9 @@ def make_recording(request: Request) -> tuple[Report, bool]:
                 stream, head=head, element_calibration=calibration, session=session, provenance=provenance
             )
         except OSError as error:
-            with suppress(OSError):  # what is still in its buffer cannot be written either
+            with suppress(OSError):  # its buffer cannot be written either
                 stream.close()
-            request.output.unlink(missing_ok=True)  # it holds nothing of a scan yet
+            request.output.unlink(missing_ok=True)  # no data yet
             raise unwritable(request.output, error) from None
         stack.callback(writer.stop_syncing)
         recorder = Recorder(
@@ -310,7 +310,7 @@ def make_recording(request: Request) -> tuple[Report, bool]:
             writer.close(as_dict(report) | {"cautions": "\n".join(report.cautions)})
         except OSError as error:
             writer.stop_syncing()
-            with suppress(OSError):  # what is still in its buffer cannot be written either
+            with suppress(OSError):  # its buffer cannot be written either
                 stream.close()
             raise full_disk(request.output, error) from None
     return report, bool(signals)
@@ -367,12 +367,12 @@ def _run(recorder: Recorder, signals: list[str], head: HeadGeometry, request: Re
         if not keys.waiting:
             recorder.start()
 
-        def look() -> None:
-            keys.look()
+        def poll() -> None:
+            keys.poll()
             if signals:
                 recorder.stop(signals[-1])
 
-        return recorder.run(look)
+        return recorder.run(poll)
 
 
 # --- From scripts: the same recorder, started at once.
@@ -420,14 +420,14 @@ def record(
     UsageError
         When options contradict each other, or the file exists and `force` is false.
     """
-    given = {name: plain(value) for name, value in options.items()}
+    values = {name: plain(value) for name, value in options.items()}
     check_number("duration_s", duration_s, 0, open_ends=True)
-    given |= {name: path_of(given[name]) for name in _PATHS if name in given}
-    roms = given.get("tracker_rom", ())
-    given["tracker_rom"] = tuple(map(path_of, [roms] if isinstance(roms, str | Path) else roms))
-    given |= {"output": path_of(output), "head_url": head, "duration_s": duration_s, "at_once": True}
-    given |= {"tracker_url": tracker, "session_file": path_of(session)}
-    report, _ = make_recording(Request(**given))
+    values |= {name: path_of(values[name]) for name in _PATHS if name in values}
+    roms = values.get("tracker_rom", ())
+    values["tracker_rom"] = tuple(map(path_of, [roms] if isinstance(roms, str | Path) else roms))
+    values |= {"output": path_of(output), "head_url": head, "duration_s": duration_s, "at_once": True}
+    values |= {"tracker_url": tracker, "session_file": path_of(session)}
+    report, _ = make_recording(Request(**values))
     if report.fault:
         raise DeviceError(report.fault)
     return report

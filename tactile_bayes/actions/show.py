@@ -1,4 +1,4 @@
-"""`show`: what a file holds, and what a scan is in a few lines."""
+"""`show`: the facts of a file, and the summary of a scan."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ from tactile_bayes.size.pooling import Calibration
 def show_action(file: Path, as_json: bool) -> None:
     """Show what a file holds: schema, shape, units, quality, provenance."""
     shipped = size_calibration_path(file.name) if str(file) in SHIPPED and not file.exists() else None
-    found = describe(shipped or file)
-    click.echo(dump_json(found) if as_json else "\n".join([*fact_lines(found), RESEARCH_USE, ""]), nl=False)
+    facts = describe(shipped or file)
+    click.echo(dump_json(facts) if as_json else "\n".join([*fact_lines(facts), RESEARCH_USE, ""]), nl=False)
 
 
-_MOST_NUMBERS = 30  #: Of a list that is shown whole.
+_MOST_NUMBERS = 30  #: Longer lists of numbers are shown by their range.
 
 
-def fact_lines(found: dict[str, Any], indent: str = "") -> Iterator[str]:
-    """Description of a file, one fact per line."""
-    width = max(map(text_width, found), default=0)
-    for name, value in found.items():
+def fact_lines(facts: dict[str, Any], indent: str = "") -> Iterator[str]:
+    """Facts of a file, one per line, those of tables indented."""
+    width = max(map(text_width, facts), default=0)
+    for name, value in facts.items():
         if isinstance(value, dict) and value:
             yield f"{indent}{name}"
             yield from fact_lines(value, indent + "  ")
         else:
-            yield f"{indent}{padded(name, width)}  {_plain(value)}"
+            yield f"{indent}{padded(name, width)}  {_value_text(value)}"
 
 
-def _plain(value: Any) -> str:
+def _value_text(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
@@ -58,9 +58,9 @@ def _plain(value: Any) -> str:
         leaves = list(_leaves(value))
         if len(leaves) > _MOST_NUMBERS and all(isinstance(one, int | float) for one in leaves):
             return f"{len(leaves)} numbers, {min(leaves):.6g} to {max(leaves):.6g}"
-        return ", ".join(_plain(item) for item in value) if value else "none"
+        return ", ".join(_value_text(item) for item in value) if value else "none"
     if isinstance(value, dict):
-        return "none" if not value else "; ".join(f"{k} {_plain(v)}" for k, v in value.items())
+        return "none" if not value else "; ".join(f"{k} {_value_text(v)}" for k, v in value.items())
     return "none" if value is None else str(value)
 
 
@@ -90,7 +90,7 @@ def _rate(times: FloatArray) -> str:
     return f"{1 / usual:.1f} Hz" if len(steps) else "no rate"
 
 
-# --- What a file is, by its first bytes, and the facts that it holds.
+# --- Kind of a file, by its first bytes, and its facts.
 
 _UNITS = {"sigma": "mm", "d": "mm", "amplitude": "1 is the background"}
 _ACCOUNT = (
@@ -126,14 +126,14 @@ def _posterior(group: Group) -> dict[str, Any]:
         "draws": group.dimension("draw"),
         "variables": [name for name in group.variables() if name not in ("chain", "draw")],
         "units": {"_mm": "mm", "_rad": "rad", "others": "as the map: 1 is the background"},
-        **_told(parse_json(attributes.get("estimate", "{}"))),
+        **_verdict_facts(parse_json(attributes.get("estimate", "{}"))),
         "diagnostics": parse_json(attributes.get("diagnostics", "{}")),
         "provenance": parse_json(attributes.get("provenance", "{}")),
     }
 
 
-def _told(document: Any) -> dict[str, Any]:
-    """Verdict of an estimate and what speaks against it, in sentences; nothing of a document without them."""
+def _verdict_facts(document: Any) -> dict[str, Any]:
+    """Verdict of an estimate and its findings in sentences; empty for a document without findings."""
     if not isinstance(document, dict) or "findings" not in document:
         return {}
     return {"verdict": document.get("verdict"), "findings": finding_lines(findings_in(document["findings"]))}
@@ -176,8 +176,8 @@ def _json(path: Path) -> dict[str, Any]:
         return _site_calibration(path, document)
     if schema.startswith("tactile-bayes/repeatability/"):
         return _repeatability(path, document)
-    kept = {name: value for name, value in document.items() if name not in ("schema", "modalities")}
-    return {"schema": schema, "kind": schema.split("/")[1], **kept, **_told(document)}
+    facts = {name: value for name, value in document.items() if name not in ("schema", "modalities")}
+    return {"schema": schema, "kind": schema.split("/")[1], **facts, **_verdict_facts(document)}
 
 
 def _site_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
@@ -186,29 +186,32 @@ def _site_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
     assert calibration.site is not None
     site = calibration.site
     middle, low, high = site.percent(site.phantoms_log_width)
-    kept = ("base", "phantoms", "maps", "mean", "covariance", "uses_fat", "fit", "cautions", "left_out")
-    told = {name: document["site"][name] for name in kept}
+    names = ("base", "phantoms", "maps", "mean", "covariance", "uses_fat", "fit", "cautions", "left_out")
+    facts = {name: document["site"][name] for name in names}
     return {
         "schema": document["schema"],
         "kind": "size calibration corrected by phantoms",
-        "correction": {"percent": middle, "percent_interval": [low, high], **told},
+        "correction": {"percent": middle, "percent_interval": [low, high], **facts},
         "base": _described(calibration, document["base"]),
         "provenance": document["provenance"],
     }
 
 
 def _repeatability(path: Path, document: dict[str, Any]) -> dict[str, Any]:
-    found = read_repeatability(path)
+    repeatability = read_repeatability(path)
     provenance = dict(document["provenance"])
-    if isinstance(inputs := provenance.get("inputs"), list):  # those of a long list that are no exam's draws
-        drawn = [isinstance(one, dict) and str(one.get("role")).startswith("draws_") for one in inputs]
-        provenance["inputs"] = [one for one, left_out in zip(inputs, drawn, strict=True) if not left_out]
-    kept = ("between_map_sd", "log_sd", "median", "low", "high", "probability", "masses", "maps", "calibration")
+    if isinstance(
+        inputs := provenance.get("inputs"), list
+    ):  # without the draws of each exam, of which there may be many
+        provenance["inputs"] = [
+            one for one in inputs if not (isinstance(one, dict) and str(one.get("role")).startswith("draws_"))
+        ]
+    names = ("between_map_sd", "log_sd", "median", "low", "high", "probability", "masses", "maps", "calibration")
     return {
         "schema": document["schema"],
         "kind": "spread between exams of one mass at a site",
-        "in_words": found.words(),
-        **{name: document[name] for name in (*kept, "half_width") if name in document},
+        "in_words": repeatability.words(),
+        **{name: document[name] for name in (*names, "half_width") if name in document},
         "units": {"between_map_sd, median, low, high, half_width": "share of the size"},
         "repeats": {one["name"]: f"{len(one['exams'])} exams" for one in document["repeats"]},
         "outlying": document["outlying"],
@@ -220,13 +223,13 @@ def _repeatability(path: Path, document: dict[str, Any]) -> dict[str, Any]:
 def _described(calibration: Calibration, document: dict[str, Any]) -> dict[str, Any]:
     """Facts of a calibration's document, without its long arrays."""
     if isinstance(calibration, BodyCalibration):
-        kept = ("form", "source", "bodies", "recipe", "centre", "constants", "domain", "fit", "provenance")
+        names = ("form", "source", "bodies", "recipe", "centre", "constants", "domain", "fit", "provenance")
         return {
             "schema": document["schema"],
             "kind": "size calibration",
             "head": str(calibration.recipe.head),
             "units": _UNITS,
-            **{name: document[name] for name in kept},
+            **{name: document[name] for name in names},
             "variance_taken_away_by_knowing": calibration.unknowns,
             "residual_points": 0 if calibration.residual is None else len(calibration.residual.points),
             "fat_mm": None if calibration.depth is None else list(calibration.depth.fat_mm),
@@ -273,7 +276,7 @@ def _foreign(path: Path) -> BadDataError:
 def _scan(path: Path) -> dict[str, Any]:
     """Summarise frames, poses, duration, losses, session and provenance; memory grows by one time per message.
 
-    Nothing looks into the messages: those that hold what they must not are not met.
+    The content of the messages is not read, so faults in it are not reported.
     """
     records = scan_mcap.scan_records(path, keep=())
     with in_file(path):
@@ -288,7 +291,7 @@ def _scan(path: Path) -> dict[str, Any]:
         provenance = scan_mcap.provenance_of(records)
     span_s = float(time_s[-1] - time_s[0]) if len(time_s) else 0.0
     account = records.metadata.get("recording", {})  # of the recorder, where it wrote the file
-    told = {name: account[name] for name in _ACCOUNT if account.get(name)}
+    recording = {name: account[name] for name in _ACCOUNT if account.get(name)}
     logs = [number for number, channel in records.channels.items() if channel.topic == "/log"]
     return {
         "schema": scan_mcap.SCAN_SCHEMA,
@@ -302,7 +305,7 @@ def _scan(path: Path) -> dict[str, Any]:
         "frame_rate_hz": (len(time_s) - 1) / span_s if span_s > 0 else None,
         "frames_missing": missing_records(time_s),
         "notes": sum(len(records.by_channel.get(number, ())) for number in logs),
-        **({"recording": told} if told else {}),
+        **({"recording": recording} if recording else {}),
         "landmarks": all(touches[name] for name in scan_mcap.LANDMARK_NAMES),
         "nipple": touches[scan_mcap.NIPPLE] > 0,
         "units": {"counts": "raw, 0 to saturation", "pressure": "kPa", "position": "mm", "time": "s"},

@@ -39,20 +39,21 @@ def simulate_action(
     force: bool,
 ) -> None:
     """Make a scan with known truth from SCENE, a TOML file."""
-    drawn = read_scene(scene)
-    for lump in drawn.solid_lumps if fidelity == "empirical" else ():
+    stated = read_scene(scene)
+    for lump in stated.solid_lumps if fidelity == "empirical" else ():
         if warning := outside_range(lump.d_mm, lump.depth_ratio):
             click.echo(warning, err=True)
-    used = drawn.seed if seed is None else seed
+    seed = stated.seed if seed is None else seed
     with progress_bar("frames") as progress:
-        made = simulate(drawn, rng=np.random.default_rng(used), fidelity=fidelity, head=head, progress=progress)
+        simulated = simulate(stated, rng=np.random.default_rng(seed), fidelity=fidelity, head=head, progress=progress)
+    scan, truth = simulated.scan, simulated.truth
     inputs = hash_inputs(scene=scene, session=session_file)
-    provenance = Provenance("simulate", {"model": made.truth["model"]}, inputs, seed=used)
-    write_scan(output, with_session(made.scan, session_file), provenance=provenance, truth=made.truth, force=force)
-    shape = f": {made.truth['shape']}" if made.truth.get("shape") else ""
-    lines = [f"{output}: scan, seed {used}", *describe_scan(made.scan), f"model {made.truth['model']}{shape}"]
-    lines += [f"head: {made.truth['head']}"] if "head" in made.truth else []
-    for line in (*lines, *_scene_lines(drawn), RESEARCH_USE):
+    provenance = Provenance("simulate", {"model": truth["model"]}, inputs, seed=seed)
+    write_scan(output, with_session(scan, session_file), provenance=provenance, truth=truth, force=force)
+    shape = f": {truth['shape']}" if truth.get("shape") else ""
+    lines = [f"{output}: scan, seed {seed}", *describe_scan(scan), f"model {truth['model']}{shape}"]
+    lines += [f"head: {truth['head']}"] if "head" in truth else []
+    for line in (*lines, *_scene_lines(stated), RESEARCH_USE):
         click.echo(line)
 
 
@@ -83,16 +84,17 @@ def population_action(
     **options: Any,
 ) -> None:
     """Simulate exams of varied bodies and fit their maps: the table that a size calibration is learned from."""
-    drawn = read_toml_record(bodies_file, BodiesFile, way_out="see bodies.schema.json") if bodies_file else BodiesFile()
-    asked = PopulationOptions(**options)
-    # results are kept by number: where the centred ones begin decides what a number is
+    way_out = "see bodies.schema.json"
+    ranges = BodiesFile() if bodies_file is None else read_toml_record(bodies_file, BodiesFile, way_out=way_out)
+    sample = PopulationOptions(**options)
+    # results are stored by number, and the number of the first centred body is one of the store's settings
     population = Population(
-        scans=asked.scans,
-        seed=asked.seed,
-        first_centred=asked.masses if asked.centred else None,
-        normalise=tuple(dict.fromkeys(asked.normalise)),
-        bodies=drawn.bodies,
-        exams=drawn.exams,
+        scans=sample.scans,
+        seed=sample.seed,
+        first_centred=sample.masses if sample.centred else None,
+        normalise=tuple(dict.fromkeys(sample.normalise)),
+        bodies=ranges.bodies,
+        exams=ranges.exams,
         head=read_simulated_head(head) if head else Head(),
     )
     with (
@@ -100,7 +102,7 @@ def population_action(
         open_store_beside(output, list[MassRow], settings=as_dict(population)) as store,
         progress_bar("masses") as progress,
     ):
-        masses = range(asked.masses + asked.centred)
+        masses = range(sample.masses + sample.centred)
         outcomes = run_batch(population.rows, masses, key=str, executor=executor, store=store, progress=progress)
     rows = [row for outcome in outcomes for row in outcome.value or []]
     write_text(output, table_text(rows), force=force)
@@ -109,9 +111,9 @@ def population_action(
         click.echo(f"could not be simulated: mass {line}", err=True)
     if not failed:
         store_path(output).unlink(missing_ok=True)
-    found = sum(row.detected for row in rows)
+    detected = sum(row.detected for row in rows)
     done = len(outcomes) - len(failed)
-    click.echo(f"{output}: {done} masses, {len(rows)} exams, a lump found in {found}, seed {asked.seed}")
+    click.echo(f"{output}: {done} masses, {len(rows)} exams, a lump found in {detected}, seed {sample.seed}")
     click.echo(RESEARCH_USE)
     if failed:
         missing = f"{len(failed)} of {len(outcomes)} masses are missing"

@@ -62,16 +62,16 @@ from tactile_bayes.studies.paper_solid import SolidSettings
 
 
 def read_frames(path: Path) -> list[MeasuredFrame]:
-    """The frames of a table, one for each place of the head, in the order in which they first appear."""
+    """Frames of a table, one for each position of the head, in the order in which they first appear."""
     columns = read_table(path, "measured_frames.table.json").columns
-    place = np.array([0.0 if x is None else x for x in columns["x_c_mm"]])
+    x_c = np.array([0.0 if x is None else x for x in columns["x_c_mm"]])
     s, pressure = np.array(columns["s_mm"]), np.array(columns["pressure_kpa"])
     with in_file(path):
-        return [MeasuredFrame(x, s[place == x], pressure[place == x]) for x in dict.fromkeys(place.tolist())]
+        return [MeasuredFrame(x, s[x_c == x], pressure[x_c == x]) for x in dict.fromkeys(x_c.tolist())]
 
 
 def prepare_figures(folder: Path, *, model: str, force: bool) -> list[Path]:
-    """Paths of figures 5 to 8, and in two dimensions of the frames of four lumps; none of them may exist already."""
+    """Paths of figures 5 to 8, in two dimensions of the frames of four lumps too; an error if one exists."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -83,7 +83,7 @@ def prepare_figures(folder: Path, *, model: str, force: bool) -> list[Path]:
 
 
 RECIPE = ("normalise", "background", "fit_radius_mm", "noise", "flat_field")
-"""Columns that say how the maps of a table were made and fitted; `calibrate size` refuses what contradicts them."""
+"""Columns on how a table's maps were made and fitted; `calibrate size` refuses options that contradict them."""
 
 
 def study_action(
@@ -99,14 +99,14 @@ def study_action(
 ) -> None:
     """Run the forward study of section 2.4: amplitude and width of the map over sizes, depths and stiffnesses."""
     section = {name: options.pop(name) for name in names_of(SectionOptions)}
-    asked = StudyOptions(**options)
-    chosen, model = parse_seat(asked.seat), asked.model
-    settings = study_settings(asked, SectionOptions(**section))
+    study = StudyOptions(**options)
+    seat, model = parse_seat(study.seat), study.model
+    settings = study_settings(study, SectionOptions(**section))
     if (measured_frames or phantom) and (figures is None or model != "plane-strain"):
-        named = "--measured-frames" if measured_frames else "--phantom"
-        raise UsageError(f"{named} is for --figures of the plane-strain model; give --figures DIR")
+        option = "--measured-frames" if measured_frames else "--phantom"
+        raise UsageError(f"{option} is for --figures of the plane-strain model; give --figures DIR")
     frames = [] if measured_frames is None else read_frames(measured_frames)
-    geometries = paper.paper_grid(chosen) if asked.grid == "paper" else read_grid(Path(asked.grid), seat=chosen)
+    geometries = paper.paper_grid(seat) if study.grid == "paper" else read_grid(Path(study.grid), seat=seat)
     paths = [] if figures is None else prepare_figures(figures, model=model, force=force)
     with open_executor(workers=workers, cluster=scheduler) as executor:
         rows = run_study(geometries, settings=settings, executor=executor, output=output)
@@ -116,37 +116,38 @@ def study_action(
         write_text(output, table_text(rows), force=force)
         store_path(output).unlink(missing_ok=True)
     click.echo(study_text(rows), err=output is None)
-    told = [RESEARCH_USE]
+    lines = [RESEARCH_USE]
     if paths:
         lump = phantom or PHANTOMS["phantom 12.5 mm"]  # without a phantom and its frames figure 6 shows the paper's
         flat = settings if isinstance(settings, paper.StudySettings) else None
-        compared = compare_frames(frames, *lump, seat=chosen, settings=flat) if frames and flat else []
-        found = study_figures(rows, settings, paths, seat=chosen, phantom=lump, measured=compared, force=force)
+        compared = compare_frames(frames, *lump, seat=seat, settings=flat) if frames and flat else []
+        lookalikes = study_figures(rows, settings, paths, seat=seat, phantom=lump, measured=compared, force=force)
         four = " and the frames of four lumps" if flat else ""
-        told = [f"figures 5 to 8{four} are in {figures}", RESEARCH_USE]
-        told = [lookalikes_text(found), *frames_text(compared), *told] if flat else told
-    for line in told:
+        lines = [f"figures 5 to 8{four} are in {figures}", RESEARCH_USE]
+        lines = [lookalikes_text(lookalikes), *frames_text(compared), *lines] if flat else lines
+    for line in lines:
         click.echo(line, err=output is None)
 
 
-def study_settings(asked: StudyOptions, at: SectionOptions) -> paper.StudySettings | SolidSettings:
+def study_settings(study: StudyOptions, section: SectionOptions) -> paper.StudySettings | SolidSettings:
     """Make the settings of the study of a model."""
-    default = SHOULDERS_INSIDE if asked.model == "plane-strain" else SHOULDERS_OUTSIDE
-    section = _section(at, asked.head or default)
-    case = {name: getattr(asked, name) for name in names_of(CaseOptions)}
-    if asked.model == "plane-strain":
-        if asked.background == "free" or asked.flat_field:
-            named = "--background free" if asked.background == "free" else "--flat-field"
-            raise UsageError(f"{named} is for --model solid: in two dimensions Eq 5 is fitted with a background of 1")
-        return paper.StudySettings(head=section, **case)
-    array = Array(radius_mm=at.head_radius_mm, rim_mm=at.shoulder_mm).with_shoulders(section.shoulders)
-    solid: dict[str, Any] = {"background": asked.background or "free", "flat_field": asked.flat_field is not False}
+    default = SHOULDERS_INSIDE if study.model == "plane-strain" else SHOULDERS_OUTSIDE
+    head = _section_head(section, study.head or default)
+    case = {name: getattr(study, name) for name in names_of(CaseOptions)}
+    if study.model == "plane-strain":
+        if study.background == "free" or study.flat_field:
+            option = "--background free" if study.background == "free" else "--flat-field"
+            raise UsageError(f"{option} is for --model solid: in two dimensions Eq 5 is fitted with a background of 1")
+        return paper.StudySettings(head=head, **case)
+    array = Array(radius_mm=section.head_radius_mm, rim_mm=section.shoulder_mm).with_shoulders(head.shoulders)
+    solid: dict[str, Any] = {"background": study.background or "free", "flat_field": study.flat_field is not False}
     return SolidSettings(head=array, **case, **solid)
 
 
-def _section(at: SectionOptions, shoulders: str | None) -> Head:
-    """The head's section; its shoulders lie inside the sensing width where nobody says."""
-    return Head(radius_mm=at.head_radius_mm, shoulder_mm=at.shoulder_mm, shoulders=shoulders or SHOULDERS_INSIDE)
+def _section_head(section: SectionOptions, shoulders: str | None) -> Head:
+    """The head of a cross-section; its shoulders lie inside the sensing width by default."""
+    shoulders = shoulders or SHOULDERS_INSIDE
+    return Head(radius_mm=section.head_radius_mm, shoulder_mm=section.shoulder_mm, shoulders=shoulders)
 
 
 def read_grid(path: Path, *, seat: float) -> list[paper.Geometry]:
@@ -176,9 +177,9 @@ def run_study(
             outcomes = run_batch(
                 settings.rows, geometries, key=attrgetter("key"), executor=executor, store=store, progress=progress
             )
-        except BatchInterrupted as stop:
-            if output is None:  # else the next run goes on
-                click.echo(table_text(_rows(stop.outcomes)), nl=False)
+        except BatchInterrupted as interrupt:
+            if output is None:  # no later run can resume
+                click.echo(table_text(_rows(interrupt.outcomes)), nl=False)
             raise
     failed = [outcome for outcome in outcomes if not outcome.ok]
     if failed:
@@ -206,33 +207,33 @@ def table_text(rows: list[paper.StudyRow]) -> str:
 
 def tables_action(*, seat: str, head: str | None, search: bool, workers: int, as_json: bool, **section: float) -> None:
     """Recompute Tables 1 and 2 of the paper beside the printed figures."""
-    at = parse_seat(seat)
-    asked = _section(SectionOptions(**section), head)
-    nearest = NEAREST_HEADS.get(at)
-    heads = list(dict.fromkeys([asked, *([nearest] if nearest else []), *(TRIED_HEADS if search else ())]))
-    found, phantoms = run_tables(at, heads=heads, workers=workers)
+    seat_value = parse_seat(seat)
+    stated = _section_head(SectionOptions(**section), head)
+    nearest = NEAREST_HEADS.get(seat_value)
+    heads = list(dict.fromkeys([stated, *([nearest] if nearest else []), *(TRIED_HEADS if search else ())]))
+    lumps, phantoms = run_tables(seat_value, heads=heads, workers=workers)
     if as_json:
-        click.echo(json.dumps(laboratory.tables_document(found, phantoms, seat=at), indent=2))
+        click.echo(json.dumps(laboratory.tables_document(lumps, phantoms, seat=seat_value), indent=2))
         return
-    beside = found[nearest] if nearest and nearest != asked else None
-    click.echo(laboratory.tables_text(found[asked], phantoms[asked], head=asked, nearest=nearest, beside=beside))
+    beside = lumps[nearest] if nearest and nearest != stated else None
+    click.echo(laboratory.tables_text(lumps[stated], phantoms[stated], head=stated, nearest=nearest, beside=beside))
     if search:
-        click.echo(laboratory.heads_text(found))
+        click.echo(laboratory.heads_text(lumps))
     click.echo(RESEARCH_USE)
 
 
 def run_tables(seat: float, *, heads: Sequence[Head], workers: int) -> tuple[laboratory.ByHead, laboratory.ByHead]:
     """Agreement of both models over the cases of the tables, and over the phantoms, under each head."""
-    scenes = table_scenes(seat) + phantom_scenes(seat)
+    lumps, phantoms = table_scenes(seat), phantom_scenes(seat)
     work = partial(compare_heads, settings=paper.StudySettings(), heads=heads)
     with open_executor(workers=workers) as executor, progress_bar("lumps") as progress:
-        outcomes = run_batch(work, scenes, key=lambda scene: scene.name, executor=executor, progress=progress)
+        outcomes = run_batch(work, lumps + phantoms, key=lambda scene: scene.name, executor=executor, progress=progress)
     for outcome in outcomes:
         if outcome.value is None:
             raise TactileBayesError(f"{outcome.key}: {outcome.error}")
-    count, by_head = len(table_scenes(seat)), zip(*(outcome.value or [] for outcome in outcomes), strict=True)
-    found = dict(zip(heads, by_head, strict=True))
-    return {head: rows[:count] for head, rows in found.items()}, {head: rows[count:] for head, rows in found.items()}
+    by_head = dict(zip(heads, zip(*(outcome.value or [] for outcome in outcomes), strict=True), strict=True))
+    count = len(lumps)
+    return {head: r[:count] for head, r in by_head.items()}, {head: r[count:] for head, r in by_head.items()}
 
 
 def head_uniformity_action(
@@ -241,26 +242,26 @@ def head_uniformity_action(
     """Compute how evenly one head presses on homogeneous tissue."""
     body = paper.HomogeneousTissue(**tissue)
     section = SectionOptions(head_radius_mm=head_radius_mm, shoulder_mm=shoulder_mm)
-    found, limit = paper.uniformity(_section(section, head), body), body.limit_percent / 100
+    uniformity, limit = paper.uniformity(_section_head(section, head), body), body.limit_percent / 100
     if as_json:
-        click.echo(json.dumps(paper_head.uniformity_document(found, body, limit=limit), indent=2))
+        click.echo(json.dumps(paper_head.uniformity_document(uniformity, body, limit=limit), indent=2))
     else:
-        click.echo(f"{paper_head.uniformity_text(found, body, limit=limit)}\n{RESEARCH_USE}")
+        click.echo(f"{paper_head.uniformity_text(uniformity, body, limit=limit)}\n{RESEARCH_USE}")
 
 
 def head_design_action(*, head: str | None, figure: Path | None, as_json: bool, force: bool, **tissue: Any) -> None:
     """Find the head that presses evenly on homogeneous tissue (section 2.1 of the paper)."""
     body = paper.HomogeneousTissue(**tissue)
     limit = body.limit_percent / 100
-    found = paper.search_heads(body, kinds=HEADS if head is None else (head,))
+    candidates = paper.search_heads(body, kinds=HEADS if head is None else (head,))
     if figure is not None:
-        paper_head.design_figure(found, body, limit=limit, path=figure, force=force)
+        paper_head.design_figure(candidates, body, limit=limit, path=figure, force=force)
     if as_json:
-        click.echo(json.dumps(paper_head.design_document(found, body, limit=limit), indent=2))
+        click.echo(json.dumps(paper_head.design_document(candidates, body, limit=limit), indent=2))
     else:
-        click.echo(f"{paper_head.design_text(found, body, limit=limit)}\n{RESEARCH_USE}")
-    if paper.narrowest(found, limit=limit) is None:
-        best = paper.most_even(found)
+        click.echo(f"{paper_head.design_text(candidates, body, limit=limit)}\n{RESEARCH_USE}")
+    if paper.narrowest(candidates, limit=limit) is None:
+        best = paper.most_even(candidates)
         raise UsageError(
             f"no head keeps the pressure within {body.limit_percent:g} % of its mean: the most even one, "
             f"{paper_head.named(best.head)}, reaches {100 * best.worst:.1f} %; give a larger --limit-percent, narrower "
@@ -286,22 +287,24 @@ def compare_model_action(
     if at is None and not (body.solid_lumps or body.lumps):
         at = (0.0, 0.0)  # no lump to look for: the middle of the strokes
     measured = measured_frames(loaded, place_mm=at, **options)
-    found = []
+    comparisons = []
     for fidelity in dict.fromkeys(fidelities or (body.fidelity,)):
         warnings = [outside_range(one.d_mm, one.depth_ratio) for one in body.solid_lumps if fidelity == "empirical"]
         for warning in filter(None, warnings):
             click.echo(warning, err=True)
         with progress_bar(f"frames, {fidelity}") as progress:
-            found.append(compare_model(measured, body, fidelity=fidelity, head=head, progress=progress))
+            comparisons.append(compare_model(measured, body, fidelity=fidelity, head=head, progress=progress))
     if figure is not None:
-        paper_head.comparison_figure(measured, found, figure, title=f"{scan.stem} against {scene.stem}", force=force)
+        paper_head.comparison_figure(
+            measured, comparisons, figure, title=f"{scan.stem} against {scene.stem}", force=force
+        )
     if as_json:
-        document = paper_head.comparison_document(measured, found, inputs=hash_inputs(scan=scan, scene=scene))
+        document = paper_head.comparison_document(measured, comparisons, inputs=hash_inputs(scan=scan, scene=scene))
         click.echo(dump_json(document), nl=False)
         return
     for line in finding_lines(scan_findings(loaded)):
         click.echo(line, err=True)
-    click.echo(f"{paper_head.comparison_text(measured, found)}\n{RESEARCH_USE}")
+    click.echo(f"{paper_head.comparison_text(measured, comparisons)}\n{RESEARCH_USE}")
 
 
 def sbc_action(
@@ -314,30 +317,30 @@ def sbc_action(
     **options: Any,
 ) -> None:
     """Check the posterior against itself: simulation-based calibration and coverage."""
-    asked, begun = SbcOptions(**options), monotonic()
-    how: dict[str, Any] = {"method": asked.method, "seed": asked.seed, "cosines": asked.field_cosines}
+    run, begun = SbcOptions(**options), monotonic()
+    settings: dict[str, Any] = {"method": run.method, "seed": run.seed, "cosines": run.field_cosines}
 
-    def report(found: list[sbc.MapRanks], speed: float | None) -> None:
-        document = laboratory.sbc_document(found, maps_per_s=speed, **how)
+    def report(ranks: list[sbc.MapRanks], speed: float | None) -> None:
+        document = laboratory.sbc_document(ranks, maps_per_s=speed, **settings)
         click.echo(dump_json(document) if as_json else laboratory.sbc_text(document), nl=False)
 
     try:
         with (
             open_executor(workers=workers, cluster=scheduler) as executor,
-            open_store_beside(output, sbc.MapRanks, settings=sbc.settings(size=DEFAULT, **how)) as store,
+            open_store_beside(output, sbc.MapRanks, settings=sbc.settings(size=DEFAULT, **settings)) as store,
             progress_bar("maps") as progress,
         ):
-            made = max(asked.maps - (0 if store is None else len(store)), 0)  # by this run
-            work = partial(ranks_of_map, **how)
-            outcomes = run_batch(work, range(asked.maps), key=str, executor=executor, store=store, progress=progress)
-    except BatchInterrupted as stop:
-        if output is None:  # else the next run goes on
-            report([one.value for one in stop.outcomes if one.value is not None], None)
+            made = max(run.maps - (0 if store is None else len(store)), 0)  # by this run
+            work = partial(ranks_of_map, **settings)
+            outcomes = run_batch(work, range(run.maps), key=str, executor=executor, store=store, progress=progress)
+    except BatchInterrupted as interrupt:
+        if output is None:  # no later run can resume
+            report([one.value for one in interrupt.outcomes if one.value is not None], None)
         raise
     speed = made / (monotonic() - begun) if made else None
-    found = [outcome.value for outcome in outcomes if outcome.value is not None]
+    ranks = [outcome.value for outcome in outcomes if outcome.value is not None]
     if output is not None:
-        write_text(output, laboratory.table_text(found), force=force)
+        write_text(output, laboratory.table_text(ranks), force=force)
     failed = [outcome for outcome in outcomes if not outcome.ok]
     for line in fault_lines(failed):
         click.echo(f"could not be estimated: map {line}", err=True)
@@ -345,15 +348,15 @@ def sbc_action(
         store_path(output).unlink(missing_ok=True)
     try:
         if figure is not None:
-            laboratory.sbc_figure(found, figure, force=force)
-    finally:  # what was computed is not lost with the figure
-        report(found, speed)
+            laboratory.sbc_figure(ranks, figure, force=force)
+    finally:  # a figure that cannot be written loses no result
+        report(ranks, speed)
     if failed:
         raise TactileBayesError(f"{len(failed)} of {len(outcomes)} maps are missing from this report")
 
 
 def ranks_of_map(index: int, *, method: Method, seed: int, cosines: FieldCosines) -> sbc.MapRanks:
-    """Ranks of one map, in any process."""
+    """Ranks of one map by the shipped calibration, which each process reads once."""
     return sbc.ranks_of_map(index, method=method, seed=seed, calibration=_shipped(), cosines=cosines)
 
 

@@ -212,20 +212,20 @@ def tradeoff_estimate_action(
         work = Work(time.process_time, tolerance_mm, runs, forecast, progress, settings.seed, settings.interval)
         tactile_map = read_map(maps[0])
         with in_file(maps[0]):
-            calibration, options = estimate_inputs(settings, tactile_map)
-            ladder = measure(tactile_map, calibration=calibration, options=options, work=work)
+            calibration, sampler = estimate_inputs(settings, tactile_map)
+            ladder = measure(tactile_map, calibration=calibration, options=sampler, work=work)
         if len(maps) > 1:
             ladder = replace(ladder, pooled=pooled_rows(maps, settings, clock=time.process_time))
-    said = [] if size_calibration is None else ["--size-calibration", size_calibration]
-    said += [] if centre_mm is None else ["--centre-mm", *map(repr, centre_mm)]
-    said += [] if settings_file is None else ["--settings", str(settings_file)]
-    cold = fresh_cpu_s(["estimate", str(maps[0]), *said])  # the same as the default row
-    if cold is not None:
-        shared = {"start of the program and reading the map": max(cold - ladder.default.seconds, 0.0)}
+    words = ["estimate", str(maps[0])]  # the command of the default row
+    words += [] if size_calibration is None else ["--size-calibration", size_calibration]
+    words += [] if centre_mm is None else ["--centre-mm", *map(repr, centre_mm)]
+    words += [] if settings_file is None else ["--settings", str(settings_file)]
+    if (cold_s := fresh_cpu_s(words)) is not None:
+        shared = {"start of the program and reading the map": max(cold_s - ladder.default.seconds, 0.0)}
         ladder = replace(ladder, shared_cpu_s=shared)
     inputs = hash_inputs(**{f"map_{number}": path for number, path in enumerate(maps, start=1)})
-    kept = {"size_calibration": size_calibration, "tolerance_mm": tolerance_mm, "runs": runs}
-    provenance = [Provenance("tradeoff estimate", kept, inputs, seed=seed)]
+    options = {"size_calibration": size_calibration, "tolerance_mm": tolerance_mm, "runs": runs}
+    provenance = [Provenance("tradeoff estimate", options, inputs, seed=seed)]
     ladders = {f"{maps[0].stem}: what more time for `estimate` buys": ladder}
     return _show(ladders, varied="estimate", figure=figure, as_json=as_json, force=force, provenance=provenance)
 
@@ -234,7 +234,7 @@ def tradeoff_map_action(
     scan: Path, tolerance_mm: float, runs: int, figure: Path | None, seed: int, as_json: bool, force: bool
 ) -> int:
     """Measure what each setting of `map` costs on a scan, and how far it moves the size interval."""
-    read_scan(scan)  # imports and first calls cost nothing afterwards
+    read_scan(scan)  # the second call is timed: the first one imports
     begun = time.process_time()
     loaded = read_scan(scan)
     read_s = time.process_time() - begun
@@ -243,7 +243,7 @@ def tradeoff_map_action(
         work = Work(time.process_time, tolerance_mm, runs, forecast, progress, seed, settings.interval)
         ladder = tradeoffs.measure_map(loaded, inputs=partial(estimate_inputs, settings), work=work)
     ladder = replace(ladder, shared_cpu_s={"reading the scan": read_s})
-    kept = {"tolerance_mm": tolerance_mm, "runs": runs}
-    provenance = [Provenance("tradeoff map", kept, hash_inputs(scan=scan), seed=seed)]
+    options = {"tolerance_mm": tolerance_mm, "runs": runs}
+    provenance = [Provenance("tradeoff map", options, hash_inputs(scan=scan), seed=seed)]
     ladders = {f"{scan.stem}: what finer cells and more frames buy": ladder}
     return _show(ladders, varied="map", figure=figure, as_json=as_json, force=force, provenance=provenance)

@@ -31,7 +31,7 @@ from tactile_bayes.actions.live_view import Estimator
 if __name__ == "__main__":
     estimator = Estimator(None)
     while estimator.done == 0:
-        estimator.look(None)
+        estimator.poll(None)
         time.sleep(0.01)
     print(*[child.pid for child in multiprocessing.active_children()], flush=True)
     if "close" in sys.argv:

@@ -304,26 +304,26 @@ def test_an_address_of_this_computer(text, address):
 def test_the_estimate_looks_at_one_rise_a_time_and_stays_where_a_lump_was():
     turn, seen, shown = RiseRotation(), [], []
     for _ in range(20):
-        seen.append(turn.of(4))
-        shown.append(turn.tell(lump=seen[-1] == 2))
+        seen.append(turn.next_of(4))
+        shown.append(turn.record(lump=seen[-1] == 2))
     assert seen == [0, 1, 2, 2, 2, 2, 2, 0, 2, 2, 2, 2, 2, 2, 2, 0, 2, 2, 2, 2]
     assert [place for place, told in enumerate(shown) if not told] == [7, 15]  # a glance at the highest: nothing new
     turn = RiseRotation()
-    assert [(turn.of(2), turn.tell(lump=False))[0] for _ in range(5)] == [0, 1, 0, 1, 0]
+    assert [(turn.next_of(2), turn.record(lump=False))[0] for _ in range(5)] == [0, 1, 0, 1, 0]
     higher = RiseRotation()
-    assert [(at := higher.of(3), higher.tell(lump=at == 1))[0] for _ in range(4)] == [0, 1, 1, 1]
+    assert [(at := higher.next_of(3), higher.record(lump=at == 1))[0] for _ in range(4)] == [0, 1, 1, 1]
     for _ in range(4):
-        at = higher.of(3)
-        higher.tell(lump=True)
+        at = higher.next_of(3)
+        higher.record(lump=True)
     assert at == 0  # a new highest one is taken when it is looked at
 
 
 def test_the_next_fit_of_a_lump_begins_with_its_width_and_a_glance_does_not():
     turn, begun = RiseRotation(), []
     for number in range(9):
-        turn.of(2)
+        turn.next_of(2)
         begun.append(turn.width_mm)
-        turn.tell(lump=number > 0 and number != 7, width_mm=4.0 + number)
+        turn.record(lump=number > 0 and number != 7, width_mm=4.0 + number)
     assert begun == [None, None, 5.0, 6.0, 7.0, 8.0, 9.0, None, 10.0]
 
 
