@@ -30,6 +30,9 @@ def map_action(
         raise UsageError(f"{twice} is given twice; its frames would count twice: give each scan once")
     if output is None:
         output = default_map_path(scans[0])
+        if first_duplicate([*scans, output]) is not None:
+            read_scan(output)  # a map given in place of a scan is named as such
+            raise UsageError(f"{output} is an input of this command; name another with -o")
         if output.exists() and not force:
             raise UsageError(f"{output} exists; name another with -o, or give --force")
         refuse_existing(output, force=force)

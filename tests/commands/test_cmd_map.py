@@ -109,6 +109,21 @@ def test_a_map_without_a_name_is_beside_its_scan_and_named(folder, run_cli):
     assert run_cli("map", "exams/one.mcap", "--force", cwd=folder).returncode == 0
 
 
+def test_a_map_without_a_name_never_replaces_its_scan(folder, run_cli):
+    scan = (folder / "one.mcap").read_bytes()
+    (folder / "exam.nc").write_bytes(scan)
+    (folder / "one.nc").symlink_to("one.mcap")
+    for name, output in (("exam.nc", "exam.nc"), ("one.mcap", "one.nc")):
+        done = run_cli("map", name, "--force", cwd=folder)
+        said = f"error: {output} is an input of this command; name another with -o\n"
+        assert (done.returncode, done.stderr) == (2, said)
+        assert (folder / name).read_bytes() == scan
+    assert run_cli("map", "two.mcap", cwd=folder).returncode == 0
+    done = run_cli("map", "two.nc", cwd=folder)
+    assert done.returncode == 3
+    assert "two.nc: is a map or posterior (netCDF), not a scan" in done.stderr
+
+
 @pytest.mark.parametrize("words", [".", "..", "/", "folder", "none.mcap"])
 def test_what_is_no_scan_has_no_map_beside_it(words, tmp_path):
     (tmp_path / "folder").mkdir()
