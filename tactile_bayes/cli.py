@@ -14,13 +14,26 @@ import click
 
 from tactile_bayes import __version__
 from tactile_bayes.errors import EXIT_FAULT, EXIT_INTERRUPTED, EXIT_READER_GONE, EXIT_USAGE, TactileBayesError
-from tactile_bayes.shell import ReaderGoneError, interrupt_on_signals, protect_streams, release_streams
+from tactile_bayes.shell import (
+    LEAST_COLUMNS,
+    ReaderGoneError,
+    interrupt_on_signals,
+    protect_streams,
+    raw_stream,
+    release_streams,
+    terminal_columns,
+)
 
 _HYPHEN = "\ue000"  # Replaces a hyphen while lines are wrapped: "--array-calibration" is a word to copy.
 
 
 class UnbrokenHelp(click.HelpFormatter):
-    """Help whose lines do not break at hyphens."""
+    """Help whose lines fit narrow terminals too and do not break at hyphens."""
+
+    def __init__(self, indent_increment: int = 2, width: int | None = None, max_width: int | None = None) -> None:
+        super().__init__(indent_increment, width, max_width)  # never below 50 columns
+        if columns := terminal_columns(raw_stream(sys.stdout)):
+            self.width = min(self.width, max(columns, LEAST_COLUMNS) - 2)
 
     def write(self, string: str) -> None:
         super().write(string.replace(_HYPHEN, "-"))
@@ -29,6 +42,7 @@ class UnbrokenHelp(click.HelpFormatter):
         super().write_text(_unbroken(text))
 
     def write_dl(self, rows: Iterable[tuple[str, str]], col_max: int = 30, col_spacing: int = 2) -> None:
+        col_max = col_max if self.width >= 48 else 16  # else no room is left for the texts
         super().write_dl([(_unbroken(term), _unbroken(text)) for term, text in rows], col_max, col_spacing)
 
 
@@ -171,13 +185,6 @@ def _run() -> int:
     return status if isinstance(status, int) else 0
 
 
-_CLICK_WORDS = {
-    "is not a valid integer range": "is not a whole number",
-    "is not a valid integer": "is not a whole number",
-    "is not a valid float": "is not a number",
-}
-
-
 def _print_error(error: click.ClickException) -> None:
     """Print an error of click's in one line, as all others; the help where no command or argument was given."""
     context = error.ctx if isinstance(error, click.UsageError) else None
@@ -185,9 +192,11 @@ def _print_error(error: click.ClickException) -> None:
         error.show()
         return
     message = " ".join(error.format_message().split()).rstrip(".")
-    for theirs, ours in _CLICK_WORDS.items():
-        message = message.replace(theirs, ours)
-    advice = f"; see `{context.command_path} --help`" if context is not None else ""
+    message = message.replace("is not a valid float", "is not a number")
+    path = "" if context is None else context.command_path
+    if not path and isinstance(error, click.UsageError) and sys.argv[1:2] and sys.argv[1] in COMMANDS:
+        path = f"tactile-bayes {sys.argv[1]}"  # the parser's own errors have no context
+    advice = f"; see `{path} --help`" if path else ""
     click.echo(f"error: {message}{advice}", err=True)
 
 

@@ -81,10 +81,11 @@ _ENDS = ("min", "max")
 def number_words(least: float | None, most: float | None, open_ends: Collection[str], *, whole: bool = False) -> str:
     """The numbers that can be given, in words: ``a number above 0 and below 1``; `open_ends` are of "min" and "max"."""
     above, below = (end in open_ends for end in _ENDS)
-    words = "" if least is None else f" above {least:g}" if above else f" from {least:g}"
-    if most is not None:
-        joint = "" if least is None else " and" if above else " to"
-        words += f"{joint} below {most:g}" if below else f"{' to' if words and not above else ' up to'} {most:g}"
+    low, high = (None if end is None else f"{end:{'' if whole else 'g'}}" for end in (least, most))
+    words = "" if low is None else f" above {low}" if above else f" from {low}"
+    if high is not None:
+        joint = "" if low is None else " and" if above else " to"
+        words += f"{joint} below {high}" if below else f"{' to' if words and not above else ' up to'} {high}"
     elif words and not above:
         words += " on"
     return f"a {'whole ' if whole else ''}number{words}"

@@ -134,6 +134,21 @@ def test_an_estimate_fits_a_terminal_and_its_size_is_bold(columns, folder, child
 
 
 @pytest.mark.long
+@pytest.mark.parametrize(
+    ("words", "paragraph"),
+    [
+        ((), "  Start with `tactile-bayes demo`; the\n  way through is import, map,\n  estimate, report.\n"),
+        (("estimate",), "  Estimate a lump's size from tactile\n  maps, with a credible interval.\n"),
+    ],
+)
+def test_help_fits_a_narrow_terminal(words, paragraph, folder, child_environment):
+    """Its lines were made for 50 columns, and each was broken again."""
+    shown, code = on_a_terminal(*words, "--help", columns=40, environment=child_environment, cwd=folder)
+    assert code == 0
+    assert paragraph in shown
+    assert all(len(line) <= 40 or " " not in line.strip() for line in shown.splitlines())  # a long word is not cut
+
+
 def test_no_color_is_plain_and_errors_are_red(folder, child_environment):
     words, named = ("estimate", "none.nc"), {"environment": child_environment, "cwd": folder, "columns": 80}
     plain, code = on_a_terminal(*words, **named, NO_COLOR="1")

@@ -6,7 +6,17 @@ from typing import get_args
 
 import click
 
-from tactile_bayes.commands.options import FORCE, SPEED, FilePath, FiniteRange, command, number, output, record_options
+from tactile_bayes.commands.options import (
+    FORCE,
+    SPEED,
+    FilePath,
+    FiniteRange,
+    WholeRange,
+    command,
+    number,
+    output,
+    record_options,
+)
 from tactile_bayes.declarations import names_of
 from tactile_bayes.options import FaultOptions, RecordOptions
 from tactile_bayes.presets import TrackerProtocol
@@ -50,7 +60,7 @@ def record_command() -> None:
 @record_options(FaultOptions, "drop", "corrupt", "stall", "disconnect_s", show_default=False)
 @record_options(FaultOptions, "hold")
 @record_options(FaultOptions, "hide", "breathe_mm", show_default=False)
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Random seed of the faults.")
+@click.option("--seed", type=WholeRange(min=0), default=1, show_default=True, help="Random seed of the faults.")
 def emulate_command() -> None:
     """Serve a scan as a scan head or a tracker would send it, or as both, at its own rate, with faults on request.
 

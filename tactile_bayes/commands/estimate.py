@@ -48,7 +48,7 @@ def map_command() -> None:
 @options.figure("Draw data, fit and residual of the fit window, or the map where there is no estimate.", "--fit-figure")
 @options.record_options(Settings, "centre_mm", "scene", "settings_file", "accuracy_sd", "known", "repeatability")
 @click.option("--pool", is_flag=True, help="Pool the maps, all of one mass, into one size.")
-@options.number("--workers", click.IntRange(min=1), 1, "Number of worker processes, for several maps.")
+@options.number("--workers", options.WholeRange(min=1), 1, "Number of worker processes, for several maps.")
 @options.scheduler_option("several maps")
 @options.FORCE
 @click.option(

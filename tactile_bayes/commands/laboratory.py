@@ -121,7 +121,7 @@ def array() -> None:
 @options.command("simulate", "simulation.simulate_action")
 @click.argument("scene", type=options.FilePath())
 @click.option("-o", "--output", required=True, type=options.FilePath(writes="MCAP"), help="Scan file to write (.mcap).")
-@click.option("--seed", type=click.IntRange(min=0), help="Seed of the random numbers, in place of the scene's.")
+@click.option("--seed", type=options.WholeRange(min=0), help="Seed of the random numbers, in place of the scene's.")
 @click.option(
     "--fidelity",
     type=click.Choice(["empirical-gaussian", "empirical", "plane-strain", "solid"]),
@@ -343,7 +343,7 @@ def compare_model_command() -> None:
 
 # --- Options that the trade-off commands share.
 
-_RUN_COUNT = click.IntRange(1, 1000)
+_RUN_COUNT = options.WholeRange(1, 1000)
 _TOLERANCE = options.number(
     "--tolerance-mm",
     _ABOVE_0,

@@ -179,6 +179,15 @@ class FiniteRange(click.FloatRange):
         return "" if self.min is None and self.max is None else super()._describe_range()
 
 
+class WholeRange(click.IntRange):
+    """A whole number in a range."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        with contextlib.suppress(click.BadParameter):
+            return super().convert(value, param, ctx)
+        return self.fail(f"{str(value)!r} is not {number_words(self.min, self.max, (), whole=True)}", param, ctx)
+
+
 class NumberOr(_ParamType):
     """A number, whole or not, or one of some words."""
 
@@ -260,7 +269,7 @@ def _click_type(kind: Any) -> Any:
         return str
     least, most, open_ends = range_of(kind)
     if bare is int:
-        return click.IntRange(least, most)
+        return WholeRange(least, most)
     return FiniteRange(least, most, min_open="min" in open_ends, max_open="max" in open_ends)
 
 
@@ -309,7 +318,7 @@ SESSION = record_options(
 )
 JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 SPEED = number("--speed", FiniteRange(0.01, 100.0), 1.0, "Playback speed; 1 is real time.")
-WORKERS = number("--workers", click.IntRange(min=0), 1, "Number of worker processes.")
+WORKERS = number("--workers", WholeRange(min=0), 1, "Number of worker processes.")
 
 
 def scheduler_option(items: str) -> Decorator:

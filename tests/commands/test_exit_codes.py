@@ -74,6 +74,11 @@ def test_what_nohup_ignores_stays_ignored() -> None:
             "Invalid value for '--map-sd': 'nan' is not a number from 0 to 3; see `tactile-bayes plan --help`",
         ),
         (("calibrate", "size"), "Missing argument 'TABLE.csv'; see `tactile-bayes calibrate size --help`"),
+        (
+            ("plan", "--trials", "7"),
+            "Invalid value for '--trials': '7' is not a whole number from 50 to 1000000; "
+            "see `tactile-bayes plan --help`",
+        ),
         (("mapp",), "No such command 'mapp'. Did you mean 'map'?; see `tactile-bayes --help`"),
     ],
 )
