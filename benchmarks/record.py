@@ -22,7 +22,7 @@ from tactile_bayes.forward.scene import Lump, Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.hardware.emulated import EmulatedHead
 from tactile_bayes.hardware.head import HeadParser, encode_hello
-from tactile_bayes.hardware.recorder import Line, Recorder
+from tactile_bayes.hardware.recorder import DeviceLine, Recorder
 from tactile_bayes.scans import Scan
 
 RATE_HZ = 200.0
@@ -104,12 +104,12 @@ def record_pieces(data: Scan, pieces: list[bytes], path: Path) -> None:
             session={"source": "benchmark"},
             provenance=Provenance("benchmark", {}),
         )
-        line = Line("head", None, None, HeadParser(), b"", b"")  # type: ignore[arg-type]
+        line = DeviceLine("head", None, None, HeadParser(), b"", b"")  # type: ignore[arg-type]
         recorder = Recorder(line, None, writer)
         recorder.recording = True
         for number, piece in enumerate(pieces):
             for reading in line.parser.feed(piece):
-                recorder._read(line, reading, time.monotonic_ns())
+                recorder._process(line, reading, time.monotonic_ns())
             if number % 9 == 0:  # every 0.2 s of real time
                 writer.flush()
         writer.close({})

@@ -43,7 +43,7 @@ def calibrate_array_action(
     levels = []
     for (kpa, path), scan in zip(steps, scans, strict=True):
         with in_file(path):
-            levels.append(BladderStep.of(kpa, scan.frames.counts, saturation_count=saturation))
+            levels.append(BladderStep.from_frames(kpa, scan.frames.counts, saturation_count=saturation))
     fit = fit_array(levels, saturation_count=saturation)
     inputs = hash_inputs(**{f"step_{number}": path for number, (_, path) in enumerate(steps, start=1)})
     provenance = Provenance("calibrate array", {"pressure_kpa": [kpa for kpa, _ in steps]}, inputs)

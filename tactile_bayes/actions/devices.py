@@ -29,8 +29,8 @@ from tactile_bayes.hardware.emulated import (
     Emulator,
     Faults,
     Link,
+    Playback,
     PtyLink,
-    Stage,
     TcpLink,
 )
 from tactile_bayes.hardware.head import rotation_sense
@@ -48,7 +48,7 @@ def emulate_action(
     """Serve a scan as a scan head or a tracker would send it, or as both, at its own rate, with faults on request."""
     roles = ("head", "tracker") if kind == "both" else (kind,)
     faults = Faults(**fault_options)
-    stage, loaded = Stage(speed=speed), read_scan(scan)
+    stage, loaded = Playback(speed=speed), read_scan(scan)
     spoilt = faults.drop or faults.corrupt or faults.stall or faults.disconnect_s is not None
     if protocol == "ndi" and "tracker" in roles and (spoilt or once):
         raise UsageError(
@@ -85,7 +85,7 @@ def emulate_action(
             click.echo(f"{role}: {words}" if kind == "both" else words, err=True)
 
 
-def _device(kind: str, scan: Scan, protocol: str, faults: Faults, *, path: Path, shared: Stage | None) -> Device:
+def _device(kind: str, scan: Scan, protocol: str, faults: Faults, *, path: Path, shared: Playback | None) -> Device:
     """Make the emulated device; an NDI tracker, which only answers, follows a shared stage itself."""
     if not len(scan.frames if kind == "head" else scan.poses):
         missing = "frames" if kind == "head" else "poses"
@@ -148,7 +148,8 @@ def replay_action(*, scan: Path, output: Path | None, speed: float, **record_opt
     """Replay a scan through emulated devices, recorder and live view, as if it were being recorded."""
     original = read_scan(scan)
     with tempfile.TemporaryDirectory() as folder, _emulated(scan, speed, poses=bool(len(original.poses))) as urls:
-        options = {"like": scan, "clock": "shared", "at_once": True, "replayed": dict(original.session)}
+        options = {"like": scan, "clock": "shared", "at_once": True}
+        options |= {"replayed": dict(original.session), "replay_speed": speed}
         options |= record_options | {f"{role}_url": url for role, url in urls.items()} | {"tracker_protocol": "open"}
         if original.landmarks is not None:
             options["landmarks"] = scan

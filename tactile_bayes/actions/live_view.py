@@ -35,10 +35,10 @@ from tactile_bayes.hardware.live import (
     LiveMap,
     LiveServer,
     LiveState,
-    address_of,
     colour_limits,
-    fed,
     grey_levels,
+    parse_address,
+    read_feed,
 )
 from tactile_bayes.mapping.map import Orientation, TactileMap, block_sums, orientation_of
 from tactile_bayes.posterior.bump import candidate_centres
@@ -59,7 +59,7 @@ def live_view(
 ) -> Iterator[Any]:
     """Start the view's process; yields an observer for the recorder."""
     if serve:
-        address_of(serve)  # an error before anything is recorded
+        parse_address(serve)  # an error before anything is recorded
     calibration_file = size_calibration_path(size_calibration)
     setup = {
         "head": head_document(head),
@@ -218,7 +218,7 @@ def run(pipe: int, setup: dict[str, Any]) -> None:
         stack.callback(estimator.close)
         displays: list[Callable[[LiveState], None]] = []
         if setup["serve"]:
-            server = LiveServer(*address_of(setup["serve"]))
+            server = LiveServer(*parse_address(setup["serve"]))
             stack.callback(server.close)
             print(f"live view: {server.url}", file=sys.stderr, flush=True)
             displays.append(server.show)
@@ -226,7 +226,7 @@ def run(pipe: int, setup: dict[str, Any]) -> None:
             displays.append(stack.enter_context(terminal_view(keys=setup["keys"])))
         began = time.monotonic()
         drawn, drawings, newest = 0.0, 0, None
-        for batch in fed(pipe, BATCH_S):
+        for batch in read_feed(pipe, BATCH_S):
             live.take(batch)
             estimator.poll(newest)
             now = time.monotonic()

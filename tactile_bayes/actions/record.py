@@ -33,7 +33,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.ports import SILENT_S, Port, read_in_process
 from tactile_bayes.hardware.readings import Follower, HelloReading, Parser
-from tactile_bayes.hardware.recorder import LandmarkTouch, Line, Observer, Recorder, Report
+from tactile_bayes.hardware.recorder import DeviceLine, LandmarkTouch, Observer, Recorder, RecordingReport
 from tactile_bayes.hardware.serial_trackers import TRACKERS, check_head, open_tracker
 from tactile_bayes.options import RecordOptions
 from tactile_bayes.presets import PRESSURE_RANGE_KPA, RECORDING_KEYS, RESEARCH_USE
@@ -48,6 +48,7 @@ class Request(RecordOptions, kw_only=True):
     """Options of one recording, and the facts and settings that its file stores of them."""
 
     replayed: dict[str, str] = field(default_factory=dict)  #: Session of a scan that is replayed, kept unchanged.
+    replay_speed: float = 1.0  #: Seconds of a replayed scan in a second.
 
     def facts(self) -> dict[str, str]:
         """Session facts as text: from the file, overridden by options."""
@@ -225,7 +226,7 @@ def record_action(output: Path, **options: Any) -> int:
     return EXIT_INTERRUPTED if interrupted and request.duration_s is not None else EXIT_DONE
 
 
-def record_text(report: Report, *, output: str) -> str:
+def record_text(report: RecordingReport, *, output: str) -> str:
     """Summary of a recording and its losses."""
     rate = (report.frames - 1) / report.duration_s if report.frames > 1 and report.duration_s > 0 else 0.0
     dropped = f" (the head dropped {report.head_dropped})" if report.head_dropped else ""
@@ -251,7 +252,7 @@ def record_text(report: Report, *, output: str) -> str:
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
-def make_recording(request: Request) -> tuple[Report, bool]:
+def make_recording(request: Request) -> tuple[RecordingReport, bool]:
     """Check the devices, record and close the file; returns the report, and True if a signal ended it."""
     ndi = request.tracker_protocol == "ndi"
     for rom in request.tracker_rom:
@@ -300,6 +301,7 @@ def make_recording(request: Request) -> tuple[Report, bool]:
             duration_s=request.duration_s,
             rate_hz=hello.rate_hz / request.every,
             observer=observer,
+            speed=request.replay_speed,
         )
         for name, position_mm in {} if landmarks is None else landmarks.points().items():
             writer.add_landmark(name, position_mm, device_ns=0, host_ns=0)
@@ -316,7 +318,7 @@ def make_recording(request: Request) -> tuple[Report, bool]:
     return report, bool(signals)
 
 
-def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Line, Line | None], Follower]:
+def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[DeviceLine, DeviceLine | None], Follower]:
     """Open the ports, identify the devices, choose the tool, and start the reading processes."""
     port = Port(request.head_url, baud=request.head_baud, role="head")
     stack.callback(port.close)
@@ -332,7 +334,7 @@ def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Li
         )
         stack.callback(port.close)
         answer = driver.check(port, tool=request.tool, reference=request.reference)
-        for words in (f"no pose yet of {answer.unseen}" if answer.unseen else "", answer.read.remark):
+        for words in (f"no pose yet of {answer.unseen}" if answer.unseen else "", answer.parsed.remark):
             if words:
                 click.echo(f"{port.name}: {words}", err=True)
         devices.append((port, answer.parser(), driver.start, driver.stop, driver.silent_s))
@@ -341,7 +343,7 @@ def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[Li
     for port, reads, start, stop, silent_s in devices:
         stream = read_in_process(port)
         stack.callback(stream.close)
-        lines.append(Line(port.role, port, stream, reads, start, stop, silent_s))
+        lines.append(DeviceLine(port.role, port, stream, reads, start, stop, silent_s))
     for line in lines:
         line.stream.wait_until_ready()
     return hello, (lines[0], lines[1] if len(lines) > 1 else None), follower
@@ -361,7 +363,7 @@ def _check_fit(hello: HelloReading, head: HeadGeometry, request: Request) -> Non
         click.echo(f"one frame in {request.every}: {hello.rate_hz / request.every:g} Hz", err=True)
 
 
-def _run(recorder: Recorder, signals: list[str], head: HeadGeometry, request: Request) -> Report:
+def _run(recorder: Recorder, signals: list[str], head: HeadGeometry, request: Request) -> RecordingReport:
     wait, drawn = request.duration_s is None and not request.at_once, request.live and can_redraw()
     with Keys(recorder, head.scanhead_from_tracker, wait=wait, drawn=drawn) as keys:
         if not keys.waiting:
@@ -387,7 +389,7 @@ def record(
     tracker: str | None = None,
     session: PathLike | None = None,
     **options: Any,
-) -> Report:
+) -> RecordingReport:
     """Record a scan head and a tracker into a scan file for some seconds, starting now.
 
     Call it from the main thread: Ctrl-C ends the recording in order.

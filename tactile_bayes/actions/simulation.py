@@ -25,7 +25,7 @@ from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.options import PopulationOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.shell import progress_bar
-from tactile_bayes.studies.population import BodiesFile, MassRow, Population
+from tactile_bayes.studies.population import BodiesFile, ExamRow, Population
 
 
 def simulate_action(
@@ -99,7 +99,7 @@ def population_action(
     )
     with (
         open_executor(workers=workers, cluster=scheduler) as executor,
-        open_store_beside(output, list[MassRow], settings=as_dict(population)) as store,
+        open_store_beside(output, list[ExamRow], settings=as_dict(population)) as store,
         progress_bar("masses") as progress,
     ):
         masses = range(sample.masses + sample.centred)
@@ -120,6 +120,6 @@ def population_action(
         raise TactileBayesError(f"{missing}; {store_path(output)} keeps the others: run again")
 
 
-def table_text(rows: list[MassRow]) -> str:
+def table_text(rows: list[ExamRow]) -> str:
     """CSV of the rows, with the header of `data_schema/population.table.json`."""
-    return csv_text(names_of(MassRow), (as_dict(row).values() for row in rows), digits=8)
+    return csv_text(names_of(ExamRow), (as_dict(row).values() for row in rows), digits=8)

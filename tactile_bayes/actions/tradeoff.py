@@ -37,13 +37,13 @@ from tactile_bayes.studies import paper, tradeoffs
 from tactile_bayes.studies.estimate_tradeoff import (
     SIZE,
     Clock,
-    Ladder,
     PooledRow,
     SizeAnswer,
-    Work,
+    StudyRun,
+    Tradeoff,
+    answer_without_number,
     intervals,
     measure,
-    no_number,
 )
 
 
@@ -66,7 +66,7 @@ def pooled_rows(paths: Sequence[Path], settings: Settings, *, clock: Clock) -> t
 def _pooled_answer(pooled: PooledEstimate, settings: Settings) -> tuple[SizeAnswer, float | None]:
     """The size of this exam, and half the width of the interval of another one."""
     if pooled.size is None:
-        return no_number(pooled.reason), None
+        return answer_without_number(pooled.reason), None
     size = {SIZE: pooled.size.summarise(SIZE, probability=settings.interval)}
     answer = SizeAnswer("", None, settings.method, intervals(size), pooled.size.variance_share)
     if pooled.size.another_exam is None:
@@ -102,7 +102,7 @@ def forecast(seconds: float) -> None:
 
 
 def _show(
-    ladders: Mapping[str, Ladder],
+    ladders: Mapping[str, Tradeoff],
     *,
     varied: Varied,
     figure: Path | None,
@@ -145,7 +145,7 @@ def tradeoff_forward_action(
         protect_inputs(size_calibration_path(size_calibration))
     with in_file(scene or ""):
         drawn = Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)) if scene is None else read_scene(scene)
-        case = tradeoffs.case_of(drawn, head=head)
+        case = tradeoffs.lump_case(drawn, head=head)
     # a raster's frames are divided by their means
     default_rules = {tradeoffs.PLANE: "plane-strain", tradeoffs.SOLID: "solid-mean"}
     rules = {model: _rule(case, model, size_calibration or name) for model, name in default_rules.items()}
@@ -160,7 +160,7 @@ def tradeoff_forward_action(
     words = f"lump of {case.d_mm:g} mm, h/d {case.depth_ratio:g}, {case.stiffness_ratio:g} times as stiff as fat"
     ladders, provenance, inputs = {}, [], hash_inputs(scene=scene)
     for model, ladder in ladder_by_model.items():
-        shoulders, rule = case.of(model).head.shoulders, rules[model]
+        shoulders, rule = case.settings(model).head.shoulders, rules[model]
         ladders[f"{model}: {words}, {paper.seat_name(case.seat)}; head: {shoulders}"] = ladder
         settings = {"model": model, **lump, "head": shoulders, "size_calibration": size_calibration}
         settings |= {"sizes_by": rule.source, "sd_ln_d": finite(rule.scatter)}
@@ -169,9 +169,11 @@ def tradeoff_forward_action(
     return _show(ladders, varied="forward", figure=figure, as_json=as_json, force=force, provenance=provenance)
 
 
-def _measure_forward(case: tradeoffs.LumpCase, model: str, rule: tradeoffs.SizeRule, share: float, runs: int) -> Ladder:
+def _measure_forward(
+    case: tradeoffs.LumpCase, model: str, rule: tradeoffs.SizeRule, share: float, runs: int
+) -> Tradeoff:
     with progress_bar(f"settings, {model}") as progress:
-        work = Work(time.process_time, share, runs, progress=progress)
+        work = StudyRun(time.process_time, share, runs, progress=progress)
         return tradeoffs.measure_forward(case, model, rule, share=share, work=work)
 
 
@@ -179,7 +181,7 @@ def _rule(case: tradeoffs.LumpCase, model: str, name: str) -> tradeoffs.SizeRule
     """Rule from a model's widths to sizes: a calibration by name or path, or one learned here."""
     if name == LEARNED:
         with progress_bar(f"lumps for Eq 6, {model}") as progress:
-            return tradeoffs.learned_rule(tradeoffs.teach(case, model, progress=progress))
+            return tradeoffs.learned_rule(tradeoffs.training_rows(case, model, progress=progress))
     path = size_calibration_path(name)
     if path is None:
         raise UsageError(f"--size-calibration {name} gives no sizes; name a calibration, or say {LEARNED}")
@@ -209,7 +211,7 @@ def tradeoff_estimate_action(
     if settings.checkpoint is not None:
         raise UsageError("a checkpoint is of one estimate, and this command makes many; leave checkpoint out")
     with progress_bar("settings") as progress:
-        work = Work(time.process_time, tolerance_mm, runs, forecast, progress, settings.seed, settings.interval)
+        work = StudyRun(time.process_time, tolerance_mm, runs, forecast, progress, settings.seed, settings.interval)
         tactile_map = read_map(maps[0])
         with in_file(maps[0]):
             calibration, sampler = estimate_inputs(settings, tactile_map)
@@ -240,7 +242,7 @@ def tradeoff_map_action(
     read_s = time.process_time() - begun
     settings = Settings(seed=seed)
     with progress_bar("settings") as progress:
-        work = Work(time.process_time, tolerance_mm, runs, forecast, progress, seed, settings.interval)
+        work = StudyRun(time.process_time, tolerance_mm, runs, forecast, progress, seed, settings.interval)
         ladder = tradeoffs.measure_map(loaded, inputs=partial(estimate_inputs, settings), work=work)
     ladder = replace(ladder, shared_cpu_s={"reading the scan": read_s})
     options = {"tolerance_mm": tolerance_mm, "runs": runs}

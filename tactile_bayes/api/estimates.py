@@ -17,8 +17,8 @@ from tactile_bayes.api.settings import Settings, refuse_checkpoint
 from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError, check_choice, check_number
-from tactile_bayes.exports.exam import EstimateFile, MapFile, estimate_of, identity_of, read_exam, shared_facts
-from tactile_bayes.exports.run import FORMATS, Outputs, refuse_untaken
+from tactile_bayes.exports.exam import EstimateFile, MapFile, merged_identity, parse_estimate, read_exam, shared_facts
+from tactile_bayes.exports.run import FORMATS, Outputs, refuse_unsupported
 from tactile_bayes.exports.run import ExportFormat as Format
 from tactile_bayes.exports.run import export as exported_files
 from tactile_bayes.files.atomic import first_duplicate, sha256
@@ -340,7 +340,7 @@ def export(
     for name, value in identity.items():
         if not isinstance(value, str):
             raise UsageError(f"{name} is {value!r}; give a text")
-    refuse_untaken(to, identity)
+    refuse_unsupported(to, identity)
     several = as_list(files)
     outputs = Outputs(path_of(path), path_of(dictionary), to=to, force=force)
     outputs.check(files=bool(several))
@@ -349,7 +349,7 @@ def export(
         read = [_read(one) for one in several]
         if to == "dicom" and not any(isinstance(one, MapFile) for one in read):  # a report refers to its maps
             read = [*(_map_file(*one) for estimate in several for one in _maps_of(estimate)), *read]
-        who = identity_of(path_of(worklist), identity)
+        who = merged_identity(path_of(worklist), identity)
         exported, notes = exported_files(read, to=to, identity=who, id_from_scan=patient_id_from_scan)
     return ExportedFiles(outputs.write(exported), notes)
 
@@ -362,7 +362,7 @@ def _read(given: Any) -> MapFile | Sequence[EstimateFile]:
     if isinstance(given, SizeEstimate | PooledSize):
         document = given.answer.document if isinstance(given, SizeEstimate) else given.document
         digests = tuple(_map_file(*one).digest for one in _maps_of(given))
-        return [replace(estimate_of(document, _IN_PYTHON), maps=digests)]
+        return [replace(parse_estimate(document, _IN_PYTHON), maps=digests)]
     raise UsageError(f"{type(given).__name__} is nothing to export; give a map, an estimate, or the path of one")
 
 

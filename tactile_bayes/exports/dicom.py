@@ -24,12 +24,12 @@ from tactile_bayes.report.estimate_text import no_estimate_line
 from tactile_bayes.report.figure_file import plain_matplotlib
 from tactile_bayes.report.map import map_figure
 
-# --- What the DICOM objects of one export share: patient, study, equipment, identifiers, and their bytes.
+# --- Patient, study, equipment and identifiers, which the DICOM objects of one export share, and their bytes.
 
 MANUFACTURER: Final = "tactile_bayes (research software)"
 MODEL: Final = "tactile-bayes"
 EXPLICIT_LITTLE_ENDIAN: Final = "1.2.840.10008.1.2.1"
-# What highdicom writes by the clock; all may be left out.
+# Times of writing, which highdicom takes from the clock; all may be left out.
 _OF_THE_CLOCK: Final = (
     "InstanceCreationDate",
     "InstanceCreationTime",
@@ -45,17 +45,17 @@ class Study(Record, eq=False):
     identity: exam.Identity  #: As given; its `patient_id` may come from the scan.
     moment: exam.Moment
     content: exam.Moment
-    """`moment`, `content`: When the exam was and when the content was made, with the time of day."""
-    study_uid: str  #: As given, or by the content of the maps.
-    key: tuple[str, ...]  #: What identifiers of the objects follow from, besides their own content.
+    """`moment`, `content`: Date and time of the exam, and of the making of the content, with the time of day."""
+    study_uid: str  #: As given, or derived from the content of the maps.
+    key: tuple[str, ...]  #: Parts that the identifiers of all objects derive from, besides their content.
 
     def uid(self, role: str, *parts: str) -> str:
-        """Identifier of an object, or of its series, by the study and the object's content."""
+        """Identifier of an object or a series, derived from the study and from the content."""
         return exam.content_uid(role, self.study_uid, *self.key, *parts)
 
 
-def study_of(identity: exam.Identity, maps: Sequence[exam.MapFile]) -> Study:
-    """The study that maps of one exam belong to."""
+def make_study(identity: exam.Identity, maps: Sequence[exam.MapFile]) -> Study:
+    """Study of the maps of one exam."""
     moment, content = identity.study, identity.content
     if moment is None or content is None:
         way_out = "give --study-date YYYY-MM-DDTHH:MM, or a --worklist with study_date"
@@ -63,22 +63,24 @@ def study_of(identity: exam.Identity, maps: Sequence[exam.MapFile]) -> Study:
     for name, one in (("study-date", moment), ("content-date", content)):
         if not one.time:
             raise UsageError(f"DICOM needs the time of day; give --{name} {one.iso_date}THH:MM")
-    given = [f"{name}={value}" for name, value in sorted(identity.given.items())]
+    identity_lines = [f"{name}={value}" for name, value in sorted(identity.given.items())]
     digests = sorted(one.digest for one in maps)
     # equal for all exports of one exam, whatever else is exported with it
-    person = [line for line in given if line.startswith(("patient_id=", "issuer=", "accession=", "study_date="))]
+    person = [
+        line for line in identity_lines if line.startswith(("patient_id=", "issuer=", "accession=", "study_date="))
+    ]
     study_uid = identity.study_uid or exam.content_uid("study", *digests, *person)
-    return Study(identity, moment, content, study_uid, (__version__, *given))
+    return Study(identity, moment, content, study_uid, (__version__, *identity_lines))
 
 
 def add_study(dataset: Any, study: Study, source: exam.MapFile | None = None) -> None:
-    """Write the modules of patient, study and equipment into a dataset; what nobody gave stays empty.
+    """Write the modules of patient, study and equipment into a dataset; parts that nobody gave stay empty.
 
-    `source`: of an image, for what it shows: the breast and its side, neither of a phantom.
+    With `source`, the map of an image, also the breast and its side; a phantom has neither.
     """
     identity = study.identity
     dataset.SpecificCharacterSet = "ISO_IR 192"  # UTF-8
-    keywords = {**exam.ATTRIBUTES, "study_description": "StudyDescription", "study_id": "StudyID"}
+    keywords = {**exam.DICOM_KEYWORDS, "study_description": "StudyDescription", "study_id": "StudyID"}
     for name, keyword in keywords.items():
         if (value := getattr(identity, name)) or name not in ("issuer", "study_description"):
             setattr(dataset, keyword, value)
@@ -101,13 +103,13 @@ def add_study(dataset: Any, study: Study, source: exam.MapFile | None = None) ->
 
 
 def coded(code: exam.Code) -> Any:
-    """A concept as highdicom has it."""
-    return exam.required("highdicom").sr.CodedConcept(code.value, code.scheme, code.meaning)
+    """Convert a concept to highdicom's class."""
+    return exam.import_extra("highdicom").sr.CodedConcept(code.value, code.scheme, code.meaning)
 
 
 def item(**attributes: Any) -> Any:
     """A dataset of these attributes, for a sequence."""
-    dataset = exam.required("pydicom").Dataset()
+    dataset = exam.import_extra("pydicom").Dataset()
     for name, value in attributes.items():
         setattr(dataset, name, value)
     return dataset
@@ -132,8 +134,8 @@ def declare_scheme(dataset: Any) -> None:
 
 
 def dicom_bytes(dataset: Any) -> bytes:
-    """The dataset as a file of DICOM's part 10; nothing in it depends on the clock."""
-    pydicom = exam.required("pydicom")
+    """Bytes of a dataset as a DICOM part 10 file; nothing in them depends on the clock."""
+    pydicom = exam.import_extra("pydicom")
     for one in (dataset, *dataset.get("ContributingEquipmentSequence", ())):
         for name in _OF_THE_CLOCK:
             if name in one:
@@ -153,13 +155,13 @@ def dicom_bytes(dataset: Any) -> bytes:
     return buffer.getvalue()
 
 
-# --- The map's figure as pixels, drawn from what an estimate's file says.
+# --- The map's figure as pixels, with the estimate where there is one.
 
-_MOST_NOTE: Final = 400  #: Characters that have a place above the figure.
+_MOST_NOTE: Final = 400  #: Characters that fit above the figure.
 
 
 def map_picture(source: exam.MapFile, estimate: exam.EstimateFile | None) -> NDArray[np.uint8]:
-    """(rows, columns, 3) red, green and blue of the map's figure; of an estimate of this map alone with its ellipse.
+    """(rows, columns, 3) red, green and blue of the map's figure; with the ellipse of an estimate of this map alone.
 
     No file name is in it, because those may hold patients' names.
     """
@@ -186,11 +188,8 @@ def map_picture(source: exam.MapFile, estimate: exam.EstimateFile | None) -> NDA
 
 
 def secondary_capture(source: exam.MapFile, estimate: exam.EstimateFile | None, *, study: Study, number: int) -> Any:
-    """The figure as a Secondary Capture in red, green and blue.
-
-    `number`: of the instance in its series, from 1.
-    """
-    highdicom = exam.required("highdicom")
+    """The figure as a Secondary Capture in red, green and blue; `number` is that of the instance in its series."""
+    highdicom = exam.import_extra("highdicom")
     digest = "" if estimate is None else estimate.digest
     dataset = highdicom.sc.SCImage(
         pixel_array=map_picture(source, estimate),
@@ -220,7 +219,7 @@ def secondary_capture(source: exam.MapFile, estimate: exam.EstimateFile | None, 
 
 
 def image_plane(tactile_map: TactileMap, transform: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """A map's means as the rows of an image that faces the viewer as every picture of the program does.
+    """A map's means as the rows of an image, oriented as in every picture of the program.
 
     `transform` (4, 4) places the map's plane. Returns (rows, columns) values, row 0 on top and NaN without data; (2, 3)
     unit vectors in L, P, S along a row and down a column; and the (3,) centre of the first value of the first row, mm.
@@ -234,8 +233,8 @@ def image_plane(tactile_map: TactileMap, transform: FloatArray) -> tuple[FloatAr
         step = sign if towards[0] == "+" else -sign
         corner[towards[1]] = float(centres[0] if step > 0 else centres[-1])
         directions.append(step * axis)
-    place = exam.on_plane(transform, (corner["x"], corner["y"]))
-    return np.ascontiguousarray(view.screen(values)), np.array(directions), place
+    first_centre = exam.lps_point(transform, (corner["x"], corner["y"]))
+    return np.ascontiguousarray(view.screen(values)), np.array(directions), first_centre
 
 
 # --- A map as a DICOM Parametric Map: float values, with their place in the patient where it is known.
@@ -245,13 +244,13 @@ POSTURES: Final = ("supine", "oblique", "sitting")  #: Of a person; a phantom ha
 _IMAGE_TYPE: Final = ["DERIVED", "PRIMARY", "VOLUME", "QUANTITY"]
 
 
-def place_of(source: exam.MapFile) -> FloatArray | None:
+def lps_of_map(source: exam.MapFile) -> FloatArray | None:
     """(4, 4) from the map's plane to L, P, S in mm; None without landmarks, or without a posture of a person."""
     return exam.lps_from_plane(source.tactile_map) if source.facts.get("posture") in POSTURES else None
 
 
 def frame_of_reference(source: exam.MapFile) -> str:
-    """Identifier of the map's own coordinates: not even another map of the exam has them, for the third axis follows
+    """Identifier of the map's own coordinates: those of another map of the exam differ, because the third axis follows
     the normal of the scanned skin."""
     return exam.content_uid("frame of reference", source.digest)
 
@@ -259,14 +258,14 @@ def frame_of_reference(source: exam.MapFile) -> str:
 def parametric_map(source: exam.MapFile, transform: FloatArray, *, study: Study, number: int) -> Any:
     """The map's means as a Parametric Map of one frame that faces the viewer as the program's pictures do.
 
-    Cells without data are NaN, which is also the padding value. `number`: of the instance in its series, from 1.
+    Cells without data are NaN, which is also the padding value. `number` is that of the instance in its series.
     """
     values, directions, corner_mm = image_plane(source.tactile_map, transform)
-    pydicom = exam.required("pydicom")
+    pydicom = exam.import_extra("pydicom")
     dataset = pydicom.Dataset()
     add_study(dataset, study, source)
     if dataset.Laterality:
-        del dataset.Laterality  # the frame has it, and it must not be said twice
+        del dataset.Laterality  # the frame has it, and it must not stand twice
     declare_scheme(dataset)
     dataset.SOPClassUID = PARAMETRIC_MAP
     dataset.SOPInstanceUID = study.uid("parametric map", source.digest)
@@ -309,12 +308,12 @@ def _add_content(dataset: Any, source: exam.MapFile, values: FloatArray) -> None
     dataset.LossyImageCompression = "00"
     dataset.PresentationLUTShape = "IDENTITY"
     dataset.AcquisitionContextSequence = []
-    told = [RESEARCH_USE, *finding_lines(source.tactile_map.findings, paper=True)]
-    dataset.ImageComments = f"{' '.join(told)} SHA-256 of the map: {source.digest}"
+    comments = [RESEARCH_USE, *finding_lines(source.tactile_map.findings, paper=True)]
+    dataset.ImageComments = f"{' '.join(comments)} SHA-256 of the map: {source.digest}"
 
 
 def _shared_groups(source: exam.MapFile, values: FloatArray, directions: FloatArray) -> Any:
-    highdicom = exam.required("highdicom")
+    highdicom = exam.import_extra("highdicom")
     cell = source.tactile_map.recipe.cell_mm
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     window = {"WindowCenter": _decimal((low + high) / 2), "WindowWidth": _decimal(max(high - low, 1e-6))}
@@ -335,10 +334,10 @@ def _shared_groups(source: exam.MapFile, values: FloatArray, directions: FloatAr
 
 
 def _value_mapping(source: exam.MapFile) -> Any:
-    """What the stored values are: themselves, in the map's unit."""
-    highdicom, pydicom = exam.required("highdicom"), exam.required("pydicom")
+    """Mapping of the stored values to themselves, in the map's unit."""
+    highdicom, pydicom = exam.import_extra("highdicom"), exam.import_extra("pydicom")
     recipe, values = source.tactile_map.recipe, source.tactile_map.mean[source.tactile_map.covered]
-    what = exam.RELATIVE_PRESSURE if recipe.value_unit == "1" else exam.PRESSURE
+    quantity = exam.RELATIVE_PRESSURE if recipe.value_unit == "1" else exam.PRESSURE
     kilopascal = pydicom.sr.coding.Code("kPa", "UCUM", "kilopascal")
     unit = kilopascal if recipe.value_unit == "kPa" else pydicom.sr.codedict.codes.UCUM.NoUnits
     ends = np.array([values.min(), values.max()], "<f4").astype(float)
@@ -349,7 +348,7 @@ def _value_mapping(source: exam.MapFile) -> Any:
         value_range=(float(ends[0]), float(ends[1])),
         slope=1.0,
         intercept=0.0,
-        quantity_definition=coded(what) if recipe.source == "scan" else None,
+        quantity_definition=coded(quantity) if recipe.source == "scan" else None,
     )
 
 
@@ -376,9 +375,9 @@ def structured_report(
     A size is the median; the ends of its interval, with its probability, are properties of that measurement. A mass
     without a size is a group with a finding and the reason, and no number.
 
-    `maps`: that the estimate was made from; `evidence`: the DICOM objects of the maps.
+    `maps` are those that the estimate was made from, `evidence` the DICOM objects of the maps.
     """
-    sr, codes_of = exam.required("highdicom").sr, exam.required("pydicom").sr.codedict.codes
+    sr, codes_of = exam.import_extra("highdicom").sr, exam.import_extra("pydicom").sr.codedict.codes
     program = sr.DeviceObserverIdentifyingAttributes(
         uid=exam.content_uid("device", MODEL, __version__),
         name=MODEL,
@@ -414,11 +413,11 @@ def structured_report(
 
 
 def _group(
-    estimate: exam.EstimateFile, finding: exam.SizedMass, maps: Sequence[exam.MapFile], evidence: Sequence[Any]
+    estimate: exam.EstimateFile, finding: exam.ExportedMass, maps: Sequence[exam.MapFile], evidence: Sequence[Any]
 ) -> Any:
-    """Measurement group of a mass, at its place in the patient where that is known."""
-    sr = exam.required("highdicom").sr
-    what = {
+    """Measurement group of a mass, with its position in the patient where that is known."""
+    sr = exam.import_extra("highdicom").sr
+    content = {
         "tracking_identifier": sr.TrackingIdentifier(
             uid=exam.content_uid("mass", estimate.digest, str(finding.number)), identifier=f"mass {finding.number}"
         ),
@@ -433,10 +432,10 @@ def _group(
     }
     region = _region(finding, maps)
     if region is None:
-        group = sr.MeasurementsAndQualitativeEvaluations(**what)
+        group = sr.MeasurementsAndQualitativeEvaluations(**content)
     else:
-        group = sr.PlanarROIMeasurementsAndQualitativeEvaluations(**what, referenced_region=region)
-    for text in (finding.reason, finding.alike_exams):
+        group = sr.PlanarROIMeasurementsAndQualitativeEvaluations(**content, referenced_region=region)
+    for text in (finding.reason, finding.narrower):
         if text:
             group[0].ContentSequence.append(_comment(text))
     return group
@@ -444,26 +443,26 @@ def _group(
 
 def _sites(estimate: exam.EstimateFile, maps: Sequence[exam.MapFile]) -> list[Any] | None:
     """The breast with its side; None for a phantom or an unknown side."""
-    said = {one.facts.get("side") for one in maps} or {estimate.facts.get("side")}
-    side = said.pop() if len(said) == 1 else None
+    sides = {one.facts.get("side") for one in maps} or {estimate.facts.get("side")}
+    side = sides.pop() if len(sides) == 1 else None
     if side not in exam.SIDES:
         return None
-    site = exam.required("highdicom").sr.FindingSite
+    site = exam.import_extra("highdicom").sr.FindingSite
     return [site(anatomic_location=coded(exam.BREAST), laterality=coded(exam.SIDES[side]))]
 
 
-def _region(finding: exam.SizedMass, maps: Sequence[exam.MapFile]) -> Any | None:
-    """The lump's centre as a point in the map's frame of reference; of one map whose place is known."""
-    transform = place_of(maps[0]) if len(maps) == 1 else None
+def _region(finding: exam.ExportedMass, maps: Sequence[exam.MapFile]) -> Any | None:
+    """The lump's centre as a point in the map's frame of reference; None for several maps or an unknown position."""
+    transform = lps_of_map(maps[0]) if len(maps) == 1 else None
     if transform is None or finding.centre_mm is None:
         return None
-    centre = exam.on_plane(transform, finding.centre_mm)
-    return exam.required("highdicom").sr.ImageRegion3D("POINT", np.array([centre]), frame_of_reference(maps[0]))
+    centre = exam.lps_point(transform, finding.centre_mm)
+    return exam.import_extra("highdicom").sr.ImageRegion3D("POINT", np.array([centre]), frame_of_reference(maps[0]))
 
 
-def _measurements(finding: exam.SizedMass, evidence: Sequence[Any]) -> Iterator[Any]:
-    """Sizes and certainty, with references to the maps' values, or to their pictures where there are no values."""
-    sr = exam.required("highdicom").sr
+def _measurements(finding: exam.ExportedMass, evidence: Sequence[Any]) -> Iterator[Any]:
+    """Sizes and certainty, with references to the maps' values, or to their pictures where no values are exported."""
+    sr = exam.import_extra("highdicom").sr
     values = [one for one in evidence if one.SOPClassUID == PARAMETRIC_MAP]
     images = [sr.SourceImageForMeasurement(one.SOPClassUID, one.SOPInstanceUID) for one in values or evidence]
     for name, size in ((exam.LONG_AXIS, finding.largest), (exam.SHORT_AXIS, finding.smallest)):
@@ -475,8 +474,8 @@ def _measurements(finding: exam.SizedMass, evidence: Sequence[Any]) -> Iterator[
 
 
 def _sized(name: exam.Code, size: Quantity, images: Sequence[Any]) -> Any:
-    """A size's median, with its interval as properties of the number."""
-    sr = exam.required("highdicom").sr
+    """A size's median, with its interval as properties of that measurement."""
+    sr = exam.import_extra("highdicom").sr
     measurement = sr.Measurement(
         coded(name), size.median, coded(_MM), derivation=coded(exam.MEDIAN), referenced_images=images
     )
@@ -498,7 +497,7 @@ def _sized(name: exam.Code, size: Quantity, images: Sequence[Any]) -> Any:
 
 
 def _comment(text: str) -> Any:
-    sr = exam.required("highdicom").sr
+    sr = exam.import_extra("highdicom").sr
     relation = sr.RelationshipTypeValues.CONTAINS
     return sr.TextContentItem(name=coded(exam.COMMENT), value=text, relationship_type=relation)
 
@@ -513,18 +512,18 @@ def dicom_files(
 ) -> dict[str, bytes]:
     """Bytes of the files by their names.
 
-    Maps whose place in the patient is not known have a picture and no values: a Parametric Map must have a place.
+    A map whose position in the patient is unknown has a picture and no values: a Parametric Map must have a position.
     """
-    exam.required("highdicom")
+    exam.import_extra("highdicom")
     for one in maps:
         if not one.tactile_map.covered.any():
             raise BadDataError("holds no data", way_out="map a scan with frames in the window", path=str(one.path))
-    study = study_of(identity, maps)
+    study = make_study(identity, maps)
     numbered = [(f"_{i}" if len(maps) > 1 else "", i, one) for i, one in enumerate(maps, start=1)]
     objects = {
         f"{VALUES}{suffix}.dcm": parametric_map(one, transform, study=study, number=number)
         for suffix, number, one in numbered
-        if (transform := place_of(one)) is not None
+        if (transform := lps_of_map(one)) is not None
     }
     for suffix, number, one in numbered:
         objects[f"picture{suffix}.dcm"] = secondary_capture(one, estimate, study=study, number=number)

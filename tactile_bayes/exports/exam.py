@@ -1,4 +1,4 @@
-"""What of an exam goes into an export: who was examined, what its files say, and the codes of the standards."""
+"""Contents of an export: the patient's identity, maps and estimates from their files, and the standards' codes."""
 
 from __future__ import annotations
 
@@ -41,19 +41,19 @@ _ROOT: Final = uuid.UUID("5d0f8a6c-54d1-5c0e-9a2b-3f5a3c1c9d47")
 
 
 def content_uuid(role: str, *parts: str) -> uuid.UUID:
-    """UUID of version 5 (RFC 9562) of a role and of what identifies the content in it, such as digests."""
+    """UUID of version 5 (RFC 9562) of a role and of the parts that identify the content, such as digests."""
     return uuid.uuid5(_ROOT, "\x1f".join((role, *parts)))
 
 
 def content_uid(role: str, *parts: str) -> str:
-    """DICOM unique identifier ``2.25.`` and the number of `content_uuid` (PS3.5 B.2); at most 44 characters."""
+    """DICOM unique identifier: ``2.25.`` and the number of `content_uuid` (PS3.5 B.2); at most 44 characters."""
     return f"2.25.{content_uuid(role, *parts).int}"
 
 
 # --- Coded concepts of the exports, with where each comes from.
 #
 # Codes of SNOMED CT and of DICOM are those that PS3.16 of the DICOM standard lists (the context groups are named
-# beside them). What no list has is in a coding scheme of this program's own, which every file declares.
+# beside them). Concepts that no list has are in this program's own coding scheme, which every file declares.
 
 
 class Code(NamedTuple):
@@ -111,7 +111,7 @@ EXTRAS: Final = {"pydicom": "dicom", "highdicom": "dicom", "fhir.resources": "fh
 """Package -> the extra of this program that installs it."""
 
 
-def required(module: str) -> Any:
+def import_extra(module: str) -> Any:
     """Import a module of an optional package, for example ``highdicom.sr``."""
     package = next(name for name in EXTRAS if module == name or module.startswith(f"{name}."))
     try:
@@ -123,7 +123,7 @@ def required(module: str) -> Any:
         ) from None
 
 
-# --- What an export is made from: a map's file, and what an estimate's file says of each mass.
+# --- Inputs of an export: the file of a map, and the file of an estimate with its masses.
 
 _WAY_OUT: Final = "give a map (.nc), a posterior (.nc), or the JSON of `estimate --json`"
 _MOST_TEXT: Final = 2000
@@ -131,33 +131,33 @@ Facts = Mapping[str, str]
 
 
 class MapFile(Record, eq=False):
-    """A map with its file's digest and the facts of its scans."""
+    """A map, the digest of its file, and facts of the exam from its scans."""
 
     path: Path
     digest: str  #: SHA-256 of the file.
     tactile_map: TactileMap
-    facts: Facts  #: What all of its scans say alike of the exam; see `EXAM_FACTS`.
+    facts: Facts  #: Facts of the exam on which all of its scans agree; see `EXAM_FACTS`.
 
 
-class SizedMass(Record, eq=False):
-    """One mass of an estimate, or why it has no size."""
+class ExportedMass(Record, eq=False):
+    """One mass of an estimate: its size, or why it has none."""
 
     number: int  #: From 1, in the order of the estimate.
     largest: Quantity | None
     smallest: Quantity | None
-    """`largest`, `smallest`: Sizes in mm with the intervals that lead; None without a size."""
-    code: str = ""  #: Reason code of the estimate where there is no number; empty with a size.
-    reason: str = ""  #: Why there is no number, or no size.
-    probability: float | None = None  #: That there is a lump; None where the file does not tell.
+    """`largest`, `smallest`: Sizes in mm with the leading intervals; None without a size."""
+    code: str = ""  #: Reason code of an estimate without a size; empty with a size.
+    reason: str = ""  #: Why there is no size; empty with a size.
+    probability: float | None = None  #: Probability that there is a lump; None where the file has none.
     centre_mm: tuple[float, float] | None = None
     centre_patient_mm: tuple[float, float] | None = None
-    """`centre_mm`, `centre_patient_mm`: Medians of x and y in `plane` and in `patient`; None where it is not told."""
-    alike_exams: str = ""
-    """The interval if exams of the mass differ less, in words; empty where there is one interval."""
+    """`centre_mm`, `centre_patient_mm`: Medians of x and y in `plane` and `patient`; None where the file has none."""
+    narrower: str = ""
+    """The narrower interval, for exams that differ less, in words; empty where there is one interval."""
 
     @property
     def outcome(self) -> Code:
-        """Whether the mass has a size, and if not, whether a lump was detected."""
+        """Concept of the outcome: sized, a lump without a size, no lump, or no verdict."""
         if self.largest is not None:
             return SIZED
         if self.code == CANNOT_SHOW:
@@ -166,37 +166,37 @@ class SizedMass(Record, eq=False):
 
 
 class EstimateFile(Record, eq=False):
-    """An estimate: of one map, pooled from several, or the draws of either."""
+    """An estimate of one map, a pooled estimate of several, or either with its draws."""
 
     path: Path
     kind: str
     """``"estimate"``, ``"pooled"`` or ``"posterior"``."""
     digest: str  #: SHA-256 of the estimate's content.
     report: EstimateReport | PooledReport
-    masses: tuple[SizedMass, ...]
-    maps: tuple[str, ...]  #: SHA-256 of the maps that it was made from; empty where the file does not tell.
+    masses: tuple[ExportedMass, ...]
+    maps: tuple[str, ...]  #: SHA-256 of the maps that it was made from; empty where the file has none.
     facts: Facts
 
     @property
     def sized(self) -> bool:
-        """Whether any mass has a size."""
+        """True if any mass has a size."""
         return any(one.largest is not None for one in self.masses)
 
     @property
     def lines(self) -> list[str]:
-        """What speaks against it, in sentences for paper."""
+        """Findings, in sentences for paper."""
         return [plain_line(line) for line in finding_lines(self.report.findings, paper=True)]
 
     @property
     def method_words(self) -> str:
         """Method and calibration in a phrase."""
-        said = self.report.origin.settings
-        calibration = said.get("size_calibration") or said.get("calibration") or "as shipped"
-        return plain_line(f"method {said.get('method') or 'unknown'}, size calibration {calibration}")
+        settings = self.report.origin.settings
+        calibration = settings.get("size_calibration") or settings.get("calibration") or "as shipped"
+        return plain_line(f"method {settings.get('method') or 'unknown'}, size calibration {calibration}")
 
     @property
     def version(self) -> str:
-        """Version of the program that made it; empty where the file does not tell."""
+        """Version of the program that made it; empty where the file has none."""
         return plain_line(str(self.report.provenance.get("version") or ""))
 
 
@@ -206,21 +206,21 @@ def verdict_words(estimate: EstimateFile) -> str:
 
 
 def plain_line(text: str) -> str:
-    """A text from a file in one line of printable characters, of bounded length."""
-    line = " ".join("".join(one if one.isprintable() else " " for one in text).split())
+    """A text from a file as one line of printable characters, of bounded length."""
+    line = " ".join("".join(letter if letter.isprintable() else " " for letter in text).split())
     return line if len(line) <= _MOST_TEXT else f"{line[:_MOST_TEXT]}..."
 
 
 def read_exam(path: Path) -> MapFile | list[EstimateFile]:
-    """Read a file of this program, whichever kind it is; a list of estimates gives several."""
+    """Read a map, or the estimates in a JSON file or a posterior."""
     head = reading.first_bytes(path, 8)
     if head.startswith(reading.HDF5_MAGIC):
         attributes = posterior_attributes(path, way_out=_WAY_OUT)
         if attributes is not None:
             if "estimate" not in attributes:
-                what, way_out = "holds draws without their estimate", "write it again with `estimate -o`"
-                raise BadDataError(what, way_out=way_out, path=str(path))
-            estimate = estimate_of(parse_json(attributes["estimate"], name="estimate"), path)
+                fault, way_out = "holds draws without their estimate", "write it again with `estimate -o`"
+                raise BadDataError(fault, way_out=way_out, path=str(path))
+            estimate = parse_estimate(parse_json(attributes["estimate"], name="estimate"), path)
             return [replace(estimate, kind="posterior", digest=sha256(path))]
         tactile_map, scans = read_map_and_scans(path)
         return MapFile(path, sha256(path), tactile_map, shared_facts(scans))
@@ -231,18 +231,18 @@ def read_exam(path: Path) -> MapFile | list[EstimateFile]:
     listed = document if isinstance(document, list) else [document]
     if not listed:
         raise BadDataError("is an empty list", way_out=_WAY_OUT, path=str(path))
-    return [estimate_of(one, path) for one in listed]
+    return [parse_estimate(one, path) for one in listed]
 
 
 def shared_facts(scans: Iterable[Mapping[str, str]]) -> dict[str, str]:
-    """What all scans say alike of the exam; where they differ or one is silent, nothing is said."""
-    said = [{(name, one[name]) for name in EXAM_FACTS if name in one} for one in scans]
-    alike = dict(set.intersection(*said)) if said else {}
-    return {name: alike[name] for name in EXAM_FACTS if name in alike}
+    """Facts of the exam on which all scans agree."""
+    facts_by_scan = [{(name, one[name]) for name in EXAM_FACTS if name in one} for one in scans]
+    shared = dict(set.intersection(*facts_by_scan)) if facts_by_scan else {}
+    return {name: shared[name] for name in EXAM_FACTS if name in shared}
 
 
-def estimate_of(document: object, path: Path) -> EstimateFile:
-    """An estimate from its JSON object; `path` is what messages call it."""
+def parse_estimate(document: object, path: Path) -> EstimateFile:
+    """An estimate from its JSON object; messages name it by `path`."""
     schema = document.get("schema") if isinstance(document, dict) else None
     if not isinstance(document, dict) or not isinstance(schema, str) or schema not in REPORTS:
         raise BadDataError(f"is {reading.schema_kind(schema) or 'no estimate'}", way_out=_WAY_OUT, path=str(path))
@@ -259,50 +259,43 @@ def estimate_of(document: object, path: Path) -> EstimateFile:
     )
 
 
-def masses_of(report: EstimateReport | PooledReport) -> tuple[SizedMass, ...]:
-    """The masses that an estimate lists, or the one that it is of, each with the sizes that lead."""
+def masses_of(report: EstimateReport | PooledReport) -> tuple[ExportedMass, ...]:
+    """The masses that an estimate lists, or its only one, each with the leading sizes."""
+    spread = report.figures.get("between_map_sd")
     listed = report.masses if isinstance(report, EstimateReport) else ()
-    found = []
-    for mass in listed or (report,):
-        leads, size, code, narrow = mass.leading, mass.max_size_mm, "", ""
-        if size is None:
-            code = (not isinstance(mass, PooledReport) and mass.reason_code) or "no size"
-        elif leads is not mass:
-            narrow = (
-                f"{capitalised(exams_label(report.figures.get('between_map_sd')))}: largest size {size_words(size)}"
-            )
-        placed = None if isinstance(mass, PooledReport) else mass
-        one = SizedMass(
-            mass.number if isinstance(mass, MassReport) else 1,
-            leads.max_size_mm,
-            leads.min_size_mm,
-            code,
-            plain_line(mass.reason) if code else "",
-            None if placed is None else placed.detected_probability,
-            None if placed is None else centre_of(placed.centre_mm),
-            None if placed is None else centre_of(placed.centre_patient_mm),
-            narrow,
-        )
-        found.append(one)
-    return tuple(found)
+    return tuple(_exported_mass(mass, spread) for mass in listed or (report,))
+
+
+def _exported_mass(mass: EstimateReport | PooledReport | MassReport, spread: float | None) -> ExportedMass:
+    number = mass.number if isinstance(mass, MassReport) else 1
+    leading, size = mass.leading, mass.max_size_mm
+    sizes, narrower, code, reason = (leading.max_size_mm, leading.min_size_mm), "", "", ""
+    if size is None:
+        code, reason = (not isinstance(mass, PooledReport) and mass.reason_code) or "no size", plain_line(mass.reason)
+    elif leading is not mass:
+        narrower = f"{capitalised(exams_label(spread))}: largest size {size_words(size)}"
+    if isinstance(mass, PooledReport):
+        return ExportedMass(number, *sizes, code, reason, narrower=narrower)
+    centres = centre_of(mass.centre_mm), centre_of(mass.centre_patient_mm)
+    return ExportedMass(number, *sizes, code, reason, mass.detected_probability, *centres, narrower)
 
 
 def size_words(size: Quantity) -> str:
-    """A size with its interval, for people."""
+    """A size with its interval, in words."""
     ends = f"{size.low:.1f} to {size.high:.1f} mm"
     return f"{size.median:.1f} mm, {100 * size.probability:g} % credible interval {ends}"
 
 
 def check_pairs(maps: Sequence[MapFile], estimates: Sequence[EstimateFile]) -> None:
-    """Refuse maps and estimates of which one was not made from the other."""
+    """Refuse an estimate that was not made from the given maps, or not from all of them."""
     for estimate in estimates:
         for one in maps:
             remedy = f"`tactile-bayes estimate {one.path} --json`"
             if not estimate.maps:
                 raise UsageError(f"{estimate.path} does not say which map it is of; estimate the file: {remedy}")
             if one.digest not in estimate.maps:
-                what = f"{estimate.path} is not an estimate of {one.path} (the SHA-256 of its map differs)"
-                raise UsageError(f"{what}; make it again: {remedy}")
+                fault = f"{estimate.path} is not an estimate of {one.path} (the SHA-256 of its map differs)"
+                raise UsageError(f"{fault}; make it again: {remedy}")
         missing = len(set(estimate.maps) - {one.digest for one in maps})
         if maps and missing:
             raise UsageError(
@@ -310,14 +303,14 @@ def check_pairs(maps: Sequence[MapFile], estimates: Sequence[EstimateFile]) -> N
             )
 
 
-# --- Who was examined, and when: only what the user or a worklist says, checked against what the formats can hold.
+# --- Identity of patient and study, as the user or a worklist gives it, checked against what the formats can hold.
 
 _MOMENT: Final = re.compile(
     r"(\d{4})-(\d{2})-(\d{2})(?:[T ](\d{2}):(\d{2})(?::(\d{2}))?(Z|[+-]\d{2}:\d{2})?)?", re.ASCII
 )
 _UID: Final = re.compile(r"(0|[1-9]\d*)(\.(0|[1-9]\d*))+", re.ASCII)
 _NAMES: Final = ("patient_name", "referring_physician")
-_REPLACED: Final = "\ufffd"  #: Stands where a program could not read a letter: no name or code holds it.
+_REPLACED: Final = "\ufffd"  #: Programs put it for a letter that they could not read; no name or code has it.
 
 
 class Moment(Record):
@@ -328,20 +321,20 @@ class Moment(Record):
     zone: str = ""  #: ``+HHMM`` or ``-HHMM``; empty where unknown.
 
     @classmethod
-    def of(cls, text: str, *, name: str) -> Moment:
-        """Read ``YYYY-MM-DD``, or ``YYYY-MM-DDTHH:MM[:SS]`` with ``Z`` or ``+HH:MM`` behind it if it is known."""
-        found = _MOMENT.fullmatch(text)
+    def parse(cls, text: str, *, name: str) -> Moment:
+        """Read ``YYYY-MM-DD``, or ``YYYY-MM-DDTHH:MM[:SS]`` with an optional ``Z`` or ``+HH:MM``; errors say `name`."""
+        match = _MOMENT.fullmatch(text)
         way_out = "give YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the time zone if you know it"
-        if found is None:
-            raise UsageError(f"{name} is {short(text)}; {way_out}")
-        year, month, day, hour, minute, second, zone = found.groups()
+        if match is None:
+            raise UsageError(f"{name} is {quoted(text)}; {way_out}")
+        year, month, day, hour, minute, second, zone = match.groups()
         try:
             datetime.datetime(int(year), int(month), int(day), int(hour or 0), int(minute or 0), int(second or 0))
         except ValueError as error:
-            raise UsageError(f"{name} is {short(text)}: {error}; {way_out}") from None
+            raise UsageError(f"{name} is {quoted(text)}: {error}; {way_out}") from None
         zone = "+00:00" if zone == "Z" else zone or ""
         if zone and not (int(zone[1:3]) <= 14 and int(zone[4:]) < 60):
-            raise UsageError(f"{name} is {short(text)}: no time zone is {zone} from UTC; {way_out}")
+            raise UsageError(f"{name} is {quoted(text)}: no time zone is {zone} from UTC; {way_out}")
         return cls(f"{year}{month}{day}", f"{hour or ''}{minute or ''}{second or ''}", zone.replace(":", ""))
 
     @property
@@ -351,7 +344,7 @@ class Moment(Record):
 
     @property
     def fhir(self) -> str:
-        """Date and time of FHIR, which takes a time of day only with its zone and its seconds; otherwise the date."""
+        """Date and time for FHIR, which takes a time of day only with its zone and seconds; otherwise the date."""
         if not (self.time and self.zone):
             return self.iso_date
         seconds = self.time[4:] or "00"
@@ -359,53 +352,53 @@ class Moment(Record):
 
 
 class Identity(IdentityOptions):
-    """Identity of patient and study that the formats can hold; empty where nobody gave it."""
+    """Identity of patient and study, checked against what the formats can hold; empty where nobody gave it."""
 
     def __post_init__(self) -> None:
         for name in names_of(self):
             value = getattr(self, name)
             if _REPLACED in value:
                 way_out = "a letter was lost on its way (U+FFFD); give it as it is written"
-                raise UsageError(f"{name} is {short(value)}: {way_out}")
+                raise UsageError(f"{name} is {quoted(value)}: {way_out}")
             if not value.isprintable() or "\\" in value:
                 way_out = "leave out backslashes, line ends and other characters that cannot be printed"
-                raise UsageError(f"{name} is {short(value)}; {way_out}")
+                raise UsageError(f"{name} is {quoted(value)}; {way_out}")
             if value != value.strip():
-                raise UsageError(f"{name} is {short(value)}; leave out the blanks around it")
+                raise UsageError(f"{name} is {quoted(value)}; leave out the blanks around it")
         for name in _NAMES:
             groups = getattr(self, name).split("=")
             if len(groups) > 3 or any(len(group) > 64 or group.count("^") > 4 for group in groups):
                 way_out = "give FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX, at most 64 characters"
-                raise UsageError(f"{name} is {short(getattr(self, name))}; {way_out}")
+                raise UsageError(f"{name} is {quoted(getattr(self, name))}; {way_out}")
         super().__post_init__()
         if self.study_uid and not _UID.fullmatch(self.study_uid):
             raise UsageError(
-                f"study_uid is {short(self.study_uid)}; give numbers with points between, at most 64 characters"
+                f"study_uid is {quoted(self.study_uid)}; give numbers with points between, at most 64 characters"
             )
         for name in ("birth_date", "study_date", "content_date"):
             if text := getattr(self, name):
-                moment = Moment.of(text, name=name)
+                moment = Moment.parse(text, name=name)
                 if name == "birth_date" and moment.time:
-                    raise UsageError(f"birth_date is {short(text)}; give YYYY-MM-DD")
+                    raise UsageError(f"birth_date is {quoted(text)}; give YYYY-MM-DD")
 
     @property
     def given(self) -> dict[str, str]:
-        """What was given, by name."""
+        """The parts that were given, by name."""
         return {name: value for name in names_of(self) if (value := getattr(self, name))}
 
     @property
     def study(self) -> Moment | None:
-        """When the exam was."""
-        return Moment.of(self.study_date, name="study_date") if self.study_date else None
+        """Date and time of the exam."""
+        return Moment.parse(self.study_date, name="study_date") if self.study_date else None
 
     @property
     def content(self) -> Moment | None:
-        """When the content was made: by default when the exam was."""
-        return Moment.of(self.content_date, name="content_date") if self.content_date else self.study
+        """Date and time when the content was made; by default those of the exam."""
+        return Moment.parse(self.content_date, name="content_date") if self.content_date else self.study
 
 
-def short(value: str) -> str:
-    """A text as an error shows it."""
+def quoted(value: str) -> str:
+    """A text in quotes, for a message; long ones are cut."""
     return repr(value if len(value) <= 60 else value[:57] + "...")
 
 
@@ -415,8 +408,8 @@ _ONE_ITEM: Final = (
     "give one worklist item: the answer of a modality worklist (.dcm), or JSON with patient_id and others"
 )
 _MOST_BYTES: Final = 10**6
-# What a worklist item says, by the attributes of DICOM; scheduled dates are no dates of an exam.
-ATTRIBUTES: Final = {
+# DICOM attributes of the parts of an identity; scheduled dates are no dates of an exam.
+DICOM_KEYWORDS: Final = {
     "patient_id": "PatientID",
     "patient_name": "PatientName",
     "sex": "PatientSex",
@@ -430,27 +423,27 @@ ATTRIBUTES: Final = {
 _TAG: Final = re.compile(r"[0-9A-Fa-f]{8}")
 
 
-def identity_of(worklist: Path | None, given: Mapping[str, Any]) -> Identity:
-    """The identity that a worklist gives, where there is one, with what the command line gives besides."""
-    found = Identity() if worklist is None else read_worklist(worklist)
-    for name, value in given.items():
-        known = getattr(found, name)
-        if known and known != value:
+def merged_identity(worklist: Path | None, options: Mapping[str, Any]) -> Identity:
+    """Identity from a worklist, where there is one, completed by the options; a contradiction is a `UsageError`."""
+    identity = Identity() if worklist is None else read_worklist(worklist)
+    for name, value in options.items():
+        listed = getattr(identity, name)
+        if listed and listed != value:
             raise UsageError(
-                f"{name} is {short(value)} by the option and {short(known)} in the worklist; leave one out"
+                f"{name} is {quoted(value)} by the option and {quoted(listed)} in the worklist; leave one out"
             )
-    return replace(found, **given)
+    return replace(identity, **options)
 
 
 def read_worklist(path: Path) -> Identity:
-    """Read the identity that a worklist file gives."""
+    """Read an identity from a worklist file."""
     data = reading.read_bytes(path, most=_MOST_BYTES)
     if not reading.other_encoding(data) and not reading.is_json(data):
-        pydicom = required("pydicom")
+        pydicom = import_extra("pydicom")
         with _decoding(path, "is neither JSON nor a DICOM file"):
             item = pydicom.dcmread(path, stop_before_pixels=True)
             _check_letters(item, pydicom.charset.python_encoding, path)
-        return _of_dicom(item, path)
+        return _identity_from_dicom(item, path)
     document = load_json(path, way_out=_ONE_ITEM)
     if isinstance(document, list):
         if len(document) != 1:
@@ -460,21 +453,21 @@ def read_worklist(path: Path) -> Identity:
         raise BadDataError("is no worklist item", way_out=_ONE_ITEM, path=str(path))
     if document and all(_TAG.fullmatch(key) for key in document):
         with _decoding(path, "is no DICOM JSON"):
-            item = required("pydicom").Dataset.from_json(document)
-        return _of_dicom(item, path)
-    return _identity(as_dict(parse_record(document, IdentityOptions, path=path)), path)
+            item = import_extra("pydicom").Dataset.from_json(document)
+        return _identity_from_dicom(item, path)
+    return _checked_identity(as_dict(parse_record(document, IdentityOptions, path=path)), path)
 
 
-def _identity(found: Mapping[str, Any], path: Path) -> Identity:
+def _checked_identity(values: Mapping[str, Any], path: Path) -> Identity:
     try:
-        return Identity(**{name: value for name, value in found.items() if value})
+        return Identity(**{name: value for name, value in values.items() if value})
     except UsageError as error:
         raise BadDataError(str(error), path=str(path)) from None
 
 
 @contextlib.contextmanager
-def _decoding(path: Path, what: str) -> Iterator[None]:
-    """Whatever a broken file ends in is one line; the library's warnings and its log are not shown."""
+def _decoding(path: Path, fault: str) -> Iterator[None]:
+    """Turn any error of a broken file into a `BadDataError`; the library's warnings and log are not shown."""
     log = logging.getLogger("pydicom")
     level = log.level
     log.setLevel(logging.CRITICAL)
@@ -485,36 +478,36 @@ def _decoding(path: Path, what: str) -> Iterator[None]:
         except TactileBayesError:
             raise
         except Exception as error:  # pydicom's faults are of many kinds
-            raise BadDataError(f"{what} ({type(error).__name__})", way_out=_ONE_ITEM, path=str(path)) from None
+            raise BadDataError(f"{fault} ({type(error).__name__})", way_out=_ONE_ITEM, path=str(path)) from None
         finally:
             log.setLevel(level)
 
 
-def _check_letters(item: Any, known: Collection[str], path: Path) -> None:
+def _check_letters(item: Any, charsets: Collection[str], path: Path) -> None:
     """Refuse letters beyond ASCII where no known character set is declared (PS3.5, 6.1): any guess is another name."""
     declared = item.get("SpecificCharacterSet")
     names = [declared] if isinstance(declared, str) else list(declared or [])
-    if names and all(name in known for name in names):
+    if names and all(name in charsets for name in names):
         return
-    for keyword in (*ATTRIBUTES.values(), "PatientBirthDate"):
+    for keyword in (*DICOM_KEYWORDS.values(), "PatientBirthDate"):
         value = getattr(item.get_item(keyword), "value", b"")
         if isinstance(value, bytes) and not value.isascii():
             byte = next(one for one in value if one > 127)
-            said = f"the character set {short(str(names[0]))}, which is none" if names else "no character set"
-            what = f"{keyword} holds the byte 0x{byte:02x}, and the item declares {said}"
+            declaration = f"the character set {quoted(str(names[0]))}, which is none" if names else "no character set"
+            fault = f"{keyword} holds the byte 0x{byte:02x}, and the item declares {declaration}"
             way_out = "declare SpecificCharacterSet in it (ISO_IR 192 for UTF-8), or give the name by options"
-            raise BadDataError(what, way_out=way_out, path=str(path))
+            raise BadDataError(fault, way_out=way_out, path=str(path))
 
 
-def _of_dicom(dataset: Any, path: Path) -> Identity:
+def _identity_from_dicom(dataset: Any, path: Path) -> Identity:
     with _decoding(path, "holds what cannot be read"):
-        found = {name: str(dataset.get(keyword) or "").strip() for name, keyword in ATTRIBUTES.items()}
+        values = {name: str(dataset.get(keyword) or "").strip() for name, keyword in DICOM_KEYWORDS.items()}
         birth = str(dataset.get("PatientBirthDate") or "").strip()
     if birth:
-        found["birth_date"] = f"{birth[:4]}-{birth[4:6]}-{birth[6:]}" if len(birth) == 8 else birth
-    if not any(found.values()):
+        values["birth_date"] = f"{birth[:4]}-{birth[4:6]}-{birth[6:]}" if len(birth) == 8 else birth
+    if not any(values.values()):
         raise BadDataError("says nothing of a patient or study", way_out=_ONE_ITEM, path=str(path))
-    return _identity(found, path)
+    return _checked_identity(values, path)
 
 
 # --- Place of a map in the coordinate system of DICOM and 3D Slicer: L, P, S in mm from the xiphoid.
@@ -536,6 +529,6 @@ def lps_from_plane(tactile_map: TactileMap) -> FloatArray | None:
     return np.asarray(LPS_FROM_PATIENT @ tactile_map.patient_from_plane)
 
 
-def on_plane(transform: FloatArray, point_mm: tuple[float, float]) -> FloatArray:
+def lps_point(transform: FloatArray, point_mm: tuple[float, float]) -> FloatArray:
     """(3,) place of a point of the map's plane."""
     return apply(transform, np.array([*point_mm, 0.0]))

@@ -18,7 +18,7 @@ CONFIDENCE_INTERVAL: Final = "http://hl7.org/fhir/StructureDefinition/quantity-c
 ABSENT: Final = "http://terminology.hl7.org/CodeSystem/data-absent-reason"
 _CATEGORY: Final = "http://terminology.hl7.org/CodeSystem/observation-category"
 _GENDERS: Final = {"F": "female", "M": "male", "O": "other"}
-_STATUS: Final = "preliminary"  #: Nobody has verified what the program found.
+_STATUS: Final = "preliminary"  #: Nobody has verified the program's result.
 _XHTML: Final = "http://www.w3.org/1999/xhtml"
 _IDENTIFIERS: Final = "http://terminology.hl7.org/CodeSystem/v2-0203"
 
@@ -27,7 +27,7 @@ def bundle_json(estimate: exam.EstimateFile, identity: exam.Identity) -> str:
     """The Bundle as JSON, checked by the models of fhir.resources."""
     bundle = bundle_of(estimate, identity)
     # R4B has all resources used here as R4 has them; the package's R4 ended with its version 6
-    models = exam.required("fhir.resources.R4B.bundle")
+    models = exam.import_extra("fhir.resources.R4B.bundle")
     try:
         models.Bundle.model_validate(bundle)
     except ValueError as error:
@@ -37,7 +37,7 @@ def bundle_json(estimate: exam.EstimateFile, identity: exam.Identity) -> str:
 
 def bundle_of(estimate: exam.EstimateFile, identity: exam.Identity) -> dict[str, Any]:
     """The Bundle as plain data: patient (if any is named), device, observations, report."""
-    parts = _Exam(estimate, identity)
+    parts = _Resources(estimate, identity)
     observations = [one for finding in estimate.masses for one in parts.observations(finding)]
     patient = [parts.patient()] if parts.patient_url else []
     resources = [*patient, parts.device(), *observations, parts.report(observations)]
@@ -47,7 +47,7 @@ def bundle_of(estimate: exam.EstimateFile, identity: exam.Identity) -> dict[str,
     return {**head, "entry": entries}
 
 
-class _Exam:
+class _Resources:
     """One estimate of one patient, whose resources refer to each other by identifiers from their content."""
 
     def __init__(self, estimate: exam.EstimateFile, identity: exam.Identity) -> None:
@@ -65,19 +65,19 @@ class _Exam:
         return f"urn:uuid:{self.id(role)}"
 
     def patient(self) -> dict[str, Any]:
-        """The patient, by what was given."""
-        given = self.identity
-        found: dict[str, Any] = {"resourceType": "Patient", "id": self.id("patient")}
-        if given.patient_id:
-            issuer = {"assigner": {"display": given.issuer}} if given.issuer else {}
-            found["identifier"] = [{"value": given.patient_id} | issuer]
-        if name := _human_name(given.patient_name):
-            found["name"] = [name]
-        if given.sex:
-            found["gender"] = _GENDERS[given.sex]
-        if given.birth_date:
-            found["birthDate"] = given.birth_date
-        return found
+        """The patient, with the parts of the identity that were given."""
+        identity = self.identity
+        resource: dict[str, Any] = {"resourceType": "Patient", "id": self.id("patient")}
+        if identity.patient_id:
+            issuer = {"assigner": {"display": identity.issuer}} if identity.issuer else {}
+            resource["identifier"] = [{"value": identity.patient_id} | issuer]
+        if name := _human_name(identity.patient_name):
+            resource["name"] = [name]
+        if identity.sex:
+            resource["gender"] = _GENDERS[identity.sex]
+        if identity.birth_date:
+            resource["birthDate"] = identity.birth_date
+        return resource
 
     def device(self) -> dict[str, Any]:
         """The program."""
@@ -90,15 +90,15 @@ class _Exam:
         }
 
     def _common(self) -> dict[str, Any]:
-        """What report and observations share."""
-        found: dict[str, Any] = {"status": _STATUS}
+        """Fields that the report and the observations share."""
+        fields: dict[str, Any] = {"status": _STATUS}
         if self.patient_url:
-            found["subject"] = {"reference": self.patient_url}
+            fields["subject"] = {"reference": self.patient_url}
         if self.identity.study:
-            found["effectiveDateTime"] = self.identity.study.fhir
-        return found
+            fields["effectiveDateTime"] = self.identity.study.fhir
+        return fields
 
-    def observations(self, finding: exam.SizedMass) -> Iterator[dict[str, Any]]:
+    def observations(self, finding: exam.ExportedMass) -> Iterator[dict[str, Any]]:
         """Largest and smallest size of a mass, and the probability of a lump."""
         n = finding.number
         sizes = (("largest", exam.LONG_AXIS, finding.largest), ("smallest", exam.SHORT_AXIS, finding.smallest))
@@ -111,10 +111,10 @@ class _Exam:
             concept = _concept(exam.CERTAINTY, text="Probability of a lump")
             yield self._observation(f"probability {n}", concept, finding) | {"valueQuantity": percent}
 
-    def _observation(self, role: str, code: dict[str, Any], finding: exam.SizedMass) -> dict[str, Any]:
+    def _observation(self, role: str, code: dict[str, Any], finding: exam.ExportedMass) -> dict[str, Any]:
         site = exam.BREASTS.get(self.estimate.facts.get("side", ""))
         notes = [RESEARCH_USE, exam.verdict_words(self.estimate), *self.estimate.lines]
-        notes += [finding.alike_exams] if finding.alike_exams else []
+        notes += [finding.narrower] if finding.narrower else []
         if len(self.estimate.masses) > 1:
             notes.append(f"Mass {finding.number} of {len(self.estimate.masses)}")
         return {
@@ -130,7 +130,7 @@ class _Exam:
         }
 
     def report(self, observations: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        """The report, with the same facts as text for people."""
+        """The report, with its text for people."""
         lines = list(_lines(self.estimate))
         number = self.identity.accession
         kind = {"system": _IDENTIFIERS, "code": "ACSN", "display": "Accession ID"}
@@ -151,7 +151,7 @@ class _Exam:
 
 
 def _lines(estimate: exam.EstimateFile) -> Iterator[str]:
-    """The report in sentences, what speaks against it first."""
+    """Sentences of the report: verdict, findings, then the masses."""
     yield exam.verdict_words(estimate)
     yield from estimate.lines
     for one in estimate.masses:
@@ -161,8 +161,8 @@ def _lines(estimate: exam.EstimateFile) -> Iterator[str]:
             continue
         yield f"{mass}Largest size {exam.size_words(one.largest)}."
         yield f"{mass}Smallest size {exam.size_words(one.smallest)}."
-        if one.alike_exams:
-            yield f"{mass}{one.alike_exams}."
+        if one.narrower:
+            yield f"{mass}{one.narrower}."
     yield RESEARCH_USE
 
 
@@ -192,8 +192,8 @@ def _size(size: Quantity) -> dict[str, Any]:
     }
 
 
-def _absent(finding: exam.SizedMass) -> dict[str, Any]:
-    """Why there is no value."""
+def _absent(finding: exam.ExportedMass) -> dict[str, Any]:
+    """FHIR's reason for an absent value."""
     unknown = finding.outcome is not exam.NOT_DETECTED
     code = ("unknown", "Unknown") if unknown else ("not-applicable", "Not Applicable")
     coding = {"system": ABSENT, "code": code[0], "display": code[1]}
@@ -201,11 +201,11 @@ def _absent(finding: exam.SizedMass) -> dict[str, Any]:
 
 
 def _human_name(name: str) -> dict[str, Any]:
-    """A name of DICOM, FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX, as FHIR has it; of its first group that is filled."""
+    """FHIR's form of a DICOM name, FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX, from its first group that is not empty."""
     group = next((one for one in name.split("=") if one.strip("^ ")), "")
     family, given, middle, prefix, suffix = (*group.split("^"), "", "", "", "", "")[:5]
-    found: dict[str, Any] = {"family": family} if family else {}
-    for key, words in (("given", (given, middle)), ("prefix", (prefix,)), ("suffix", (suffix,))):
-        if any(words):
-            found[key] = [word for word in words if word]
-    return found
+    human_name: dict[str, Any] = {"family": family} if family else {}
+    for key, parts in (("given", (given, middle)), ("prefix", (prefix,)), ("suffix", (suffix,))):
+        if any(parts):
+            human_name[key] = [word for word in parts if word]
+    return human_name

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Final, Literal, NamedTuple
 
 from tactile_bayes.errors import UsageError
-from tactile_bayes.exports.exam import EstimateFile, Identity, SizedMass, content_uuid, short
+from tactile_bayes.exports.exam import EstimateFile, ExportedMass, Identity, content_uuid, quoted
 from tactile_bayes.files.tables import csv_text
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
@@ -33,16 +33,16 @@ COMPLETE: Final = f"{FORM}_complete"
 """The form's own status, which REDCap adds to every form: 0 incomplete, 1 unverified, 2 complete."""
 
 
-class Row(NamedTuple):
-    """A mass of an estimate, of which a record is made."""
+class RecordRow(NamedTuple):
+    """A mass of an estimate and the identity, from which a record is made."""
 
     record_id: str
     estimate: EstimateFile
-    mass: SizedMass
+    mass: ExportedMass
     identity: Identity
 
     def fact(self, name: str) -> str:
-        """What the scans say of the exam; empty where they say nothing."""
+        """A fact of the exam from its scans; empty where they have none."""
         return self.estimate.facts.get(name, "")
 
     def of_size(self, which: Literal["largest", "smallest"], part: str) -> float | None:
@@ -56,16 +56,16 @@ class Row(NamedTuple):
 
 
 class Field(NamedTuple):
-    """One variable of the form: its name, label, what a record has there, and number's range where it is one."""
+    """One variable of the form: name, label, value of a record, and the range of a number."""
 
     name: str
     label: str
-    value: Callable[[Row], str | float | None]
+    value: Callable[[RecordRow], str | float | None]
     note: str = ""
     validation: str = ""
     least: str = ""
     most: str = ""
-    choices: Sequence[str] = ()  #: Answers, of which the value is one, or none; their codes are 1, 2, 3...
+    choices: Sequence[str] = ()  #: Answers that the value may be; their codes are 1, 2, 3...
 
 
 _MM: Final = ("mm", "number", "0", "500")
@@ -111,7 +111,7 @@ def dictionary_csv() -> str:
     """The data dictionary of the form, for a new project or to append to one."""
     rows = []
     for one in FIELDS:
-        choices = " | ".join(f"{code}, {words}" for code, words in enumerate(one.choices, start=1))
+        choices = " | ".join(f"{code}, {answer}" for code, answer in enumerate(one.choices, start=1))
         kind = "radio" if choices else "notes" if one.name in ("tb_reason", "tb_findings") else "text"
         row = [one.name, FORM, "", kind, one.label, choices, one.note, one.validation, one.least, one.most]
         rows.append(row + [""] * (len(DICTIONARY_HEADER) - len(row)))
@@ -119,12 +119,12 @@ def dictionary_csv() -> str:
 
 
 def records_csv(estimates: Sequence[EstimateFile], identity: Identity, *, id_from_scan: bool) -> str:
-    """One record per mass of each estimate.
+    """CSV with one record per mass of each estimate.
 
-    `identity`: its `patient_id` begins the record IDs; without one they follow from the estimates' content;
-    `id_from_scan`: take the subject codes of the scans for patient IDs.
+    Record IDs begin with the identity's `patient_id`, or with the scans' subject codes where `id_from_scan` is true;
+    without either they derive from the estimates' content.
     """
-    rows = dict[str, Row]()
+    rows = dict[str, RecordRow]()
     for estimate in estimates:
         for mass in estimate.masses:
             name = _record_id(estimate, mass, identity, id_from_scan=id_from_scan)
@@ -132,12 +132,12 @@ def records_csv(estimates: Sequence[EstimateFile], identity: Identity, *, id_fro
                 both = f"{estimate.path} and {rows[name].estimate.path} would both be record {name}"
                 way_out = "give a scan's visit and mass in its session, or export them into two files"
                 raise UsageError(f"{both}; {way_out}")
-            rows[name] = Row(name, estimate, mass, identity)
+            rows[name] = RecordRow(name, estimate, mass, identity)
     cells = ([*(_cell(one, row) for one in FIELDS), "1"] for row in rows.values())
     return csv_text([*(one.name for one in FIELDS), COMPLETE], cells)
 
 
-def _record_id(estimate: EstimateFile, finding: SizedMass, identity: Identity, *, id_from_scan: bool) -> str:
+def _record_id(estimate: EstimateFile, finding: ExportedMass, identity: Identity, *, id_from_scan: bool) -> str:
     facts = estimate.facts
     patient = identity.patient_id
     if id_from_scan and not patient:
@@ -153,12 +153,12 @@ def _record_id(estimate: EstimateFile, finding: SizedMass, identity: Identity, *
     name = "-".join(parts)
     if not _RECORD.fullmatch(name):
         way_out = "use letters, digits, points and dashes, at most 100"
-        raise UsageError(f"the record ID {short(name)} is none that REDCap takes; {way_out}")
+        raise UsageError(f"the record ID {quoted(name)} is none that REDCap takes; {way_out}")
     return name
 
 
-def _cell(field: Field, row: Row) -> str:
-    """A value as a cell in one line that no spreadsheet takes for a formula; an answer by its code."""
+def _cell(field: Field, row: RecordRow) -> str:
+    """A value as a cell of one line that no spreadsheet takes for a formula; an answer as its code."""
     value = field.value(row)
     if field.choices:
         return str(field.choices.index(value) + 1) if value in field.choices else ""

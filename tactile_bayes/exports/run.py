@@ -1,4 +1,4 @@
-"""One call for every export: what is asked for, checked, then written; and maps for 3D Slicer."""
+"""Exports: inputs and options are checked, then the files written; and maps for 3D Slicer."""
 
 from __future__ import annotations
 
@@ -13,7 +13,15 @@ import numpy as np
 from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.exports.dicom import VALUES, dicom_files
-from tactile_bayes.exports.exam import EstimateFile, Identity, MapFile, check_pairs, lps_from_plane, on_plane, required
+from tactile_bayes.exports.exam import (
+    EstimateFile,
+    Identity,
+    MapFile,
+    check_pairs,
+    import_extra,
+    lps_from_plane,
+    lps_point,
+)
 from tactile_bayes.exports.fhir import bundle_json
 from tactile_bayes.exports.redcap import dictionary_csv, records_csv
 from tactile_bayes.files.atomic import Format, check_suffix, refuse_existing, same_file, unwritable, write_all
@@ -28,20 +36,20 @@ def nrrd_bytes(source: MapFile) -> bytes:
 
     The axes are the plane's, in ``left-posterior-superior`` and mm; the slice is as thick as a cell is wide.
     """
-    nrrd = required("nrrd")
+    nrrd = import_extra("nrrd")
     one = source.tactile_map
     transform = lps_from_plane(one)
     if transform is None:
-        what = "has no landmarks, so its place in the patient is not known"
+        fault = "has no landmarks, so its place in the patient is not known"
         way_out = "3D Slicer takes maps of scans in which sternal notch and xiphoid were touched"
-        raise BadDataError(what, way_out=way_out, path=str(source.path))
+        raise BadDataError(fault, way_out=way_out, path=str(source.path))
     values = np.where(one.covered, one.mean, np.nan).T[:, :, None].astype("<f4")
     header: dict[str, Any] = {
         "space": "left-posterior-superior",
         "kinds": ["domain", "domain", "domain"],
         "space units": ["mm", "mm", "mm"],
         "space directions": transform[:3, :3].T * one.recipe.cell_mm,
-        "space origin": on_plane(transform, (float(one.x_mm[0]), float(one.y_mm[0]))),
+        "space origin": lps_point(transform, (float(one.x_mm[0]), float(one.y_mm[0]))),
         "encoding": "gzip",
         "content": "tactile map",
         "tactile_bayes_values": one.recipe.value_words.encode("ascii", "replace").decode(),
@@ -54,18 +62,18 @@ def nrrd_bytes(source: MapFile) -> bytes:
         warnings.simplefilter("ignore", DeprecationWarning)  # the library asks for the time in an old way
         nrrd.write(buffer, values, header, index_order="F", compression_level=9)
     head, _, data = buffer.getvalue().partition(b"\n\n")
-    kept = [line for line in head.split(b"\n") if not line.startswith(b"#")]  # one has the time of day
-    return b"\n".join(kept) + b"\n\n" + data
+    lines = [line for line in head.split(b"\n") if not line.startswith(b"#")]  # one has the time of day
+    return b"\n".join(lines) + b"\n\n" + data
 
 
-# --- Writing the files of an export: one file, or a folder that holds those of no other export.
+# --- Writing the files of an export: one file, or a folder of its own.
 
-_WRITTEN: Final[dict[str, Format]] = {"csv": "CSV", "fhir": "JSON", "nrrd": "NRRD"}
+_SINGLE_FILES: Final[dict[str, Format]] = {"csv": "CSV", "fhir": "JSON", "nrrd": "NRRD"}
 """Formats of exports that are one file."""
 
 
 class Outputs(Record):
-    """What an export writes."""
+    """Files that an export writes."""
 
     path: Path | None  #: File, or the folder of several; None where only a dictionary is wanted.
     dictionary: Path | None = None  #: File of the data dictionary of REDCap's form; None for none.
@@ -73,7 +81,7 @@ class Outputs(Record):
     force: bool = False  #: Overwrite files.
 
     def check(self, *, files: bool) -> None:
-        """Refuse, before any work is done, what could not be written; `files` says whether something is exported."""
+        """Refuse, before any work is done, files that could not be written; `files` is true if anything is exported."""
         if files and self.path is None:
             raise UsageError("there is nowhere to write to; give the path (-o OUT)")
         if not files and (self.dictionary is None or self.path is not None):
@@ -83,7 +91,7 @@ class Outputs(Record):
             raise UsageError("--dictionary is REDCap's; give it with --to csv")
         if self.path is not None and self.dictionary is not None and same_file(self.path, self.dictionary):
             raise UsageError(f"{self.path} is to hold records and dictionary; choose another name for one of them")
-        for path, written in ((self.dictionary, "CSV"), (self.path, _WRITTEN.get(self.to))):
+        for path, written in ((self.dictionary, "CSV"), (self.path, _SINGLE_FILES.get(self.to))):
             if path is not None and written is not None:
                 check_suffix(path, written)
                 refuse_existing(path, force=self.force)
@@ -93,7 +101,7 @@ class Outputs(Record):
         paths, folder = dict[Path, bytes](), None
         if exported and self.path is not None:
             if "" not in exported:
-                folder = _prepared_folder(self.path, set(exported))
+                folder = _make_folder(self.path, set(exported))
             paths = {self.path / name if name else self.path: data for name, data in exported.items()}
         if self.dictionary is not None:
             paths[self.dictionary] = dictionary_csv().encode()
@@ -106,8 +114,8 @@ class Outputs(Record):
         return tuple(paths)
 
 
-def _prepared_folder(folder: Path, names: set[str]) -> Path | None:
-    """Refuse a folder in which the files would stand beside those of another export; make it, and return a new one."""
+def _make_folder(folder: Path, names: set[str]) -> Path | None:
+    """Make the folder, and return it if it is new; one with files of another export is refused."""
     new = not folder.exists()
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
@@ -121,27 +129,27 @@ def _prepared_folder(folder: Path, names: set[str]) -> Path | None:
     return folder if new else None
 
 
-# --- What is exported from which files: inputs are told apart by their content, and one line says what does not fit.
+# --- One call for every export: inputs are recognised by their content, and one line says which does not fit.
 
 ExportFormat = Literal["dicom", "fhir", "nrrd", "csv"]
 FORMATS: Final[tuple[ExportFormat, ...]] = get_args(ExportFormat)
-TAKES: Final[dict[ExportFormat, tuple[str, ...]]] = {
+IDENTITY_FIELDS: Final[dict[ExportFormat, tuple[str, ...]]] = {
     "dicom": names_of(Identity),
     "fhir": ("patient_id", "patient_name", "birth_date", "sex", "issuer", "accession", "study_date"),
     "nrrd": (),
     "csv": ("patient_id", "study_date"),
 }
-"""Which parts of an identity each format holds."""
-Written = tuple[dict[str, bytes], tuple[str, ...]]
-"""Bytes by file name, for a folder, or by the empty name, for one file; and what a user should know of them."""
+"""Parts of an identity that each format holds."""
+Exported = tuple[dict[str, bytes], tuple[str, ...]]
+"""Bytes by file name, for a folder, or by the empty name, for one file; and remarks for the user."""
 
 
-def refuse_untaken(to: ExportFormat, options: Iterable[str]) -> None:
+def refuse_unsupported(to: ExportFormat, options: Iterable[str]) -> None:
     """Refuse parts of an identity that a format does not hold, rather than drop them."""
     for name in options:
-        if name not in TAKES[to]:
-            taken = ", ".join(_option(one) for one in TAKES[to]) or "nothing of a patient or study"
-            raise UsageError(f"{_option(name)} has no place in {to} files; they hold {taken}")
+        if name not in IDENTITY_FIELDS[to]:
+            held = ", ".join(_option(one) for one in IDENTITY_FIELDS[to]) or "nothing of a patient or study"
+            raise UsageError(f"{_option(name)} has no place in {to} files; they hold {held}")
 
 
 def _option(name: str) -> str:
@@ -150,24 +158,24 @@ def _option(name: str) -> str:
 
 def export(
     files: Sequence[MapFile | Sequence[EstimateFile]], *, to: ExportFormat, identity: Identity, id_from_scan: bool
-) -> Written:
+) -> Exported:
     """Export maps and estimates.
 
-    `files`: as `read_exam` gives them for maps, estimates (JSON) and posteriors, in any order; `identity`: of patient
-    and study; what the format does not hold is left out; `id_from_scan`: take the subject code of the scans for the
-    patient ID where none is given.
+    `files` are as `read_exam` returns them for maps, estimates (JSON) and posteriors, in any order. Parts of the
+    `identity` that the format does not hold are left out. With `id_from_scan` the scans' subject code is the patient ID
+    where none is given.
     """
     maps = [one for one in files if isinstance(one, MapFile)]
     estimates = [one for several in files if not isinstance(several, MapFile) for one in several]
-    seen = dict[str, Path]()
+    path_of = dict[str, Path]()
     inputs: list[MapFile | EstimateFile] = [*maps, *estimates]
     for one in inputs:
-        if one.digest in seen:
-            raise UsageError(f"{one.path} holds what {seen[one.digest]} holds; give each once")
-        seen[one.digest] = one.path
+        if one.digest in path_of:
+            raise UsageError(f"{one.path} holds what {path_of[one.digest]} holds; give each once")
+        path_of[one.digest] = one.path
     check_pairs(maps, estimates)
-    given: dict[str, Any] = {name: value for name, value in identity.given.items() if name in TAKES[to]}
-    who = Identity(**given)
+    dropped = {name: "" for name in identity.given if name not in IDENTITY_FIELDS[to]}
+    identity = replace(identity, **dropped)
     if to == "nrrd":
         if id_from_scan:
             raise UsageError("nrrd files hold no patient; leave out --patient-id-from-scan")
@@ -178,20 +186,20 @@ def export(
         return {"": nrrd_bytes(maps[0])}, ()
     if to == "csv":
         _refuse_maps(maps, estimates, to)
-        return {"": records_csv(estimates, who, id_from_scan=id_from_scan).encode()}, ()
-    if id_from_scan and not who.patient_id:
+        return {"": records_csv(estimates, identity, id_from_scan=id_from_scan).encode()}, ()
+    if id_from_scan and not identity.patient_id:
         subjects = {one.facts.get("subject", "") for one in inputs}
         if len(subjects) != 1 or "" in subjects:
             way_out = "give --patient-id instead of --patient-id-from-scan"
             raise UsageError(f"the scans name no subject, or several; {way_out}")
-        who = replace(who, patient_id=subjects.pop())
+        identity = replace(identity, patient_id=subjects.pop())
     no_patient = "the patient ID is empty; --patient-id, --worklist or --patient-id-from-scan gives one"
-    notes = [] if who.patient_id else [no_patient]
+    notes = [] if identity.patient_id else [no_patient]
     if to == "dicom":
-        held, others = _dicom(maps, estimates, who)
-        return held, (*notes, *others)
+        written, remarks = _dicom(maps, estimates, identity)
+        return written, (*notes, *remarks)
     _refuse_maps(maps, estimates, to)
-    return {"": bundle_json(_one_estimate(estimates, to), who).encode()}, tuple(notes)
+    return {"": bundle_json(_one_estimate(estimates, to), identity).encode()}, tuple(notes)
 
 
 def _one_estimate(estimates: Sequence[EstimateFile], to: ExportFormat) -> EstimateFile:
@@ -201,7 +209,7 @@ def _one_estimate(estimates: Sequence[EstimateFile], to: ExportFormat) -> Estima
     return estimates[0]
 
 
-def _dicom(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity: Identity) -> Written:
+def _dicom(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity: Identity) -> Exported:
     if not maps:
         raise UsageError(f"a DICOM report refers to its map; give it too: export MAP.nc {estimates[0].path} --to dicom")
     estimate = _one_estimate(estimates, "dicom") if estimates else None

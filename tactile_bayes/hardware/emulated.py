@@ -1,4 +1,4 @@
-"""Devices that send a scan as real ones would, over pseudo-terminals or TCP and at its own rate."""
+"""Emulated devices that send a scan as real ones would, over pseudo-terminals or TCP, at the scan's own rate."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ from tactile_bayes.errors import DeviceError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.readings import HelloReading, MissingReading, PoseReading, ToolReading, pose_from_relative
-from tactile_bayes.hardware.serial_trackers import encoded
+from tactile_bayes.hardware.serial_trackers import encode_record
 from tactile_bayes.options import FaultOptions
 from tactile_bayes.scans import Scan, TrackerPoses
 
 # --- Emulated devices: a scan's frames and poses as a head or a tracker sends them, with faults on request.
 #
-# They are devices like any other: nothing in the recorder knows of them.
+# The recorder treats them as any other devices.
 
 _NS: Final = 1_000_000_000
 # A command with arguments ends in CR; what is left are commands of one letter.
 _SETTING: Final = re.compile(rb"[A-Za-z][0-9*,][^\r]*\r")
 _BREATH_S: Final = 4.0
-# Where the second tool is, turned against the tracker so that its frame is another one.
+# Position and rotation of the second tool; it is rotated so that its frame differs from the tracker's.
 _REFERENCE_MM: Final = (250.0, -40.0, 30.0)
 _REFERENCE_TURN: Final = (0.8, 0.0, 0.6, 0.0)
 
 
 class Faults(FaultOptions):
-    """Faults of an emulated device, and what they do to its records."""
+    """Faults of an emulated device, applied to its records."""
 
     def disturb(self, record: bytes, rng: np.random.Generator) -> bytes:
-        """Apply the faults to a record: unchanged, one bit changed, or dropped."""
+        """Return the record unchanged, with one bit flipped, or empty where it is dropped."""
         if self.drop and rng.random() < self.drop:
             return b""
         if not self.corrupt or rng.random() >= self.corrupt:
@@ -56,25 +56,25 @@ class Faults(FaultOptions):
         return bytes(changed)
 
 
-def within(span: tuple[float, float] | None, time_s: float) -> bool:
-    """True at the times of a fault, given by its begin and its length."""
+def is_during(span: tuple[float, float] | None, time_s: float) -> bool:
+    """True during a fault, whose `span` is its begin and its length in s."""
     return span is not None and span[0] <= time_s < span[0] + span[1]
 
 
 class Device:
-    """An emulated device: it answers commands and sends records at their times; most wait for a command."""
+    """An emulated device: it answers commands and sends records at their times, most devices after a command."""
 
     times_s: FloatArray  #: Times of the records after the start, never falling.
     starts = 0  #: Number of START commands so far; each begins the scan anew.
     streaming = False  #: True when the device sends, or will when the scan begins.
     stopped = False  #: True when the host's last command about sending was STOP.
-    said_end = False  #: True when the device has told the host that everything was sent.
+    end_sent = False  #: True when the device has sent its last message, which says that everything was sent.
     open_framing = False  #: True for a device of the open framing, which has a last message.
 
     def start(self) -> None:
         """Begin to send."""
         self.starts += 1
-        self.streaming, self.stopped, self.said_end = True, False, False
+        self.streaming, self.stopped, self.end_sent = True, False, False
 
     def stop(self) -> None:
         """Stop sending."""
@@ -83,12 +83,12 @@ class Device:
     def greet(self) -> None:
         """React to a new connection."""
 
-    def hear(self, data: bytes) -> bytes:
+    def respond(self, data: bytes) -> bytes:
         """Process commands and return the answer."""
         raise NotImplementedError
 
-    def _obeyed(self, packets: Iterable[head.Packet]) -> Iterator[head.Packet]:
-        """Commands in the open framing, those to start and stop carried out."""
+    def _obey(self, packets: Iterable[head.Packet]) -> Iterator[head.Packet]:
+        """Carry out START and STOP among commands in the open framing; yields every command."""
         for packet in packets:
             if packet.kind == head.START:
                 self.start()
@@ -97,12 +97,12 @@ class Device:
             yield packet
 
     def record(self, index: int) -> bytes:
-        """Bytes of one record; empty for a record left out."""
+        """Bytes of one record; empty for a record that is not sent."""
         raise NotImplementedError
 
     def end(self, sent: int, dropped: int) -> bytes:
-        """Last message, after which the device no longer streams; empty where there is none."""
-        self.streaming, self.said_end = False, self.open_framing
+        """End the stream and return the last message; empty where the protocol has none."""
+        self.streaming, self.end_sent = False, self.open_framing
         return head.encode_end(sent, dropped) if self.open_framing else b""
 
 
@@ -125,9 +125,9 @@ class EmulatedHead(Device):
         name = self._scan.session.get("head_id", "emulated")
         return HelloReading(name, *self._scan.head.shape, saturation, rate)
 
-    def hear(self, data: bytes) -> bytes:
+    def respond(self, data: bytes) -> bytes:
         answer = b""
-        for packet in self._obeyed(self._commands.packets(data)):
+        for packet in self._obey(self._commands.packets(data)):
             if packet.kind == head.START:
                 self._every = max(1, packet.payload[0] if packet.payload else 1)
             if packet.kind in (head.ASK, head.START):
@@ -141,10 +141,11 @@ class EmulatedHead(Device):
         return head.encode_frame(self._scan.frames.counts[index], sequence=index, device_us=device_us)
 
 
-def played_tools(poses: TrackerPoses, faults: Faults, index: int, *, names: tuple[str, str]) -> list[ToolReading]:
-    """What a tracker knows at the n-th time of a scan, of a second tool first, with the faults that are a tracker's.
+def tool_readings(poses: TrackerPoses, faults: Faults, index: int, *, names: tuple[str, str]) -> list[ToolReading]:
+    """Readings of a tracker's tools at the n-th time of a scan, with the faults that a tracker can have.
 
-    `names` are those of the tool and of the second one, which is fixed to the body and there where that breathes.
+    `names` are those of the tool and of a reference fixed to the body. The reference comes first, and only where the
+    body breathes.
     """
     measured = index - index % max(1, faults.hold)  # the values of the latest measurement, at its own time
     x, y, z = poses.position_mm[measured].tolist()
@@ -158,7 +159,7 @@ def played_tools(poses: TrackerPoses, faults: Faults, index: int, *, names: tupl
         y += faults.breathe_mm / 2 * math.sin(2 * math.pi * time_s / _BREATH_S)
         bases = [PoseReading((x, y, z), _REFERENCE_TURN, pose.device_ns, tool=names[1])]
         pose = pose_from_relative(pose, bases[0])._replace(tool=names[0])
-    if within(faults.hide, time_s):
+    if is_during(faults.hide, time_s):
         return [*bases, MissingReading("out of sight", pose.tool)]
     return [*bases, pose]
 
@@ -172,17 +173,17 @@ class EmulatedTracker(Device):
         self._commands = head.PacketParser()
         self._faults = faults or Faults()
         names = ("Probe", "Reference") if protocol in ("open", "igtlink") else ("1", "2")
-        self._tools = partial(played_tools, poses, self._faults, names=names)
+        self._tools = partial(tool_readings, poses, self._faults, names=names)
 
     def greet(self) -> None:
         """Start sending in OpenIGTLink, whose servers send to whoever connects."""
         if self._protocol == "igtlink":
             self.start()
 
-    def hear(self, data: bytes) -> bytes:
+    def respond(self, data: bytes) -> bytes:
         answer = b""
         if self.open_framing:
-            for packet in self._obeyed(self._commands.packets(data)):
+            for packet in self._obey(self._commands.packets(data)):
                 if packet.kind == head.ASK:
                     answer += head.encode_hello(HelloReading("emulated tracker", 0, 0, 0, 0.0))
                     answer += self.record(0) if self._faults.breathe_mm else b""
@@ -198,7 +199,7 @@ class EmulatedTracker(Device):
         return answer
 
     def record(self, index: int) -> bytes:
-        return b"".join(encoded(self._protocol, one, index) for one in self._tools(index))
+        return b"".join(encode_record(self._protocol, one, index) for one in self._tools(index))
 
 
 # --- Emulated NDI tracker: the commands of the combined API that a host needs to follow one tool.
@@ -214,9 +215,9 @@ _START: Final = 0xA5C4
 _BAD_CRC, _UNKNOWN, _NOT_NOW = 0x04, 0x01, 0x0C
 _POLYNOMIAL: Final = 0xA001
 _LISTED: Final = {1: "to be freed", 2: "plugged in", 3: "initialised", 4: "enabled"}
-"""States of ports that PHSR asks for by numbers; by others it asks for all."""
-_LEADS_TO: Final = {"PVWR": "plugged in", "PINIT": "initialised", "PENA": "enabled", "PHF": "none"}
-"""The state of a tool's port after a command."""
+"""States of ports by the number in PHSR; another number asks for all ports."""
+_STATE_AFTER: Final = {"PVWR": "plugged in", "PINIT": "initialised", "PENA": "enabled", "PHF": "none"}
+"""State of a tool's port after a command."""
 _LONGEST: Final = 4096
 
 
@@ -231,10 +232,10 @@ def crc16(data: bytes) -> int:
 
 
 class EmulatedNdi(Device):
-    """NDI tracker that answers with the poses of the present time, counted from TSTART; it never sends unasked.
+    """Emulated NDI tracker: it answers with the poses of the present time, counted from TSTART; it sends nothing else.
 
-    Of the faults it has those that are a tracker's. `elapsed` gives the seconds of the scan
-    that other devices play too, None while it waits: by default it begins with TSTART.
+    It has only the faults that a tracker can have. `elapsed` returns the seconds of a scan that other devices play too,
+    None while that waits; by default the scan begins with TSTART.
     """
 
     _port = "plugged in"
@@ -245,13 +246,13 @@ class EmulatedNdi(Device):
         self.times_s = poses.time_s
         self._elapsed = elapsed
         faults = faults or Faults()
-        self._tools = partial(played_tools, poses, faults, names=("", ""))
+        self._tools = partial(tool_readings, poses, faults, names=("", ""))
         self._handles = (HANDLE + 1, HANDLE) if faults.breathe_mm else (HANDLE,)
         self._asked = 0
         self._begun: float | None = None
         self._rest = b""
 
-    def hear(self, data: bytes) -> bytes:
+    def respond(self, data: bytes) -> bytes:
         *lines, rest = (self._rest + data).split(b"\r")
         self._rest = rest[-_LONGEST:]
         return b"".join(self._answer(line) for line in lines)
@@ -259,19 +260,19 @@ class EmulatedNdi(Device):
     def _answer(self, line: bytes) -> bytes:
         name, colon, rest = line.partition(b":")
         if colon:
-            body, told = line[:-4], line[-4:]
-            if told != b"%04X" % crc16(body):
-                return _text(f"ERROR{_BAD_CRC:02X}")
+            body, checksum = line[:-4], line[-4:]
+            if checksum != b"%04X" % crc16(body):
+                return _encode_answer(f"ERROR{_BAD_CRC:02X}")
             rest = body[len(name) + 1 :]
         else:
             name, _, rest = line.partition(b" ")
         if name == b"BX":
             return self._poses_now()
-        done = self._do(name.decode("latin-1"), rest.decode("latin-1"))
-        return _text(f"ERROR{_UNKNOWN:02X}" if done is None else done)
+        done = self._carry_out(name.decode("latin-1"), rest.decode("latin-1"))
+        return _encode_answer(f"ERROR{_UNKNOWN:02X}" if done is None else done)
 
-    def _do(self, name: str, rest: str) -> str | None:
-        """Answer to one command; None for an unknown one."""
+    def _carry_out(self, name: str, rest: str) -> str | None:
+        """Carry out one command and return the answer; None for an unknown command."""
         match name:
             case "INIT" | "COMM" | "TSTOP":
                 self._begun = None if name != "COMM" else self._begun
@@ -286,15 +287,15 @@ class EmulatedNdi(Device):
             case "PHRQ":
                 self._port, self._asked = "asked for", self._asked + 1
                 return f"{HANDLE + self._asked - 1:02X}"
-            case _ if name in _LEADS_TO:
-                self._port = _LEADS_TO[name]
+            case _ if name in _STATE_AFTER:
+                self._port = _STATE_AFTER[name]
             case _:
                 return None
         return "OKAY"
 
     def _poses_now(self) -> bytes:
         if self._begun is None or self._port != "enabled":
-            return _text(f"ERROR{_NOT_NOW:02X}")
+            return _encode_answer(f"ERROR{_NOT_NOW:02X}")
         elapsed = time.monotonic() - self._begun if self._elapsed is None else self._elapsed() or 0.0
         index = int(np.searchsorted(self.times_s - self.times_s[0], elapsed, side="right")) - 1
         put_away = elapsed > self.times_s[-1] - self.times_s[0] + 0.1
@@ -311,27 +312,28 @@ class EmulatedNdi(Device):
         return header + crc16(header).to_bytes(2, "little") + body + crc16(body).to_bytes(2, "little")
 
 
-def _text(words: str) -> bytes:
+def _encode_answer(words: str) -> bytes:
     return b"%b%04X\r" % (words.encode(), crc16(words.encode()))
 
 
 # --- Serving of emulated devices over pseudo-terminals or TCP.
 
-# A device's own buffer: what does not fit is dropped record by record, as firmware does.
+# A device's buffer: records that do not fit are dropped, as firmware does.
 BUFFER_BYTES: Final = 256 * 1024
 _READ: Final = 4096
 _LOOK_S: Final = 0.01
 _LOOKS: Final = 25
 _IDLE_S: Final = 0.2
-# A follower repeats its first record so often while the scan waits, but not so soon after a START: it may begin now.
+# A device that follows repeats its first record this often while the scan waits, but not so soon after a START: the
+# scan may be about to begin.
 _HOLD_S: Final = 0.01
 _SETTLE_S: Final = 0.5
-# How long `--once` waits for a host to read, and to say STOP to a device that does not tell its end.
+# How long `--once` waits for a host to read, and to send STOP to a device whose protocol has no last message.
 LINGER_S: Final = 5.0
 
 
 class PtyLink:
-    """A pseudo-terminal, which the host at `url` opens like a serial device."""
+    """A pseudo-terminal; the host opens its `url` like a serial device."""
 
     def __init__(self) -> None:
         self._near, self._far = os.openpty()
@@ -360,9 +362,9 @@ class PtyLink:
         return 0
 
     def finish(self, patience_s: float) -> None:
-        """Wait until the terminal's buffers are empty, because they are lost when it closes.
+        """Wait until the terminal's buffers are empty, because closing it loses them.
 
-        Only the last of them says how much it holds, so it must have been empty for a while.
+        Only the last buffer says how much it holds, so it must stay empty for a while.
         """
         end, left, empty = time.monotonic() + patience_s, bytearray(4), 0
         while time.monotonic() < end and empty < _LOOKS:
@@ -447,8 +449,8 @@ class TcpLink:
 Link = PtyLink | TcpLink
 
 
-class Stage:
-    """Clock of a scan that devices play together; `speed` is seconds of the scan in a second."""
+class Playback:
+    """Clock of a scan that several devices play together; `speed` is seconds of the scan in a second."""
 
     def __init__(self, *, speed: float = 1.0) -> None:
         self.speed = speed
@@ -470,10 +472,10 @@ class Stage:
 
 @dataclass
 class Emulator:
-    """Runs an emulated device on a link, with the given faults; records keep their device times.
+    """Runs an emulated device on a link, with faults; records keep their device times.
 
-    Each START of a device that `leads` begins the scan. A device that follows another's stage repeats its first record
-    while it streams and the scan has not begun, as a tracker does whose sensor is held still.
+    Each START of a device that `leads` begins the scan. A device that follows repeats its first record while it streams
+    and the scan has not begun, as a tracker does whose sensor is held still.
     """
 
     device: Device
@@ -481,7 +483,7 @@ class Emulator:
     _: KW_ONLY
     faults: Faults
     rng: np.random.Generator
-    stage: Stage = field(default_factory=Stage)
+    stage: Playback = field(default_factory=Playback)
     leads: bool = True
 
     sent = dropped = faulty = 0  #: Records sent, dropped and changed by faults since a START.
@@ -499,16 +501,16 @@ class Emulator:
             self._step()
             if once and self._finished_at and not self._waiting:
                 waited = time.monotonic() - self._finished_at > LINGER_S
-                if self.device.said_end or self.device.stopped or waited:
+                if self.device.end_sent or self.device.stopped or waited:
                     self.link.finish(LINGER_S)
                     self.unplugged = True
 
     def _step(self) -> None:
         """Wait for the next event and handle it."""
         writable = [self.link] if self._waiting else []
-        readable, _, _ = select.select([self.link], writable, [], self._patience_s())
+        readable, _, _ = select.select([self.link], writable, [], self._wait_s())
         if readable:
-            self._hear()
+            self._read_commands()
         self._follow_commands()
         number, elapsed_s = self.stage.now()
         if self.device.streaming and self.link.connected():
@@ -520,13 +522,14 @@ class Emulator:
             elif not self.leads and time.monotonic() > self._hold_at:
                 self._hold_at = time.monotonic() + _HOLD_S
                 self._waiting += self.device.record(0)
-        self._pass_on()
+        self._send_waiting()
 
-    def _pass_on(self) -> None:
+    def _send_waiting(self) -> None:
         if self._waiting and not self.unplugged:
             del self._waiting[: self.link.write(bytes(self._waiting))]
 
-    def _patience_s(self) -> float:
+    def _wait_s(self) -> float:
+        """Longest wait for a command before the next record is due."""
         times = self.device.times_s
         if not self.device.streaming or self._next >= len(times):
             return _IDLE_S
@@ -535,16 +538,16 @@ class Emulator:
             return _HOLD_S
         return max(0.0, min((float(times[self._next] - times[0]) - elapsed_s) / self.stage.speed, _IDLE_S))
 
-    def _hear(self) -> None:
+    def _read_commands(self) -> None:
         was_there = self.link.connected()
-        self._waiting += self.device.hear(self.link.read())
+        self._waiting += self.device.respond(self.link.read())
         if self.link.connected() and not was_there:
             self.device.greet()
         elif was_there and not self.link.connected():
             self._waiting.clear()
 
     def _follow_commands(self) -> None:
-        """Begin anew at each START, also while streaming; a device that leads starts the others too."""
+        """Begin again at each START, also while streaming; a device that leads starts the others too."""
         if self.device.starts != self._starts:
             self._starts, self._hold_at = self.device.starts, time.monotonic() + _SETTLE_S
             if self.leads:
@@ -565,7 +568,7 @@ class Emulator:
                 self.link.close()
                 return
             record = self.device.record(self._next)
-            if within(self.faults.stall, moment) or len(self._waiting) + len(record) > BUFFER_BYTES:
+            if is_during(self.faults.stall, moment) or len(self._waiting) + len(record) > BUFFER_BYTES:
                 self.dropped += bool(record)
             elif record:
                 disturbed = self.faults.disturb(record, self.rng)
@@ -573,7 +576,7 @@ class Emulator:
                 self.sent += bool(disturbed)
                 self._waiting += disturbed
             self._next += 1
-            self._pass_on()  # at once: when this process was late, many are due and must not meet in the buffer
+            self._send_waiting()  # at once: when this process was late, many are due and must not meet in the buffer
         if self._next >= len(times):
             self._waiting += self.device.end(self.sent, self.dropped)
             self._finished_at = time.monotonic()

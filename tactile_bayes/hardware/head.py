@@ -29,7 +29,7 @@ HEADER: Final = struct.Struct("<BBIQ")
 CRC_BYTES: Final = 4
 # CRC-32 of any data followed by its own CRC-32, little-endian, is this number.
 _RESIDUE: Final = zlib.crc32(zlib.crc32(b"").to_bytes(CRC_BYTES, "little"))
-# Between two zero bytes; the longest packet a head may send. More without a zero is line noise, and is let go.
+# The longest packet a head may send. More bytes without a zero are line noise, and are dropped.
 MAX_PACKET_BYTES: Final = 16 * 1024
 _LONGEST: Final = MAX_PACKET_BYTES + MAX_PACKET_BYTES // 254 + 1
 
@@ -60,21 +60,21 @@ def cobs_decode(data: bytes) -> bytes | None:
     A code byte stands where a zero was, so most of the work is to put the zeros back in place.
     """
     out = bytearray(data)
-    place, end = 0, len(data)
+    index, end = 0, len(data)
     full = []  # codes of 255: no zero was there, the byte goes
-    while place < end:
-        code = data[place]
+    while index < end:
+        code = data[index]
         if code == 0:
             return None
-        out[place] = 0
-        place += code
+        out[index] = 0
+        index += code
         if code == 255:
-            full.append(place)
-    if place != end or not end:
+            full.append(index)
+    if index != end or not end:
         return None
-    for place in reversed(full):
-        if place < end:
-            del out[place]
+    for index in reversed(full):
+        if index < end:
+            del out[index]
     return bytes(out[1:])
 
 
@@ -87,7 +87,7 @@ def encode_packet(kind: int, payload: bytes, *, sequence: int = 0, device_us: in
 
 
 class PacketParser(readings.Parser):
-    """Parser of packets from a stream; skips and counts garbage: checksums that fail, senseless codes, noise."""
+    """Parser of packets; skips and counts garbage: failed checksums, invalid codes, noise."""
 
     def __init__(self) -> None:
         self._rest = b""
@@ -155,7 +155,7 @@ def encode_end(sent: int, dropped: int) -> bytes:
 def encode_pose(pose: readings.ToolReading, *, sequence: int) -> bytes:
     """Encode a pose without rounding: doubles in mm, and the nanoseconds that the header's microseconds leave out.
 
-    The tool's name follows, and a zero byte and why there is no pose, or what speaks against it.
+    The tool's name follows; then, after a zero byte, the reason for a missing pose or the pose's flags.
     """
     if isinstance(pose, readings.PoseReading):
         device_us, rest_ns = divmod(pose.device_ns or 0, 1000)
@@ -245,7 +245,7 @@ def needed_baud(taxels: int, *, rate_hz: float) -> int:
 
 
 def check_link_rate(hello: readings.HelloReading, *, baud: int, every: int = 1, port: str = "head") -> None:
-    """Refuse a line too slow for every n-th of the head's frames; the rate needed and what would fit are told."""
+    """Refuse a line that is too slow for every n-th frame of the head; the error says which rate or `every` fits."""
     need = needed_baud(hello.rows * hello.columns, rate_hz=hello.rate_hz / every)
     if need <= baud:
         return
@@ -268,12 +268,12 @@ STEPS_FOR_CURVATURE: Final = 4  #: With fewer steps a curvature fits the noise.
 class BladderStep(Record, eq=False):
     """Mean counts of the array under one known pressure."""
 
-    pressure_kpa: float  #: Of the bladder.
+    pressure_kpa: float  #: Pressure of the bladder.
     counts: FloatArray  #: (rows, columns) array: Mean over the frames.
     saturated: NDArray[np.bool_]  #: (rows, columns) bool array: Taxels that reached full scale in any frame.
 
     @classmethod
-    def of(cls, pressure_kpa: float, frames: readings.CountArray, *, saturation_count: int) -> BladderStep:
+    def from_frames(cls, pressure_kpa: float, frames: readings.CountArray, *, saturation_count: int) -> BladderStep:
         """Average the frames of a step."""
         if not np.isfinite(pressure_kpa) or pressure_kpa < 0:
             raise BadDataError(f"a step of {pressure_kpa} kPa", way_out="give the bladder's pressure, 0 or more")
@@ -286,13 +286,13 @@ class BladderStep(Record, eq=False):
 
 
 class ArrayFit(Record, eq=False):
-    """The fit of each taxel."""
+    """Calibration of an array, fitted taxel by taxel."""
 
     calibration: ElementCalibration
     """Pressure = gain x counts + offset, which is what maps use; gain 0 for dead and hot taxels."""
     curvature_kpa_per_count2: FloatArray
-    """(rows, columns) array: Of a parabola through the same steps; 0 where there are too few. Maps do not use it: it
-    tells how far the straight line is from enough.
+    """(rows, columns) array: Curvature of a parabola through the same steps; 0 where there are too few. Maps do not
+    use it; it shows how far the straight line is off.
     """
     dead: tuple[tuple[int, int], ...]
     hot: tuple[tuple[int, int], ...]  #: `dead`, `hot`: (row, column) of taxels that hardly answer, or far too much.
@@ -327,8 +327,8 @@ def fit_array(steps: Sequence[BladderStep], *, saturation_count: int) -> ArrayFi
     return ArrayFit(
         calibration=ElementCalibration(gain, offset, saturation_count=saturation_count),
         curvature_kpa_per_count2=curve[2],
-        dead=_places(dead),
-        hot=_places(hot),
+        dead=_taxels_in(dead),
+        hot=_taxels_in(hot),
         nonuniformity=_nonuniformity(line, pressure, counts, use),
         curved_nonuniformity=_nonuniformity(curve, pressure, counts, use),
         pressure_kpa=pressure,
@@ -338,7 +338,7 @@ def fit_array(steps: Sequence[BladderStep], *, saturation_count: int) -> ArrayFi
 def _odd_taxels(
     pressure: FloatArray, counts: FloatArray, valid: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Dead taxels and hot taxels, by the rise of their counts."""
+    """Masks of dead and of hot taxels, by the slope of their counts on pressure."""
     weight = valid.astype(np.float64)
     number = np.maximum(weight.sum(axis=0), 1)
     x = pressure[:, None, None] - (weight * pressure[:, None, None]).sum(axis=0) / number
@@ -353,7 +353,7 @@ def _odd_taxels(
 
 
 def _polynomials(pressure: FloatArray, counts: FloatArray, use: NDArray[np.bool_], *, degree: int) -> FloatArray:
-    """(3, rows, columns) coefficients of pressure in counts, lowest first; zero where nothing is used."""
+    """(3, rows, columns) coefficients of pressure in counts, lowest order first; zero with fewer than two steps."""
     result = np.zeros((3, *counts.shape[1:]))
     for row, column in np.argwhere(use.sum(axis=0) >= 2):
         chosen = use[:, row, column]
@@ -369,26 +369,26 @@ def _nonuniformity(
     coefficients: FloatArray, pressure: FloatArray, counts: FloatArray, use: NDArray[np.bool_]
 ) -> FloatArray:
     powers = np.arange(len(coefficients))[:, None, None]
-    found = np.full(len(pressure), np.nan)
+    shares = np.full(len(pressure), np.nan)
     for i, (step, chosen) in enumerate(zip(counts, use, strict=True)):
         if pressure[i] > 0 and chosen.sum() > 1:
             kpa = (coefficients * step**powers).sum(axis=0)[chosen]
-            found[i] = float(kpa.std(ddof=1)) / pressure[i]
-    return found
+            shares[i] = float(kpa.std(ddof=1)) / pressure[i]
+    return shares
 
 
-def _places(mask: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
+def _taxels_in(mask: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
     return tuple((int(row), int(column)) for row, column in np.argwhere(mask))
 
 
 # --- Test of a tracker's rotation convention (sensor to base, or inverse) by turning it about a fixed point.
 
 LEAST_TURN_DEG: Final = 20.0
-CLEAR: Final = 3.0  #: How many times worse the wrong sense must fit before the right one is believed.
+CLEAR: Final = 3.0  #: The wrong sense must fit this many times worse than the right one.
 
 
 class RotationSense(Record):
-    """Fit of a fixed point under each sense of rotation, and the angle that the sensor was turned by."""
+    """Fit of a fixed point under each sense of rotation, and the angle by which the sensor was turned."""
 
     as_given_mm: float
     inverted_mm: float  #: `as_given_mm`, `inverted_mm`: Root mean square distance of the point from its mean.
@@ -413,19 +413,21 @@ def rotation_sense(position_mm: FloatArray, quaternion_wxyz: FloatArray) -> Rota
         raise BadDataError(f"{len(position_mm)} poses are too few", way_out="turn the sensor for some seconds")
     rotation = rotation_from_quaternion(quaternion_wxyz)
     traces = np.einsum("nij,ij->n", rotation, rotation[0])
-    turn = float(np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)).max()))
-    if turn < LEAST_TURN_DEG:
+    turn_deg = float(np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)).max()))
+    if turn_deg < LEAST_TURN_DEG:
         raise BadDataError(
-            f"the sensor was turned by {turn:.0f} degrees only", way_out=f"turn it by {LEAST_TURN_DEG:g} or more"
+            f"the sensor was turned by {turn_deg:.0f} degrees only", way_out=f"turn it by {LEAST_TURN_DEG:g} or more"
         )
     inverse = rotation.transpose(0, 2, 1)
-    return RotationSense(_spread_mm(position_mm, rotation), _spread_mm(position_mm, inverse), turn)
+    return RotationSense(
+        _fixed_point_rms_mm(position_mm, rotation), _fixed_point_rms_mm(position_mm, inverse), turn_deg
+    )
 
 
-def _spread_mm(position_mm: FloatArray, rotation: FloatArray) -> float:
+def _fixed_point_rms_mm(position_mm: FloatArray, rotation: FloatArray) -> float:
     minus = np.broadcast_to(-np.eye(3), rotation.shape)
     matrix = np.concatenate([rotation, minus], axis=2).reshape(-1, 6)
-    wanted = -position_mm.reshape(-1)
-    solution = np.linalg.lstsq(matrix, wanted, rcond=None)[0]
-    rest = (matrix @ solution - wanted).reshape(-1, 3)
+    target = -position_mm.reshape(-1)
+    solution = np.linalg.lstsq(matrix, target, rcond=None)[0]
+    rest = (matrix @ solution - target).reshape(-1, 3)
     return float(np.sqrt((rest**2).sum(axis=1).mean()))

@@ -29,7 +29,7 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import BoolArray, FloatArray, Plane, apply, patient_from_plane
 from tactile_bayes.hardware.ports import PIPE_BYTES
 from tactile_bayes.hardware.readings import CountArray, PoseReading
-from tactile_bayes.hardware.recorder import Observer, Report
+from tactile_bayes.hardware.recorder import Observer, RecordingReport
 from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.cells import FramePoses, HeadMoments, distinct_poses, head_moments, poses_at
 from tactile_bayes.mapping.map import TactileMap, orientation_of
@@ -38,16 +38,16 @@ from tactile_bayes.scans import ElementCalibration, HeadGeometry, TrackerPoses
 
 # --- Feed of a recording to its live view, through a pipe on which the recorder never waits.
 #
-# A message is the sizes of its parts, JSON, and a frame's counts. It goes in whole or, when it does not fit, not at
-# all: then the view misses it while the file does not.
+# A message is the sizes of its parts, JSON, and a frame's counts. A message that does not fit into the pipe is dropped
+# whole: the view misses it, the file does not.
 
 _SIZES: Final = struct.Struct("<II")
-_TOLD: Final = ("frames", "frames_lost", "poses", "duration_s", "unseen")  #: Of the recorder's account.
+_REPORTED: Final = ("frames", "frames_lost", "poses", "duration_s", "unseen")  #: Fields of the recorder's report.
 
 
-Seen = tuple[Any, ...]
+FeedMessage = tuple[Any, ...]
 """``"frame"``, device time, host time, counts; ``"pose"``, device time, place, quaternion; ``"landmark"``, name, place;
-or ``"report"`` and some of the account."""
+or ``"report"`` and some fields of the report."""
 
 
 class Feed(Observer):
@@ -72,17 +72,17 @@ class Feed(Observer):
         """Send a landmark, touched or read from a file."""
         self._send("landmark", name, position_mm.tolist())
 
-    def told(self, report: Report) -> None:
-        """Send the account so far, with the landmark that was touched last."""
-        told = {name: getattr(report, name) for name in _TOLD}
-        self._send("report", told | {"touched": "".join(report.landmarks[-1:])})
+    def report(self, report: RecordingReport) -> None:
+        """Send the report so far, with the landmark that was touched last."""
+        summary = {name: getattr(report, name) for name in _REPORTED}
+        self._send("report", summary | {"touched": "".join(report.landmarks[-1:])})
 
-    def _send(self, *told: Any, counts: bytes = b"") -> None:
-        text = json.dumps(told).encode()
-        message = _SIZES.pack(len(text), len(counts)) + text + counts
+    def _send(self, *message: Any, counts: bytes = b"") -> None:
+        text = json.dumps(message).encode()
+        data = _SIZES.pack(len(text), len(counts)) + text + counts
         with suppress(BlockingIOError, BrokenPipeError):  # it is full, or the view was closed; the recording goes on
-            if len(message) <= select.PIPE_BUF:  # else it could go in by halves
-                os.write(self._pipe, message)
+            if len(data) <= select.PIPE_BUF:  # a longer one could be cut in two
+                os.write(self._pipe, data)
                 return
         self.missed += 1
 
@@ -91,34 +91,34 @@ class Feed(Observer):
         os.close(self._pipe)
 
 
-def fed(pipe: int, every_s: float) -> Iterator[list[Seen]]:
-    """What a `Feed` has sent, time after time until the recorder has gone.
+def read_feed(pipe: int, every_s: float) -> Iterator[list[FeedMessage]]:
+    """Yield the messages that a `Feed` has sent since the last time, every `every_s` until the recorder has gone.
 
-    Messages are not given one by one: frames taken so cost eight times as much.
+    They come in lists: frames that are mapped one by one cost eight times as much.
     """
     os.set_blocking(pipe, False)
     ended = False
     while not ended:
         time.sleep(every_s)
-        data, seen, place = b"", list[Seen](), 0
+        data, messages, index = b"", list[FeedMessage](), 0
         with suppress(BlockingIOError):
             while piece := os.read(pipe, PIPE_BYTES):
                 data += piece
             ended = True
-        while place < len(data):  # a whole number of messages, as each went in at once
-            text, size = _SIZES.unpack_from(data, place)
-            start = place + _SIZES.size + text
-            place = start + size
-            told = json.loads(data[start - text : start])
-            if told[0] == "frame":
-                told[-1] = np.frombuffer(data[start:place], dtype="<u2").reshape(told[-1])
-            seen.append(tuple(told))
-        yield seen
+        while index < len(data):  # a whole number of messages, as each went in at once
+            text, size = _SIZES.unpack_from(data, index)
+            start = index + _SIZES.size + text
+            index = start + size
+            message = json.loads(data[start - text : start])
+            if message[0] == "frame":
+                message[-1] = np.frombuffer(data[start:index], dtype="<u2").reshape(message[-1])
+            messages.append(tuple(message))
+        yield messages
 
 
 # --- The growing map and the pressure during a recording, for a live view.
 
-# Frames used after which the plane is fitted anew: the first ones lie on a line.
+# Numbers of used frames at which the plane is fitted again: the first frames lie on a line.
 REFIT_AT: Final = (100, 200, 400, 800, 1600)
 LANDMARKS: Final = ("sternal_notch", "xiphoid")
 _KEPT_POSES: Final = 400
@@ -126,24 +126,24 @@ _PATIENCE_NS: Final = 150_000_000
 
 
 class LiveState(Record, eq=False):
-    """Data of one drawing of the live view."""
+    """State of a recording that the live view draws."""
 
     tactile_map: TactileMap | None = None
-    """So far, with the patient's axes once both landmarks are known; None before there is one."""
+    """Map so far, with the patient's axes once both landmarks are known; None before there is one."""
     pressure_kpa: float = float("nan")  #: Mean of the last frame; NaN before the first.
     frames: int = 0
     frames_lost: int = 0
     poses: int = 0
     unseen: str = ""
-    """`frames`, `frames_lost`, `poses`, `unseen`: By the recorder's account; `unseen` is why there is no pose now."""
-    duration_s: float = 0.0  #: Recorded so far.
-    used_share: float = 0.0  #: Of the frames that the map has used.
-    latency_ms: float = 0.0  #: From the recorder to this state, of its youngest frame.
-    landmarks: tuple[str, ...] = ()  #: Names of those touched or read from a file.
-    touched: str = ""  #: The last one that was touched, with its place and whether the head was still, in words.
+    """`frames`, `frames_lost`, `poses`, `unseen`: From the recorder's report; `unseen` is why no pose comes now."""
+    duration_s: float = 0.0  #: Time recorded so far.
+    used_share: float = 0.0  #: Share of the frames that the map uses.
+    latency_ms: float = 0.0  #: Age of the youngest frame in this state.
+    landmarks: tuple[str, ...] = ()  #: Names of the landmarks that were touched or read from a file.
+    touched: str = ""  #: The landmark touched last, with its position and whether the head was still, in words.
     size: str = ""  #: The current estimate in words.
     lump_base_mm: FloatArray | None = None
-    """(3,) array or None: Where the estimate's lump lies, in `base`: the plane changes while the map grows."""
+    """(3,) array or None: Centre of the estimated lump in `base`: the map's plane changes while the map grows."""
 
     @property
     def size_words(self) -> str:
@@ -161,9 +161,9 @@ class LiveState(Record, eq=False):
 
     @property
     def account_words(self) -> str:
-        """Numbers so far; a tool that is not seen comes first."""
-        unseen, made = f"NO POSE ({self.unseen}); " if self.unseen else "", self.tactile_map
-        covered_mm2 = 0.0 if made is None else float(made.covered.sum()) * made.recipe.cell_mm**2
+        """Counts so far, in words; a missing pose comes first."""
+        unseen, tactile_map = f"NO POSE ({self.unseen}); " if self.unseen else "", self.tactile_map
+        covered_mm2 = 0.0 if tactile_map is None else float(tactile_map.covered.sum()) * tactile_map.recipe.cell_mm**2
         return (
             f"{unseen}{self.duration_s:.1f} s, {self.frames} frames, {self.frames_lost} lost, {self.poses} poses, "
             f"{covered_mm2 / 100:.1f} cm² covered"
@@ -171,9 +171,9 @@ class LiveState(Record, eq=False):
 
     @property
     def landmark_words(self) -> str:
-        """Which landmarks are known, and the last touch in words; empty while there are none."""
-        known = ", ".join(name.replace("_", " ") for name in self.landmarks)
-        return f"landmarks: {known}" + (f"; {self.touched}" if self.touched else "") if known else ""
+        """Names of the known landmarks and the last touch, in words; empty without landmarks."""
+        names = ", ".join(name.replace("_", " ") for name in self.landmarks)
+        return f"landmarks: {names}" + (f"; {self.touched}" if self.touched else "") if names else ""
 
     @property
     def pressure_words(self) -> str:
@@ -205,21 +205,21 @@ class LiveMap:
     calibration: ElementCalibration
     _frames: list[tuple[int, CountArray]] = field(default_factory=list)
     _poses: list[tuple[int, Sequence[float], Sequence[float]]] = field(default_factory=list)
-    """`_frames`, `_poses`: Those not mapped yet, and the last ones, each with its device time."""
+    """`_frames`, `_poses`: Frames not mapped yet, and the last poses, each with its device time."""
     _report: dict[str, Any] = field(default_factory=dict)
     _landmarks: dict[str, FloatArray] = field(default_factory=dict)
     _map: MapAccumulator | None = None
-    _fed: list[tuple[CountArray, FramePoses, BoolArray]] = field(default_factory=list)
-    """Frames and poses that the map was given, and which it used, as long as its plane may change."""
+    _mapped: list[tuple[CountArray, FramePoses, BoolArray]] = field(default_factory=list)
+    """Frames in the map, their poses, and which were used; kept as long as the plane may change."""
     _refits: int = 0
     _pressure_kpa: float = float("nan")
     _host_ns: int = 0
 
-    def take(self, seen: Iterable[Seen]) -> None:
+    def take(self, messages: Iterable[FeedMessage]) -> None:
         """Add frames, poses and landmarks; frames wait for the tracker's next pose."""
         youngest = None
-        for one in seen:
-            match one:
+        for message in messages:
+            match message:
                 case "frame", device_ns, host_ns, counts:
                     self._frames.append((device_ns, counts))
                     youngest, self._host_ns = counts, host_ns
@@ -246,44 +246,45 @@ class LiveMap:
             return
         del self._frames[: len(ready)]
         poses = TrackerPoses(np.array([max(0, ns) / 1e9 for ns in times_ns]), np.array(places), np.array(turns))
-        found = poses_at(distinct_poses(poses), np.array([device_ns / 1e9 for device_ns, _ in ready]))
+        frame_poses = poses_at(distinct_poses(poses), np.array([device_ns / 1e9 for device_ns, _ in ready]))
         if self._map is None:
-            if not found.known.any():
+            if not frame_poses.known.any():
                 return
-            self._map = self._map_on(head_moments(self.head, found).plane())
+            self._map = self._empty_map(head_moments(self.head, frame_poses).plane())
         counts = np.stack([counts for _, counts in ready])
-        used = self._map.add(counts, found)
+        used = self._map.add(counts, frame_poses)
         if self._refits < len(REFIT_AT):
-            self._fed.append((counts, found, used))
+            self._mapped.append((counts, frame_poses, used))
             self._refit()
 
-    def _map_on(self, plane: Plane) -> MapAccumulator:
+    def _empty_map(self, plane: Plane) -> MapAccumulator:
         return MapAccumulator(self.head, self.calibration, plane_from_base=plane.plane_from_base)
 
     def _refit(self) -> None:
-        """Move the map to the best-fit plane of the frames used so far, from time to time."""
-        if sum(int(used.sum()) for _, _, used in self._fed) < REFIT_AT[self._refits]:
+        """Map all frames again on their best-fit plane, when their number has reached the next of `REFIT_AT`."""
+        if sum(int(used.sum()) for _, _, used in self._mapped) < REFIT_AT[self._refits]:
             return
         self._refits += 1
-        moments = sum((head_moments(self.head, poses.part(used)) for _, poses, used in self._fed), HeadMoments())
+        moments = sum((head_moments(self.head, poses.part(used)) for _, poses, used in self._mapped), HeadMoments())
         with suppress(BadDataError):  # still too nearly a line: the plane under the head will do until the next time
-            self._map = self._map_on(moments.plane())
-            for counts, poses, _ in self._fed:
+            self._map = self._empty_map(moments.plane())
+            for counts, poses, _ in self._mapped:
                 self._map.add(counts, poses)
         if self._refits == len(REFIT_AT):
-            self._fed.clear()
+            self._mapped.clear()
 
     def _snapshot(self) -> TactileMap | None:
-        """The map so far, with the patient's axes if known."""
+        """The map so far, with the patient's axes where they are known."""
         if self._map is None or not self._map.figures["frames_used"]:
             return None
-        found = self._map.snapshot()
-        if found.plane_from_base is None or not all(name in self._landmarks for name in LANDMARKS):
-            return found
+        tactile_map = self._map.snapshot()
+        if tactile_map.plane_from_base is None or not all(name in self._landmarks for name in LANDMARKS):
+            return tactile_map
         notch, xiphoid = (self._landmarks[name] for name in LANDMARKS)
         with suppress(BadDataError):  # two landmarks in one place give no axes
-            return replace(found, patient_from_plane=patient_from_plane(notch, xiphoid, found.plane_from_base))
-        return found
+            axes = patient_from_plane(notch, xiphoid, tactile_map.plane_from_base)
+            return replace(tactile_map, patient_from_plane=axes)
+        return tactile_map
 
     def state(self, *, size: str = "", lump_base_mm: FloatArray | None = None) -> LiveState:
         """The present state for the view."""
@@ -326,9 +327,9 @@ def grey_levels(values: FloatArray) -> FloatArray:
 # that is open in the browser can look on.
 
 _PAGE: Final = Path(__file__).with_name("live_page.html")
-OPEN_S: Final = 4.0  #: How long a page may take to ask, and to say goodbye: the view's process waits for all of them.
+OPEN_S: Final = 4.0  #: How long a page may take to send its request: the view's process waits for all of them.
 CLOSE_S: Final = 0.5
-MOST_OPEN: Final = 24  #: Connections at a time; nobody has as many pages open.
+MOST_OPEN: Final = 24  #: Connections at a time, more than anybody's open pages.
 WAIT_S: Final = 0.1
 SHED_S: Final = 0.01
 _SECURITY: Final = (
@@ -337,7 +338,7 @@ _SECURITY: Final = (
 )
 
 
-def address_of(text: str) -> tuple[str, int]:
+def parse_address(text: str) -> tuple[str, int]:
     """Parse the HOST:PORT of a server that only this computer can reach: the data are a patient's."""
     host, colon, port = text.rpartition(":")
     if not colon or not port.isdigit() or int(port) > 65535:
@@ -354,11 +355,11 @@ def address_of(text: str) -> tuple[str, int]:
     return host, int(port)
 
 
-class _Door(socket.socket):
-    """A listening socket that keeps `MOST_OPEN` connections, whatever comes.
+class _LimitedListener(socket.socket):
+    """A listening socket with at most `MOST_OPEN` connections, which survives failures to accept one.
 
     A server of websockets ends for good when a connection cannot be accepted, for example without file descriptors.
-    Beyond the limit the oldest that is no page gives way, so that whoever knows the address is let in.
+    Beyond the limit the oldest connection that is no page is closed, so that a page with the secret always gets in.
     """
 
     def __init__(self, host: str, port: int, pages: Callable[[], set[socket.socket]]) -> None:
@@ -382,13 +383,13 @@ class _Door(socket.socket):
                 time.sleep(SHED_S)
                 continue
             with suppress(OSError):  # its other end has gone, or the system has nothing left
-                made, address = super().accept()
-                self._open.append(made)
-                return made, address
+                connection, address = super().accept()
+                self._open.append(connection)
+                return connection, address
             time.sleep(SHED_S)
 
     def _wait(self) -> None:
-        """Wait for somebody to knock."""
+        """Wait for a connection."""
         while self.fileno() >= 0:
             with suppress(ValueError):  # it was closed meanwhile
                 if select.select([self], [], [], WAIT_S)[0]:
@@ -397,7 +398,7 @@ class _Door(socket.socket):
 
 
 class LiveServer:
-    """Sends states to the pages whose address has the secret, a random one; port 0 takes a free one."""
+    """Sends states to the pages whose address has the server's random secret; port 0 takes a free port."""
 
     def __init__(self, host: str, port: int) -> None:
         try:
@@ -405,15 +406,15 @@ class LiveServer:
         except ImportError:
             raise UsageError("--serve needs the package websockets; pip install 'tactile-bayes[live]'") from None
         self._token = secrets.token_urlsafe(24)
-        self._news = threading.Condition()
-        self._text, self._number, self._over = "", 0, False
+        self._changed = threading.Condition()
+        self._text, self._number, self._ended = "", 0, False
         self._pages: set[Any] = set()
         try:
             self._closed = websockets.exceptions.ConnectionClosed
             self._server = websockets.sync.server.serve(
-                self._talk,
-                sock=_Door(host, port, self._sockets),
-                process_request=self._admit,
+                self._send_states,
+                sock=_LimitedListener(host, port, self._sockets),
+                process_request=self._answer_request,
                 compression=None,
                 open_timeout=OPEN_S,
                 close_timeout=CLOSE_S,
@@ -431,16 +432,16 @@ class LiveServer:
 
     def show(self, state: LiveState) -> None:
         """Send a state to every page."""
-        text = json.dumps(document(state), allow_nan=False)
-        with self._news:
+        text = json.dumps(page_state(state), allow_nan=False)
+        with self._changed:
             self._text, self._number = text, self._number + 1
-            self._news.notify_all()
+            self._changed.notify_all()
 
     def close(self) -> None:
-        """Tell the pages that the recording is over, and stop; pages that do not read are cut off."""
-        with self._news:
-            self._over = True
-            self._news.notify_all()
+        """End the pages' connections and stop the server; pages that do not read are cut off."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
         closing = threading.Thread(target=self._server.shutdown, daemon=True)
         closing.start()
         closing.join(CLOSE_S)
@@ -450,14 +451,14 @@ class LiveServer:
         closing.join(CLOSE_S)
 
     def _sockets(self) -> set[socket.socket]:
-        with self._news:
+        with self._changed:
             return {page.socket for page in self._pages}
 
-    def _admit(self, connection: Any, request: Any) -> Any:
-        """Return the page or a refusal; None accepts a websocket."""
+    def _answer_request(self, connection: Any, request: Any) -> Any:
+        """Answer with the page or a refusal; None accepts a websocket."""
         address = urlsplit(request.path)
-        given = parse_qs(address.query).get("token", [""])[0]
-        if not hmac.compare_digest(given.encode(), self._token.encode()):
+        token = parse_qs(address.query).get("token", [""])[0]
+        if not hmac.compare_digest(token.encode(), self._token.encode()):
             return connection.respond(HTTPStatus.FORBIDDEN, "give the whole address that `record` printed\n")
         if request.headers.get_all("Host") != [self._authority]:
             return connection.respond(HTTPStatus.FORBIDDEN, "not under this name\n")
@@ -477,42 +478,42 @@ class LiveServer:
         response.headers["Cache-Control"] = "no-store"
         return response
 
-    def _talk(self, connection: Any) -> None:
+    def _send_states(self, connection: Any) -> None:
         """Send each new state until the page closes or the recording ends."""
-        seen = 0
-        with self._news:
+        number_sent = 0
+        with self._changed:
             self._pages.add(connection)
         try:
             while True:
-                with self._news:
-                    while self._number == seen and not self._over:
-                        self._news.wait()
-                    text, seen, over = self._text, self._number, self._over
+                with self._changed:
+                    while self._number == number_sent and not self._ended:
+                        self._changed.wait()
+                    text, number_sent, over = self._text, self._number, self._ended
                 if over:
                     return
                 connection.send(text)
         except self._closed:
             return
         finally:
-            with self._news:
+            with self._changed:
                 self._pages.discard(connection)
 
 
-def document(state: LiveState) -> dict[str, Any]:
-    """A state as JSON for the page."""
-    known = math.isfinite(state.pressure_kpa)
+def page_state(state: LiveState) -> dict[str, Any]:
+    """A state as plain data for the page."""
+    has_pressure = math.isfinite(state.pressure_kpa)
     return {
         "tone": state.tone,
-        "pressure_kpa": round(state.pressure_kpa, 2) if known else None,
+        "pressure_kpa": round(state.pressure_kpa, 2) if has_pressure else None,
         "window_kpa": list(PRESSURE_WINDOW_KPA),
         "figures": state.account_words,
         "size": state.size_words,
-        "map": _map_document(state),
+        "map": _map_state(state),
     }
 
 
-def _map_document(state: LiveState) -> dict[str, Any] | None:
-    """Picture row by row from its top left corner, with the overlays, in cells from that corner."""
+def _map_state(state: LiveState) -> dict[str, Any] | None:
+    """The map's picture row by row from its top left corner, and the overlays in cells from that corner."""
     tactile_map = state.tactile_map
     if tactile_map is None:
         return None
@@ -529,7 +530,7 @@ def _map_document(state: LiveState) -> dict[str, Any] | None:
         "edges": dict(view.edges),
         "words": view.words,
         "notch": None if view.notch is None else [round(part, 4) for part in view.notch],
-        "lump": None if state.lump_mm is None else [round(at, 2) for at in view.place(tactile_map, state.lump_mm)],
+        "lump": None if state.lump_mm is None else [round(part, 2) for part in view.place(tactile_map, state.lump_mm)],
         "limits": None if limits is None else [float(f"{end:.3g}") for end in limits],
         "values": tactile_map.recipe.value_words,
     }

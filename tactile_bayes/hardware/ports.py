@@ -33,13 +33,13 @@ SILENT_S: Final = 3.0  #: Without a byte for so long a device has gone.
 _SHOWN_BYTES: Final = 12
 _SOCKET_BYTES: Final = 65536
 _MOST_DRAINED: Final = 4096
-# One read waits so long at most. It is never changed: with rfc2217 that would be negotiated anew each time.
+# Longest wait of one read. It is never changed: with rfc2217 each change would be negotiated.
 _READ_S: Final = 0.01
-# What a device that vanishes ends a call with; a terminal's own error is no OSError.
+# Errors of a call on a device that has vanished; a terminal's own error is no OSError.
 GONE: Final = (OSError, serial.SerialException, termios.error)
 # In "[Errno 111] Connection refused" and "(25, 'Inappropriate ioctl for device')".
 _ERROR_NUMBER: Final = re.compile(r"(?:\[Errno |\()(\d+)[\],]")
-_NETWORK: Final = ("socket://", "rfc2217://")  #: Of a network's URL: host and port.
+_NETWORK: Final = ("socket://", "rfc2217://")  #: Beginnings of URLs that name a host and a port.
 
 
 class Port:
@@ -68,11 +68,11 @@ class Port:
 
     @property
     def remedy(self) -> str:
-        """What to look at when it has gone."""
+        """Advice for when the device has gone."""
         return "check its cable" if self.has_line_rate else "check that its program runs"
 
     def write(self, data: bytes) -> None:
-        """Send bytes; a device that has gone is one error line."""
+        """Send bytes; `DeviceError` if the device has gone."""
         try:
             self._serial.write(data)
             self._serial.flush()
@@ -80,7 +80,7 @@ class Port:
             raise DeviceError(f"{self.name}: cannot be written to ({_reason(error)}); {self.remedy}") from None
 
     def read_some(self, timeout_s: float) -> bytes:
-        """Read what comes within the time, returning with the first bytes; empty when nothing came."""
+        """Return the first bytes that come within the time; empty when nothing came."""
         end = time.monotonic() + timeout_s
         try:
             while True:
@@ -93,25 +93,25 @@ class Port:
             raise DeviceError(f"{self.name}: cannot be read ({_reason(error)}); {self.remedy}") from None
 
     def _waiting(self) -> bytes:
-        """Bytes that have come already."""
+        """Read the bytes that have come already."""
         if not self._is_socket:
             return bytes(self._serial.read(self._serial.in_waiting))
-        number = self._serial.fileno()  # pyserial knows only whether there are any, and loses those before an end
+        number = self._serial.fileno()  # pyserial does not count a socket's bytes, and loses those before its end
         return os.read(number, _SOCKET_BYTES) if select.select([number], [], [], 0)[0] else b""
 
     def drain(self) -> bytes:
-        """Take input until the line is quiet, at most 2 s; returns its beginning."""
-        end, came = time.monotonic() + 2.0, b""
+        """Read until the line is quiet, at most 2 s; returns the first bytes."""
+        end, received = time.monotonic() + 2.0, b""
         while time.monotonic() < end and (data := self.read_some(0.05)):
-            came += data[: _MOST_DRAINED - len(came)]
-        return came
+            received += data[: _MOST_DRAINED - len(received)]
+        return received
 
     @contextlib.contextmanager
     def descriptor(self) -> Iterator[int]:
         """File descriptor that a reading process can inherit.
 
-        A port without one (rfc2217, loop) is read by a thread here that passes its bytes on; under load a thread is
-        less sure to be in time than a process.
+        A port without one (rfc2217, loop) is read by a thread here that passes its bytes on; under load a thread may be
+        late where a process is not.
         """
         number = None
         with contextlib.suppress(AttributeError, OSError, TypeError):
@@ -162,7 +162,7 @@ def _relay(port: Any, sink: socket.socket) -> None:
 
 
 def _reason(error: Exception) -> str:
-    """The system's error text, also where pyserial wraps it in its own."""
+    """The system's error text, also where pyserial wraps it in a text of its own."""
     number = error.args[0] if isinstance(error, termios.error) else getattr(error, "errno", None)
     if not isinstance(number, int):
         wrapped = _ERROR_NUMBER.search(str(error))
@@ -171,7 +171,7 @@ def _reason(error: Exception) -> str:
     return os.strerror(number) if number > 0 else str(error).split("] ")[-1].split(": ")[-1].strip("[]()'\" ")
 
 
-def shown(data: bytes) -> str:
+def preview(data: bytes) -> str:
     """Beginning of received bytes for a message: as text if printable, else as hex."""
     if not data:
         return "nothing"
@@ -199,11 +199,11 @@ _ADAPTERS: Final = {0x0403: "FTDI", 0x10C4: "Silicon Labs", 0x067B: "Prolific", 
 
 def list_ports() -> list[str]:
     """The system's ports in order, each with its description and a guess from its USB ids; opens none of them."""
-    found = ((port.device, port.description or "", guess(port.vid, port.product or "")) for port in comports())
-    return [f"{url}  {description}: {guess}" for url, description, guess in sorted(found)]
+    ports = sorted(comports(), key=lambda port: (port.device, port.description or ""))
+    return [f"{one.device}  {one.description or ''}: {guess_device(one.vid, one.product or '')}" for one in ports]
 
 
-def guess(vendor: int | None, product: str) -> str:
+def guess_device(vendor: int | None, product: str) -> str:
     """Guess the device on a port from its USB vendor and product name."""
     if vendor in _TRACKER_MAKERS:
         return f"tracker ({_TRACKER_MAKERS[vendor]})"
@@ -220,10 +220,10 @@ READY_S: Final = 15.0  #: A reader starts in 20 ms; on a busy computer it may ta
 
 @dataclass(slots=True)
 class Stream:
-    """A device read by a process of its own."""
+    """Stream of a device that is read by a process of its own."""
 
     process: subprocess.Popen[bytes]
-    pipe: int  #: Where its records come out; not blocking.
+    pipe: int  #: Pipe with the process's records; not blocking.
     overrun_bytes: int = 0  #: Bytes that the reader had to drop because the pipe was full.
     ready: bool = False  #: The reader has begun to read.
     ended: bool = False  #: The device has gone, or the reader has.
@@ -236,16 +236,16 @@ class Stream:
     def wait_until_ready(self, timeout_s: float = READY_S) -> None:
         """Wait until the reader reads: before, a device's data would pile up in a buffer of 4 KiB.
 
-        A reader that takes longer is waited for no more; what it loses is counted. What comes meanwhile is not asked
-        for: devices are told to send afterwards.
+        After `timeout_s` the recording begins without it, and bytes that it loses are counted. Devices are told to send
+        only afterwards, so that what comes meanwhile may be dropped.
         """
         end = time.monotonic() + timeout_s
-        while not (self.ready or self.ended) and (left := end - time.monotonic()) > 0:
-            if select.select([self], [], [], left)[0]:
+        while not (self.ready or self.ended) and (remaining_s := end - time.monotonic()) > 0:
+            if select.select([self], [], [], remaining_s)[0]:
                 self.read()
 
     def read(self, most: int = PIPE_BYTES) -> list[tuple[int, bytes]]:
-        """What has come, up to so many bytes, with the host's times (monotonic ns); sets `ended` after the last."""
+        """Read at most `most` bytes as pieces of data with host times (monotonic ns); sets `ended` after the last."""
         try:
             data = os.read(self.pipe, most)
         except BlockingIOError:
@@ -253,23 +253,23 @@ class Stream:
         if not data:
             self.ended = True
             return []
-        pieces, place, buffer = [], 0, self._rest + data
+        pieces, index, buffer = [], 0, self._rest + data
         size = reading.RECORD.size
-        while len(buffer) - place >= size:
-            host_ns, lost, length = reading.RECORD.unpack_from(buffer, place)
+        while len(buffer) - index >= size:
+            host_ns, lost, length = reading.RECORD.unpack_from(buffer, index)
             if length == reading.READY:
-                self.ready, place = True, place + size
+                self.ready, index = True, index + size
                 continue
-            if len(buffer) - place - size < length:
+            if len(buffer) - index - size < length:
                 break
             self.overrun_bytes = lost
-            start = place + size
-            place = start + length
+            start = index + size
+            index = start + length
             if length:
-                pieces.append((host_ns, buffer[start:place]))
+                pieces.append((host_ns, buffer[start:index]))
             else:
                 self.ended = True
-        self._rest = buffer[place:]
+        self._rest = buffer[index:]
         return pieces
 
     def stop(self) -> None:

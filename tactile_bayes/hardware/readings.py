@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 CountArray = NDArray[np.uint16]
 Quaternion = tuple[float, float, float, float]
 MM_PER_INCH: Final = 25.4
-NO_ROTATION: Final = "no rotation"  #: Why there is no pose where a record's numbers are none of a place and a rotation.
+NO_ROTATION: Final = "no rotation"  #: Reason for a missing pose whose numbers are no position with a rotation.
 
 
 class FrameReading(NamedTuple):
@@ -69,8 +69,8 @@ Reading = FrameReading | PoseReading | MissingReading | HelloReading | EndReadin
 class Parser:
     """Base of the protocols' parsers: `feed` returns the readings that bytes complete."""
 
-    fault = ""  #: What is wrong with the last record that could not be read; empty where nothing looked like one.
-    remark = ""  #: What is to be known of the records that were read; empty where they are as they should be.
+    fault = ""  #: Fault of the last record that could not be read; empty where nothing looked like a record.
+    remark = ""  #: Remark on the records that were read; empty where they are as they should be.
     garbage_bytes = 0  #: Number of bytes so far that belong to no valid record.
 
     def feed(self, data: bytes) -> list[Reading]:
@@ -81,25 +81,25 @@ class Parser:
 class RecordParser(Parser):
     """Parser of records of a fixed length; after garbage it tries again at each next byte.
 
-    `read` makes a pose of so many bytes, or None where they are no record.
+    `read` returns the pose in `record_bytes` bytes, or None where they are no record.
     """
 
     def __init__(self, record_bytes: int, read: Callable[[bytes], PoseReading | None]) -> None:
         self.record_bytes, self._read, self._rest = record_bytes, read, b""
 
     def feed(self, data: bytes) -> list[Reading]:
-        buffer, place, size = self._rest + data, 0, self.record_bytes
-        found: list[Reading] = []
-        while len(buffer) - place >= size:
-            pose = self._read(buffer[place : place + size])
+        buffer, index, size = self._rest + data, 0, self.record_bytes
+        poses: list[Reading] = []
+        while len(buffer) - index >= size:
+            pose = self._read(buffer[index : index + size])
             if pose is None:
-                place += 1
+                index += 1
                 self.garbage_bytes += 1
             else:
-                found.append(pose)
-                place += size
-        self._rest = buffer[place:]
-        return found
+                poses.append(pose)
+                index += size
+        self._rest = buffer[index:]
+        return poses
 
 
 def plausible(position_mm: Sequence[float], quaternion_wxyz: Sequence[float]) -> bool:
@@ -110,43 +110,43 @@ def plausible(position_mm: Sequence[float], quaternion_wxyz: Sequence[float]) ->
 
 
 def printable(data: bytes) -> str:
-    """Text of a device's bytes, in which what no terminal should get, but for zeros, is a question mark."""
+    """Text of a device's bytes, with a question mark for each character that cannot be printed; zeros stay."""
     text = data.decode("utf-8", "replace").strip()
     return "".join(letter if letter.isprintable() or letter == "\0" else "?" for letter in text)
 
 
 # --- The tool that is followed, relative to a reference tool where there is one.
 
-# Between a tool's pose and the reference's; a patient breathes 1 mm in this time at most.
+# Longest time between a tool's pose and the reference's; a patient breathes 1 mm in this time at most.
 REFERENCE_NS: Final = 50_000_000
-_MOST_WORDS: Final = 16  #: Words that are told apart, of tools and of reasons; a device may make up more.
+_MOST_WORDS: Final = 16  #: Different words that are counted, of tools and of reasons; a device may make up more.
 ToolReading = PoseReading | MissingReading
 
 
 def tally(counted: Counter[str], word: str) -> None:
-    """Count a word that a device sent."""
+    """Count a word that a device sent; beyond `_MOST_WORDS` different ones it counts as ``other_tools``."""
     counted[word if word in counted or len(counted) < _MOST_WORDS else "others"] += 1
 
 
 class Follower:
-    """Follows one tool of a tracker: of what all of its tools send, the readings of that one.
+    """Selects the readings of one tool from those of all tools of a tracker.
 
-    Without a `tool` that is the first one seen. With a `reference`, poses are relative to that tool's: fixed to the
+    Without a `tool` it follows the first one seen. With a `reference`, poses are relative to that tool's: fixed to the
     body, it takes breathing out. Its pose of the same moment is used, whichever of the two is sent first; where records
-    carry no time, each of the reference's poses serves the one pose of the tool beside it.
+    carry no time, each pose of the reference serves one pose of the tool.
     """
 
     def __init__(self, tool: str | None = None, reference: str | None = None, *, inverse: bool = False) -> None:
         self.tool, self.reference = tool, reference
-        self.others: Counter[str] = Counter()
+        self.other_tools: Counter[str] = Counter()
         """Number of readings of tools that are not followed."""
         self._inverse = inverse
-        self._held: tuple[PoseReading, int] | None = None
-        self._base: tuple[PoseReading, int] | None = None
-        self._fresh = False
+        self._waiting: tuple[PoseReading, int] | None = None  # a pose of the tool, with its arrival
+        self._latest: tuple[PoseReading, int] | None = None  # the reference's latest pose, with its arrival
+        self._unused = False  # no pose of the tool has been related to the latest one yet
 
     def take(self, reading: ToolReading, host_ns: int) -> Iterator[tuple[ToolReading, int]]:
-        """Readings of the tool that this one completes, with the times at which they came."""
+        """Yield the readings of the tool that this reading completes, each with its arrival time."""
         if self.tool is None:
             self.tool = reading.tool
         if isinstance(reading, PoseReading) and self._inverse:
@@ -156,45 +156,45 @@ class Follower:
             if self.reference is None or isinstance(reading, MissingReading):
                 yield reading, host_ns
                 return
-            self._held, base = (reading, host_ns), self._base
-            if base is not None and (self._fresh or base[0].device_ns == reading.device_ns is not None):
+            self._waiting, latest = (reading, host_ns), self._latest
+            if latest is not None and (self._unused or latest[0].device_ns == reading.device_ns is not None):
                 yield from self._release()
-                self._fresh = False
+                self._unused = False
         elif reading.tool == self.reference:
-            self._base = (reading, host_ns) if isinstance(reading, PoseReading) else None
-            self._fresh = self._base is not None and self._held is None
+            self._latest = (reading, host_ns) if isinstance(reading, PoseReading) else None
+            self._unused = self._latest is not None and self._waiting is None
             yield from self._release()
         else:
-            tally(self.others, reading.tool)
+            tally(self.other_tools, reading.tool)
 
     def _release(self) -> Iterator[tuple[ToolReading, int]]:
-        if self._held is None:
+        if self._waiting is None:
             return
-        (pose, host_ns), base = self._held, self._base
-        self._held = None
-        if base is None or abs(host_ns - base[1]) > REFERENCE_NS:
+        (pose, host_ns), latest = self._waiting, self._latest
+        self._waiting = None
+        if latest is None or abs(host_ns - latest[1]) > REFERENCE_NS:
             yield MissingReading(f"no pose of {self.reference}", pose.tool), host_ns
         else:
-            yield relative_pose(pose, base[0]), host_ns
+            yield relative_pose(pose, latest[0]), host_ns
 
 
-def pose_from_relative(pose: PoseReading, base: PoseReading) -> PoseReading:
-    """The pose in the tracker's frame of one that is given in the frame of another tool."""
-    back = _conjugate(base.quaternion_wxyz)
-    _, x, y, z = _product(_product(base.quaternion_wxyz, (0.0, *pose.position_mm)), back)
-    a, b, c = base.position_mm
-    turn = _product(base.quaternion_wxyz, pose.quaternion_wxyz)
-    return pose._replace(position_mm=(a + x, b + y, c + z), quaternion_wxyz=turn)
+def pose_from_relative(pose: PoseReading, reference: PoseReading) -> PoseReading:
+    """Convert a pose from the frame of a reference tool to the tracker's frame."""
+    back = _conjugate(reference.quaternion_wxyz)
+    _, x, y, z = _product(_product(reference.quaternion_wxyz, (0.0, *pose.position_mm)), back)
+    a, b, c = reference.position_mm
+    rotation = _product(reference.quaternion_wxyz, pose.quaternion_wxyz)
+    return pose._replace(position_mm=(a + x, b + y, c + z), quaternion_wxyz=rotation)
 
 
-def relative_pose(pose: PoseReading, base: PoseReading) -> PoseReading:
-    """The pose in the frame of another tool, whose flags it takes over."""
-    size = math.hypot(*base.quaternion_wxyz)
-    w, i, j, k = (part / size for part in _conjugate(base.quaternion_wxyz))
-    x, y, z = (a - b for a, b in zip(pose.position_mm, base.position_mm, strict=True))
+def relative_pose(pose: PoseReading, reference: PoseReading) -> PoseReading:
+    """Convert a pose to the frame of a reference tool; the reference's flags are added to the pose's own."""
+    size = math.hypot(*reference.quaternion_wxyz)
+    w, i, j, k = (part / size for part in _conjugate(reference.quaternion_wxyz))
+    x, y, z = (a - b for a, b in zip(pose.position_mm, reference.position_mm, strict=True))
     _, x, y, z = _product(_product((w, i, j, k), (0.0, x, y, z)), (w, -i, -j, -k))
-    turn = _product((w, i, j, k), pose.quaternion_wxyz)
-    return pose._replace(position_mm=(x, y, z), quaternion_wxyz=turn, flags=(*pose.flags, *base.flags))
+    rotation = _product((w, i, j, k), pose.quaternion_wxyz)
+    return pose._replace(position_mm=(x, y, z), quaternion_wxyz=rotation, flags=(*pose.flags, *reference.flags))
 
 
 def _conjugate(quaternion_wxyz: Quaternion) -> Quaternion:
@@ -219,9 +219,9 @@ _S: Final = 1_000_000_000
 LATEST_NS: Final = 1 << 62
 AHEAD_NS: Final = 2 * _S  #: A record cannot be measured this much later than it arrives: its clock has stepped forward.
 _SLIP_NS: Final = _S // 4  #: How well a wrap must agree with the time that passed on this computer.
-MOST_STEPS: Final = 20  #: After so many steps a clock is not believed any more.
+MOST_STEPS: Final = 20  #: After this many steps the device's clock is not used any more.
 STILL_NS: Final = _S // 10
-# Counters that start again: 2^16 ms, 2^31 and 2^32 of ns, us and ms, 2^24 us, and clocks of a minute to a day.
+# Periods of counters that wrap: 2^16 ms, 2^31 and 2^32 of ns, us and ms, 2^24 us, and clocks of a minute to a day.
 WRAPS_NS: Final = tuple(
     sorted(
         [bits * unit for unit in (1, 1_000, 1_000_000) for bits in (1 << 31, 1 << 32)]
@@ -239,7 +239,7 @@ class ArrivalClock:
     """
 
     def __init__(self) -> None:
-        self.begun_ns: int | None = None  #: Arrival with which this stretch of estimates began; None before any.
+        self.begun_ns: int | None = None  #: Arrival with which this window of estimates began; None before any.
         self._last = self._now = 0
 
     @property
@@ -258,11 +258,11 @@ class ArrivalClock:
             self._now = min(self._now, difference)
 
 
-class Moment(NamedTuple):
-    """Time at which a record was measured."""
+class ClockTime(NamedTuple):
+    """Time at which a record was measured, by the device's clock made continuous."""
 
-    time_ns: int  #: On the device's clock made continuous: 0 or more, never below the time before, below 2^63.
-    event: str = ""  #: Step of the clock just now in words; empty when it went on as it should.
+    time_ns: int  #: 0 or more, never below the time before, below 2^63.
+    event: str = ""  #: Step of the clock at this record, in words; empty where there was none.
 
 
 class DeviceClock:
@@ -282,7 +282,7 @@ class DeviceClock:
         self._raw_ns: int | None = None
         self._host_ns = self._moved_ns = self._last_ns = 0
 
-    def read(self, raw_ns: int, host_ns: int) -> Moment:
+    def read(self, raw_ns: int, host_ns: int) -> ClockTime:
         """Time of a record stamped `raw_ns` that arrived at `host_ns`."""
         moment = self._first(raw_ns) if self._raw_ns is None else self._next(raw_ns, host_ns, self._raw_ns)
         if self._raw_ns is None or moment.time_ns > self._last_ns:
@@ -291,43 +291,44 @@ class DeviceClock:
         self.arrival.observe(moment.time_ns, host_ns)
         return moment
 
-    def _first(self, raw_ns: int) -> Moment:
+    def _first(self, raw_ns: int) -> ClockTime:
         time_ns = raw_ns % LATEST_NS
         self._shift_ns = time_ns - raw_ns
         if time_ns == raw_ns:
-            return Moment(time_ns)
+            return ClockTime(time_ns)
         self.steps += 1
-        return Moment(time_ns, f"the clock begins at {raw_ns / 1e9:.0f} s, taken as {time_ns / 1e9:.3f} s")
+        return ClockTime(time_ns, f"the clock begins at {raw_ns / 1e9:.0f} s, taken as {time_ns / 1e9:.3f} s")
 
-    def _next(self, raw_ns: int, host_ns: int, before_ns: int) -> Moment:
+    def _next(self, raw_ns: int, host_ns: int, before_ns: int) -> ClockTime:
         time_ns = raw_ns + self._shift_ns
         if not self._trusted:
-            return Moment(self._by_host(host_ns))
+            return ClockTime(self._host_time(host_ns))
         if time_ns < self._last_ns:
             period_ns = wrap_period(before_ns, raw_ns, passed_ns=host_ns - self._host_ns)
             if period_ns is None:
                 return self._step(raw_ns, host_ns, f"stepped back by {(before_ns - raw_ns) / 1e9:.3f} s")
             self.wraps += 1
             self._shift_ns += period_ns
-            what = f"the clock wrapped after {period_ns / 1e9:.6f} s"
-            return Moment(max(self._last_ns, raw_ns + self._shift_ns), what)
+            event = f"the clock wrapped after {period_ns / 1e9:.6f} s"
+            return ClockTime(max(self._last_ns, raw_ns + self._shift_ns), event)
         if time_ns == self._last_ns and host_ns - self._moved_ns > STILL_NS:
             self._trusted = False
             return self._step(raw_ns, host_ns, "stood still")
         ahead_ns = time_ns + self.arrival.offset_ns - host_ns
         if ahead_ns > AHEAD_NS:
             return self._step(raw_ns, host_ns, f"stepped forward by {ahead_ns / 1e9:.3f} s")
-        return Moment(time_ns)
+        return ClockTime(time_ns)
 
-    def _step(self, raw_ns: int, host_ns: int, what: str) -> Moment:
-        time_ns = self._by_host(host_ns)
+    def _step(self, raw_ns: int, host_ns: int, event: str) -> ClockTime:
+        time_ns = self._host_time(host_ns)
         self.steps += 1
         self._shift_ns = time_ns - raw_ns
         self._trusted = self._trusted and self.steps < MOST_STEPS
         stands_in = "is used for the step" if self._trusted else "is used from here on"
-        return Moment(time_ns, f"the clock {what}, to {raw_ns / 1e9:.3f} s; this computer's clock {stands_in}")
+        return ClockTime(time_ns, f"the clock {event}, to {raw_ns / 1e9:.3f} s; this computer's clock {stands_in}")
 
-    def _by_host(self, host_ns: int) -> int:
+    def _host_time(self, host_ns: int) -> int:
+        """Time by the host's clock, never below the time before."""
         return max(self._last_ns, host_ns - self.arrival.offset_ns)
 
 
@@ -338,7 +339,7 @@ def wrap_period(before_ns: int, after_ns: int, *, passed_ns: int) -> int | None:
 
 
 class PoseClock:
-    """The time of each pose on the head's clock, never running backwards.
+    """Converts the time of each pose to the head's clock, never running backwards.
 
     `shared`: both devices count from one zero (they are synchronised by wire, or one program emulates both), and the
     tracker's own time is taken as it is. Otherwise poses are placed by when they and the frames arrive; what is then
@@ -351,19 +352,19 @@ class PoseClock:
         self._shared = shared
         self._last_ns = 0
 
-    def place(self, device_ns: int | None, host_ns: int) -> Moment | None:
+    def time_of(self, device_ns: int | None, host_ns: int) -> ClockTime | None:
         """Time of a pose on the head's clock; None before the first frame, or when it would be negative."""
         if self._shared:
             return None if device_ns is None else self._in_order(self.tracker.read(device_ns, host_ns))
         if self.head.arrival.begun_ns is None:
             return None
-        moment = Moment(host_ns)
+        moment = ClockTime(host_ns)
         if device_ns is not None:
             measured = self.tracker.read(device_ns, host_ns)
-            moment = Moment(measured.time_ns + self.tracker.arrival.offset_ns, measured.event)
+            moment = ClockTime(measured.time_ns + self.tracker.arrival.offset_ns, measured.event)
         return self._in_order(moment._replace(time_ns=moment.time_ns - self.head.arrival.offset_ns))
 
-    def _in_order(self, moment: Moment) -> Moment | None:
+    def _in_order(self, moment: ClockTime) -> ClockTime | None:
         if moment.time_ns < 0:
             return None
         self._last_ns = max(self._last_ns, moment.time_ns)

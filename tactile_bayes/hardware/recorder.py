@@ -1,4 +1,4 @@
-"""Recording: devices to a file, with landmarks and an account of what came."""
+"""Recording of devices to a file, with landmarks, and a report of what came and what was lost."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from tactile_bayes.mapping.select import Jumps, Span, disjoint, overlap_cautions
 _RATE_SHARE: Final = 0.02
 _RATE_LEAST_S: Final = 0.5
 _STUCK_POSES: Final = 10
-_TOLD_SHARE: Final = 0.01  #: Of missing or flagged poses: fewer are those of any exam.
+_CAUTION_SHARE: Final = 0.01  #: Of missing or flagged poses: any exam has fewer.
 
 
 @dataclass(slots=True)
-class Report:
-    """The account of a recording; numbers are of records unless the name says bytes."""
+class RecordingReport:
+    """What came in a recording and what was lost; numbers count records unless the name says bytes."""
 
     frames: int = 0
     frames_lost: int = 0
@@ -43,7 +43,7 @@ class Report:
     poses_repeated: int = 0
     poses_flagged: int = 0
     poses_missing: int = 0
-    unseen: str = ""  #: Why there is no pose just now; empty while there are.
+    unseen: str = ""  #: Why no pose comes now; empty while poses come.
     missing_why: str = ""
     flagged_why: str = ""  #: `missing_why`, `flagged_why`: The tracker's reasons, each with its number.
     other_tools: str = ""  #: Tools that were not followed, each with the number of its records.
@@ -66,60 +66,60 @@ class Report:
         return (self.last_ns - self.first_ns) / 1e9
 
 
-def _cautions(report: Report, passed_s: float, rate_hz: float) -> Iterator[str]:
-    """Clocks and counters that jump, another pace than that of the host or the promised one, poses missing or alike.
+def _cautions(report: RecordingReport, passed_s: float, rate_hz: float) -> Iterator[str]:
+    """Cautions about clocks and counters that jump, about the pace of clock and frames, and about the poses.
 
-    On the host's clock `passed_s` went by.
+    `passed_s` is the time between the first frame and the last on the host's clock.
     """
 
     def times(number: int) -> str:
         return "once" if number == 1 else f"{number} times"
 
-    told_s = report.duration_s
-    if abs(told_s - passed_s) > max(_RATE_LEAST_S, _RATE_SHARE * passed_s):
-        yield f"the head's clock ran {told_s:.1f} s while {passed_s:.1f} s passed on this computer"
-    due, came = told_s * rate_hz, report.frames - 1 + report.frames_lost
-    if due > 0 and abs(came - due) > max(_RATE_LEAST_S * rate_hz, _RATE_SHARE * due):
-        yield f"the head promised {rate_hz:g} frames per second and measured {came / told_s:.1f}"
+    head_s = report.duration_s
+    if abs(head_s - passed_s) > max(_RATE_LEAST_S, _RATE_SHARE * passed_s):
+        yield f"the head's clock ran {head_s:.1f} s while {passed_s:.1f} s passed on this computer"
+    promised, measured = head_s * rate_hz, report.frames - 1 + report.frames_lost
+    if promised > 0 and abs(measured - promised) > max(_RATE_LEAST_S * rate_hz, _RATE_SHARE * promised):
+        yield f"the head promised {rate_hz:g} frames per second and measured {measured / head_s:.1f}"
     for role, steps in (("head", report.head_clock_steps), ("tracker", report.tracker_clock_steps)):
         if steps:
             yield f"the {role}'s clock stepped {times(steps)}; this computer's clock was used instead"
     if report.frame_counter_restarts:
         yield f"the head's frame counter restarted or was damaged {times(report.frame_counter_restarts)}"
-    asked = report.poses + report.poses_missing
-    for number, what, why in (
+    all_poses = report.poses + report.poses_missing
+    for number, state, why in (
         (report.poses_missing, "missing", report.missing_why),
         (report.poses_flagged, "flagged by the tracker", report.flagged_why),
     ):
-        if number > _TOLD_SHARE * asked:
-            yield f"{number:,} of {asked:,} poses {what}: {why}"
+        if number > _CAUTION_SHARE * all_poses:
+            yield f"{number:,} of {all_poses:,} poses {state}: {why}"
     if report.tracker_remark:
         yield f"the tracker's {report.tracker_remark}"
     if report.poses > _STUCK_POSES and report.poses_repeated >= report.poses - 1:
         yield "every pose is the same: the tracker does not follow the head"
 
 
-# --- Touching of landmarks with the head's apex: the mean of several poses, and their spread.
+# --- Landmarks, touched with the head's apex: the mean of several poses, and their spread.
 
 SAMPLES: Final = 60
 STEADY_MM: Final = 2.0  #: A hand at rest on bone; more says that the head slipped while it touched.
 
 
 class LandmarkTouch:
-    """A landmark, such as ``nipple``: the mean of the next poses of the apex on it; the tracker is in the handle."""
+    """Position of a landmark, such as ``nipple``: the mean of the apex's positions while it rests on the landmark."""
 
     def __init__(self, name: str, *, scanhead_from_tracker: FloatArray, samples: int = SAMPLES) -> None:
         self.name = name
         self._apex_mm = inverse(scanhead_from_tracker)[:3, 3]
-        self._wanted = samples
+        self._samples = samples
         self._points: list[FloatArray] = []
 
     def add(self, pose: readings.PoseReading) -> bool:
-        """Add one pose; True when there are enough. Poses that the tracker flags are skipped."""
+        """Add a pose, unless the tracker flags it; True when there are enough."""
         if not pose.flags:
             rotation = rotation_from_quaternion(np.array(pose.quaternion_wxyz))
             self._points.append(np.array(pose.position_mm) + rotation @ self._apex_mm)
-        return len(self._points) >= self._wanted
+        return len(self._points) >= self._samples
 
     @property
     def position_mm(self) -> FloatArray:
@@ -150,11 +150,11 @@ class LandmarkTouch:
 FLUSH_S: Final = 0.2
 DRAIN_S: Final = 0.25
 OVERTIME_S: Final = 1.0  #: A recording with a duration goes on for so long at most when the head's clock is behind.
-# After so long without a pose the examiner is told, also where the tracker says nothing.
+# After so long without a pose the view says so, also where the tracker says nothing.
 _HIDDEN_NS: Final = 300_000_000
-_MOST_TOLD: Final = 5
+_MOST_REASONS: Final = 5
 _TICK_S: Final = 0.05
-# Of a tracker that sends without end, so much is read before the head's turn comes again.
+# Bytes read from the tracker before the head is read again: a tracker that sends without end must not hold it up.
 _TRACKER_BYTES: Final = 32768
 
 
@@ -173,16 +173,16 @@ class Sink(Protocol):
 
 
 class Observer:
-    """A recording's spectator, which must never wait; it is told the account several times a second. This is nobody."""
+    """Observer of a recording, which must never wait; it gets the report several times a second."""
 
     def landmark(self, name: str, position_mm: FloatArray) -> None: ...
     def frame(self, counts: readings.CountArray, device_ns: int) -> None: ...
     def pose(self, pose: readings.PoseReading, device_ns: int) -> None: ...
-    def told(self, report: Report) -> None: ...
+    def report(self, report: RecordingReport) -> None: ...
 
 
 @dataclass(slots=True)
-class Line:
+class DeviceLine:
     """A device in use: port, reading process, parser, and commands to start and stop it."""
 
     role: str
@@ -203,23 +203,24 @@ class Recorder:
     The sink gets everything in order of arrival.
     """
 
-    head: Line
-    tracker: Line | None
+    head: DeviceLine
+    tracker: DeviceLine | None
     sink: Sink
     _: KW_ONLY
     shared_clock: bool = False  #: True when both devices count from one zero.
-    follower: readings.Follower = field(default_factory=readings.Follower)  #: Of which of the tracker's tools.
+    follower: readings.Follower = field(default_factory=readings.Follower)  #: Follows one of the tracker's tools.
     duration_s: float | None = None
     """By the head's clock made continuous, and at most `OVERTIME_S` longer by the host's; None goes on until it is
     stopped."""
     rate_hz: float = 0.0  #: What the head promised; 0 for nothing.
     observer: Observer = field(default_factory=Observer)
     clock_ns: Callable[[], int] = time.monotonic_ns  #: The host time that the reading processes stamp with.
+    speed: float = 1.0  #: Seconds of the devices' clocks in one of the host's: other than 1 where a scan is replayed.
     touch: LandmarkTouch | None = None  #: The landmark for which the next poses are averaged.
     recording: bool = False
 
     def __post_init__(self) -> None:
-        self.report = Report()
+        self.report = RecordingReport()
         self._lines = [line for line in (self.head, self.tracker) if line is not None]
         self._clock = readings.PoseClock(shared=self.shared_clock)
         self._why_missing: Counter[str] = Counter()
@@ -249,30 +250,34 @@ class Recorder:
             self.report.ended_by = why
             self._drain_until_ns = self.clock_ns() + round(DRAIN_S * 1e9)
 
-    def run(self, each_tick: Callable[[], None] = lambda: None) -> Report:
+    def run(self, each_tick: Callable[[], None] = lambda: None) -> RecordingReport:
         """Record until the end; `each_tick`, called many times a second, may call `stop` and `start` and set `touch`.
 
-        Whatever happens, the devices are told to stop and the account is complete.
+        However the recording ends, the devices get their stop commands and the report is complete.
         """
         flushed_ns = self.clock_ns()
         try:
             while not self._done():
-                self._take()
+                self._read_lines()
                 each_tick()
                 now = self.clock_ns()
                 if now - flushed_ns > FLUSH_S * 1e9:
                     flushed_ns = now
                     self.sink.flush()
-                    self._account()
-                self._look_for_silence(now)
-                self._look_at_host_time(now)
+                    self._update_report()
+                self._check_silence(now)
+                self._check_host_time(now)
         finally:
-            self._hush()
-            self._judge()
-            self._account()
+            self._stop_devices()
+            self._add_cautions()
+            self._update_report()
         return self.report
 
-    def _take(self) -> None:
+    def _elapsed_ns(self, host_ns: int) -> int:
+        """Time from the beginning to a host time, in the devices' nanoseconds."""
+        return round((host_ns - self._zero_ns) * self.speed)
+
+    def _read_lines(self) -> None:
         """Wait briefly for bytes, and process all of them."""
         waiting = [line.stream for line in self._lines if not line.stream.ended]
         if not waiting:
@@ -284,20 +289,22 @@ class Recorder:
             for host_ns, data in line.stream.read() if line is self.head else line.stream.read(_TRACKER_BYTES):
                 line.heard_ns = host_ns
                 for reading in line.parser.feed(data):
-                    self._read(line, reading, host_ns)
+                    self._process(line, reading, host_ns)
             if line.stream.ended and not line.finished:
-                self._gone(line)
+                self._device_gone(line)
 
-    def _read(self, line: Line, reading: object, host_ns: int) -> None:
+    def _process(self, line: DeviceLine, reading: object, host_ns: int) -> None:
+        """Process a reading that arrived at `host_ns`; from here on times on the host count from the beginning."""
+        elapsed_ns = self._elapsed_ns(host_ns)
         match reading:
             case readings.FrameReading():
-                self._frame(reading, host_ns)
+                self._frame(reading, elapsed_ns)
             case readings.PoseReading() | readings.MissingReading():
-                for one, came_ns in self.follower.take(reading, host_ns):
-                    if isinstance(one, readings.PoseReading):
-                        self._pose(one, came_ns)
+                for followed, arrival_ns in self.follower.take(reading, elapsed_ns):
+                    if isinstance(followed, readings.PoseReading):
+                        self._pose(followed, arrival_ns)
                     else:
-                        self._missing(one, came_ns)
+                        self._missing(followed, arrival_ns)
             case readings.EndReading() if self.recording:
                 line.finished = True
                 if line is self.head:
@@ -309,7 +316,7 @@ class Recorder:
     def _frame(self, reading: readings.FrameReading, host_ns: int) -> None:
         if not self.recording:
             return
-        report, host_ns = self.report, host_ns - self._zero_ns
+        report = self.report
         device_ns, event = self._clock.head.read(reading.device_ns, host_ns)
         if not report.frames:
             report.first_ns, self._begun_ns = device_ns, host_ns
@@ -330,25 +337,25 @@ class Recorder:
         self._frame_span.add(device_ns / 1e9)
         report.frames += 1
         report.last_ns, self._heard_ns = device_ns, host_ns
-        report.longest_wait_ms = max(report.longest_wait_ms, (self.clock_ns() - self._zero_ns - host_ns) / 1e6)
+        wait_ms = (self._elapsed_ns(self.clock_ns()) - host_ns) / self.speed / 1e6
+        report.longest_wait_ms = max(report.longest_wait_ms, wait_ms)
         self.observer.frame(reading.counts, device_ns)
 
     def _pose(self, reading: readings.PoseReading, host_ns: int) -> None:
-        host_ns -= self._zero_ns
-        self._touched(reading, host_ns)
+        self._add_to_touch(reading, host_ns)
         if not self.recording:
             return
         if reading.device_ns is not None and self._last_pose is not None and reading[:3] == self._last_pose[:3]:
-            self._missing(readings.MissingReading("an old record sent again", reading.tool), host_ns + self._zero_ns)
+            self._missing(readings.MissingReading("an old record sent again", reading.tool), host_ns)
             return
-        moment = self._clock.place(reading.device_ns, host_ns)
+        moment = self._clock.time_of(reading.device_ns, host_ns)
         if moment is None:
             self.report.poses_without_time += 1
             return
         device_ns, event = moment
-        flags = self._flags(reading)
-        position, turn = np.array(reading.position_mm), np.array(reading.quaternion_wxyz)
-        self.sink.add_pose(position, turn, device_ns=device_ns, host_ns=max(0, host_ns))
+        flags = self._record_flags(reading)
+        position, quaternion = np.array(reading.position_mm), np.array(reading.quaternion_wxyz)
+        self.sink.add_pose(position, quaternion, device_ns=device_ns, host_ns=max(0, host_ns))
         self.report.poses += 1
         self._pose_ns = device_ns
         self._pose_span.add(device_ns / 1e9)
@@ -364,22 +371,22 @@ class Recorder:
         self.observer.pose(reading, device_ns)
 
     def _missing(self, reading: readings.MissingReading, host_ns: int) -> None:
-        """Count a pose that the tracker does not have, once frames come; the log has where a gap begins and ends."""
+        """Count a pose that the tracker does not have, once frames come; the file's log has both ends of a gap."""
         if not (self.recording and self.report.frames):
             return
         self.report.poses_missing += 1
         readings.tally(self._why_missing, reading.why)
-        self._unseen(reading.why, host_ns - self._zero_ns)
+        self._note_unseen(reading.why, host_ns)
 
-    def _unseen(self, why: str, host_ns: int) -> None:
-        """Keep why there is no pose now; the file's log has where that begins."""
+    def _note_unseen(self, why: str, host_ns: int) -> None:
+        """Store why no pose comes now; the file's log has where that begins."""
         if not self.report.unseen:
             text = f"no pose of {self.follower.tool or 'the tool'} from here on: {why}"
             self._note(text, "tracker", max(0, self._pose_ns), host_ns)
         self.report.unseen = why
 
-    def _flags(self, reading: readings.PoseReading) -> tuple[str, ...]:
-        """Flags that the device set on a pose, and whether it repeats the last one."""
+    def _record_flags(self, reading: readings.PoseReading) -> tuple[str, ...]:
+        """Count and return the device's flags of a pose, with ``repeated`` where it equals the last one."""
         self.report.poses_flagged += bool(reading.flags)
         for flag in reading.flags:
             readings.tally(self._why_flagged, flag.rstrip("-0123456789 "))
@@ -389,7 +396,7 @@ class Recorder:
         self.report.poses_repeated += 1
         return (*reading.flags, "repeated")
 
-    def _touched(self, reading: readings.PoseReading, host_ns: int) -> None:
+    def _add_to_touch(self, reading: readings.PoseReading, host_ns: int) -> None:
         touch = self.touch
         if touch is None or not touch.add(reading):
             return
@@ -403,8 +410,8 @@ class Recorder:
     def _note(self, text: str, device: str, device_ns: int, host_ns: int, *, serious: bool = True) -> None:
         self.sink.add_note(text, device=device, device_ns=device_ns, host_ns=max(0, host_ns), serious=serious)
 
-    def _gone(self, line: Line) -> None:
-        """Handle a device that disappeared: cable pulled, or its program ended."""
+    def _device_gone(self, line: DeviceLine) -> None:
+        """End the recording because a device disappeared: its cable was pulled, or its program ended."""
         line.finished = True
         if self.report.ended_by:
             return
@@ -412,34 +419,41 @@ class Recorder:
         self._fail(line, f"the device has gone {lost}", line.port.remedy)
         self.stop(f"the {line.role} has gone")
 
-    def _fail(self, line: Line, what: str, remedy: str) -> None:
-        kept = "; what came before is in the file" if self.report.frames else ""
-        self.report.fault = f"{line.port.name}: more data was expected, {what}{kept}; {remedy}"
+    def _fail(self, line: DeviceLine, event: str, remedy: str) -> None:
+        saved = "; what came before is in the file" if self.report.frames else ""
+        self.report.fault = f"{line.port.name}: more data was expected, {event}{saved}; {remedy}"
 
-    def _look_for_silence(self, now_ns: int) -> None:
+    def _check_silence(self, now_ns: int) -> None:
         if not self.recording or self.report.ended_by:
             return
         for line in self._lines:
             silent_s = (now_ns - line.heard_ns) / 1e9
-            if silent_s > line.silent_s and not line.finished and not select.select([line.stream], [], [], 0)[0]:
+            if (
+                silent_s > line.silent_s / min(1.0, self.speed)
+                and not line.finished
+                and not select.select([line.stream], [], [], 0)[0]
+            ):
                 self._fail(line, f"nothing has come for {silent_s:.1f} s", "check that the device runs")
                 self.stop(f"the {line.role} fell silent")
 
-    def _look_at_host_time(self, now_ns: int) -> None:
+    def _check_host_time(self, now_ns: int) -> None:
         """End a recording of limited duration by the host's clock when the head's is behind."""
         if self.duration_s is None or not self.report.frames:
             return
-        passed_ns = now_ns - self._zero_ns - self._begun_ns
+        passed_ns = self._elapsed_ns(now_ns) - self._begun_ns
         if passed_ns > (self.duration_s + OVERTIME_S) * 1e9:
             self.stop("duration, by this computer's clock")
 
-    def _judge(self) -> None:
-        """Add cautions for the recording; a tracker without one usable pose is an error."""
+    def _add_cautions(self) -> None:
+        """Complete the report with counts and cautions; a tracker without one usable pose is a fault."""
         report, clock = self.report, self._clock
         report.head_clock_steps, report.head_clock_wraps = clock.head.steps, clock.head.wraps
         report.tracker_clock_steps, report.tracker_clock_wraps = clock.tracker.steps, clock.tracker.wraps
-        report.missing_why, report.flagged_why = _numbers(self._why_missing), _numbers(self._why_flagged)
-        report.other_tools = _numbers(self.follower.others)
+        report.missing_why, report.flagged_why = (
+            _counts_in_words(self._why_missing),
+            _counts_in_words(self._why_flagged),
+        )
+        report.other_tools = _counts_in_words(self.follower.other_tools)
         report.tracker_remark = self.tracker.parser.remark if self.tracker else ""
         passed_s = (self._heard_ns - self._begun_ns) / 1e9
         spans = self._frame_span, self._pose_span
@@ -460,16 +474,16 @@ class Recorder:
         behind = tracker is not None and not tracker.finished and self._pose_ns < self.report.last_ns
         return not behind or self.clock_ns() > self._drain_until_ns
 
-    def _account(self) -> None:
+    def _update_report(self) -> None:
         report = self.report
         report.head_garbage_bytes = self.head.parser.garbage_bytes
         report.tracker_garbage_bytes = self.tracker.parser.garbage_bytes if self.tracker else 0
         report.overrun_bytes = sum(line.stream.overrun_bytes for line in self._lines)
         if self.recording and self.tracker is not None and report.last_ns - self._pose_ns > _HIDDEN_NS:
-            self._unseen(report.unseen or "nothing is sent", self._heard_ns)
-        self.observer.told(report)
+            self._note_unseen(report.unseen or "nothing is sent", self._heard_ns)
+        self.observer.report(report)
 
-    def _hush(self) -> None:
+    def _stop_devices(self) -> None:
         """Send stop commands to the devices that are still there."""
         for line in self._lines:
             with contextlib.suppress(DeviceError):
@@ -477,8 +491,8 @@ class Recorder:
             line.stream.stop()
 
 
-def _numbers(counted: Counter[str]) -> str:
+def _counts_in_words(counted: Counter[str]) -> str:
     """Words with their numbers, the most frequent first."""
-    told = [f"{word or 'one without a name'} {number:,}" for word, number in counted.most_common(_MOST_TOLD)]
-    more = [f"and {len(counted) - _MOST_TOLD} more"] if len(counted) > _MOST_TOLD else []
-    return ", ".join(told + more)
+    counts = [f"{word or 'one without a name'} {number:,}" for word, number in counted.most_common(_MOST_REASONS)]
+    more = [f"and {len(counted) - _MOST_REASONS} more"] if len(counted) > _MOST_REASONS else []
+    return ", ".join(counts + more)

@@ -15,7 +15,7 @@ from typing import Final
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import DeviceError, UsageError
 from tactile_bayes.hardware import head
-from tactile_bayes.hardware.ports import ANSWER_S, SILENT_S, Port, shown
+from tactile_bayes.hardware.ports import ANSWER_S, SILENT_S, Port, preview
 from tactile_bayes.hardware.readings import (
     MM_PER_INCH,
     NO_ROTATION,
@@ -43,12 +43,12 @@ def _bird_pose(record: bytes) -> PoseReading | None:
     if not record[0] & 0x80 or any(byte & 0x80 for byte in record[1:]):
         return None
     words = ((record[i] & 0x7F) << 2 | record[i + 1] << 9 for i in range(0, _BIRD_BYTES, 2))  # two bits are not sent
-    x, y, z, *turn = ((word - 65536 if word & 0x8000 else word) / 32768 for word in words)
+    x, y, z, *quaternion = ((word - 65536 if word & 0x8000 else word) / 32768 for word in words)
     inches = (_SCALE_INCH * x, _SCALE_INCH * y, _SCALE_INCH * z)
-    return _pose((*inches, *turn), str(record[-1]) if len(record) > _BIRD_BYTES else "")
+    return _pose((*inches, *quaternion), str(record[-1]) if len(record) > _BIRD_BYTES else "")
 
 
-def record_bytes(numbers: Sequence[float]) -> bytes:
+def encode_bird(numbers: Sequence[float]) -> bytes:
     """Encode a pose, its position in inches and its quaternion, as the device would: truncated to 14 bits."""
     out = bytearray()
     for value, scale in zip(numbers, (*3 * (_SCALE_INCH,), 1, 1, 1, 1), strict=True):
@@ -123,37 +123,37 @@ class LibertyAsciiParser(Parser):
         if len(self._rest) > _LONGEST_LINE:
             self.garbage_bytes += len(self._rest)
             self._rest = b""
-        found: list[Reading] = []
+        poses: list[Reading] = []
         for line in lines:
             pose = self._line(line.rstrip(b"\r"))
             if pose is None:
                 self.garbage_bytes += len(line) + 1
             else:
-                found.append(pose)
-        return found
+                poses.append(pose)
+        return poses
 
     def _line(self, line: bytes) -> PoseReading | None:
-        found, words = _LIBERTY_TEXT.match(line), line[3:].split()
-        if found is None or len(words) != _WORDS_LIBERTY or not all(map(_NUMBER.fullmatch, words)):
+        prefix, words = _LIBERTY_TEXT.match(line), line[3:].split()
+        if prefix is None or len(words) != _WORDS_LIBERTY or not all(map(_NUMBER.fullmatch, words)):
             return None
         *values, time_ms, distortion = map(float, words)
         if not math.isfinite(time_ms + distortion):
             return None
-        return _pose(values, str(int(found[1])), found[2], int(time_ms), int(distortion))
+        return _pose(values, str(int(prefix[1])), prefix[2], int(time_ms), int(distortion))
 
 
 def _pose(
     values: Sequence[float], tool: str, error: bytes = b" ", time_ms: int | None = None, distortion: int = 0
 ) -> PoseReading | None:
-    """Pose from a place in inches and a quaternion; None for numbers that cannot be one. A space is no error."""
+    """Pose from a position in inches and a quaternion; None for numbers that cannot be one. A space means no error."""
     x, y, z = (number * MM_PER_INCH for number in values[:3])
     w, i, j, k = values[3:]
     if not plausible((x, y, z), (w, i, j, k)):
         return None
-    told: tuple[str, ...] = ("" if error == b" " else f"error {error.decode() if error.isalpha() else error[0]}",)
-    told += (f"distortion {distortion}" if distortion else "",)
+    flags: tuple[str, ...] = ("" if error == b" " else f"error {error.decode() if error.isalpha() else error[0]}",)
+    flags += (f"distortion {distortion}" if distortion else "",)
     device_ns = None if time_ms is None else time_ms * 1_000_000
-    return PoseReading((x, y, z), (w, i, j, k), device_ns, tuple(filter(None, told)), tool)
+    return PoseReading((x, y, z), (w, i, j, k), device_ns, tuple(filter(None, flags)), tool)
 
 
 # --- Records as the devices of these drivers send them.
@@ -161,8 +161,8 @@ def _pose(
 PROTOCOLS: Final = ("fastrak", "fastrak-ascii", "liberty", "liberty-ascii", "bird", "open", "igtlink")
 
 
-def encoded(protocol: str, pose: ToolReading, number: int) -> bytes:
-    """A reading in one of `PROTOCOLS`; nothing of a tool that is not seen, where the protocol has no word for that."""
+def encode_record(protocol: str, pose: ToolReading, number: int) -> bytes:
+    """Encode a reading in one of `PROTOCOLS`; empty for a missing pose where the protocol cannot say so."""
     if protocol == "open":
         return head.encode_pose(pose, sequence=number)
     if protocol == "igtlink":
@@ -184,7 +184,7 @@ def encoded(protocol: str, pose: ToolReading, number: int) -> bytes:
         case "liberty-ascii":
             return f"{station:02}  {' '.join(f'{value:.5f}' for value in numbers)} {time_ms} 0\r\n".encode()
         case _:  # of a bird, whose address stands behind it in group mode
-            return record_bytes(numbers) + (bytes([station]) if pose.tool else b"")
+            return encode_bird(numbers) + (bytes([station]) if pose.tool else b"")
 
 
 # --- Drivers of the devices: setup, start, stop and identification.
@@ -194,18 +194,18 @@ _ASK_AGAIN_S: Final = 0.5
 _LISTEN_S: Final = 0.25  #: After the first record, for those of other tools.
 _MOST_TOOLS: Final = 64
 _MOST_KEPT: Final = 65536
-# A board may restart when its port is opened: so long it is waited for, and so long while it says things.
+# A board may restart when its port is opened: the longest wait without a byte, and in all.
 _RESTART_S: Final = 4.0
 _BOOT_S: Final = 12.0
 
 
-class Answer:
-    """What a tracker answered before a recording, in one form of its records: `parser` makes one of these."""
+class TrackerAnswer:
+    """Answer of a tracker before a recording, read as records of one form; `parser` makes a parser of that form."""
 
     def __init__(self, parser: Callable[[], Parser]) -> None:
-        self.parser, self.read = parser, parser()
+        self.parser, self.parsed = parser, parser()
         self.hello: HelloReading | None = None
-        self.tools: dict[str, str] = {}  #: Why a tool has no pose just now, by its name; empty where it has one.
+        self.tools: dict[str, str] = {}  #: By tool: why it has no pose now; empty where it has one.
         self.tool = ""
         self.reference: str | None = None
         """`tool`, `reference`: Names of the tools to follow, in full."""
@@ -217,13 +217,13 @@ class Answer:
 
     @property
     def unseen(self) -> str:
-        """The tools followed that are not seen just now, in words; empty where all are."""
+        """The followed tools that have no pose now, in words; empty where all have one."""
         followed = [name for name in (self.tool, self.reference) if name is not None and self.tools.get(name)]
         return ", ".join(f"{name} ({self.tools[name]})" for name in followed)
 
     def feed(self, data: bytes) -> None:
         """Parse `data`."""
-        for reading in self.read.feed(data):
+        for reading in self.parsed.feed(data):
             if isinstance(reading, HelloReading):
                 self.hello = reading
             elif isinstance(reading, PoseReading | MissingReading) and len(self.tools) < _MOST_TOOLS:
@@ -234,104 +234,109 @@ class Answer:
 class TrackerDriver(Record):
     """Commands of one tracker protocol."""
 
-    title: str  #: The makers' name, for messages.
-    baud: int  #: Line rate it runs at unless told.
-    parser: Callable[[], Parser]  #: Makes a fresh parser.
-    configure: tuple[bytes, ...] = ()  #: Commands that set records and units, sent one by one.
+    title: str  #: Name of the device, for messages.
+    baud: int  #: Default line rate.
+    parser: Callable[[], Parser]  #: Makes a parser of its records.
+    configure: tuple[bytes, ...] = ()  #: Commands that set the form of records and the units, sent one by one.
     single: bytes = b""
     start: bytes = b""
     stop: bytes = b""  #: `single`, `start`, `stop`: Commands for one record, for a stream of them, and for its end.
-    late: bytes = b""  #: What to ask for where nothing comes by itself.
-    several: tuple[bytes, ...] = ()  #: Commands after which records say whose they are, where a tool is named.
-    other_parser: Callable[[], Parser] | None = None  #: Of records in the other form that the device may be set to.
-    silent_s: float = SILENT_S  #: After so long without a byte it has gone; a server may send nothing of a hidden tool.
+    late: bytes = b""  #: Command to send where nothing comes without it.
+    several: tuple[bytes, ...] = ()  #: Commands that add the tool to each record, sent where a tool is named.
+    other_parser: Callable[[], Parser] | None = None  #: Parser of the other form that the device may be set to.
+    silent_s: float = SILENT_S  #: Silence after which the device has gone; a server may send nothing of a hidden tool.
     hint: str = "check its power, cable and line rate"  #: Advice when nothing comes.
 
-    def check(self, port: Port, *, tool: str | None = None, reference: str | None = None) -> Answer:
-        """Set the tracker up, ask for records and choose the tools to follow.
+    def check(self, port: Port, *, tool: str | None = None, reference: str | None = None) -> TrackerAnswer:
+        """Configure the tracker, ask it for records and choose the tools to follow.
 
-        No record that fits the protocol, or none of a tool that is asked for, is a `DeviceError`; several tools of
-        which none was chosen are a `UsageError`.
+        `DeviceError` if no record fits the protocol, or none is of a tool that is named; `UsageError` if several tools
+        send and none is named.
         """
-        before = b""
+        unasked = b""
         if self.stop:
             port.write(self.stop)
-            before = port.drain()
+            unasked = port.drain()
         for command in (*self.configure, *(self.several if tool or reference else ())):
             port.write(command)
             time.sleep(_BETWEEN_COMMANDS_S)
         if self.configure:
-            before += port.drain()
+            unasked += port.drain()
         port.write(self.single)
-        # records in the form that fits best, for a while after the first of the tools wanted
-        tries = [Answer(parser) for parser in (self.parser, self.other_parser) if parser is not None]
-        came, heard, late, begun = b"", 0.0, self.late, time.monotonic()
+        # read in each form for `_LISTEN_S` after the first record; the form with the least garbage counts
+        answers = [TrackerAnswer(parser) for parser in (self.parser, self.other_parser) if parser is not None]
+        received, answered_at, late, begun = b"", 0.0, self.late, time.monotonic()
         while (now := time.monotonic()) < begun + ANSWER_S:
-            if late and not heard and now > begun + ANSWER_S / 3:
+            if late and not answered_at and now > begun + ANSWER_S / 3:
                 port.write(late)
                 late = b""
-            seen = all(name is None or _called(tries[0].tools, name) for name in (tool, reference))
-            if heard and now - heard > _LISTEN_S and seen:
+            all_seen = all(name is None or _tools_named(answers[0].tools, name) for name in (tool, reference))
+            if answered_at and now - answered_at > _LISTEN_S and all_seen:
                 break
             data = port.read_some(_LISTEN_S / 2)
-            came += data[: _MOST_KEPT - len(came)]
-            for one in tries:
-                one.feed(data)
-            tries.sort(key=lambda one: (not one.came, one.read.garbage_bytes))
-            heard = heard or (time.monotonic() if tries[0].came else 0.0)
-        answer = tries[0]
+            received += data[: _MOST_KEPT - len(received)]
+            for answer in answers:
+                answer.feed(data)
+            answers.sort(key=lambda answer: (not answer.came, answer.parsed.garbage_bytes))
+            answered_at = answered_at or (time.monotonic() if answers[0].came else 0.0)
+        answer = answers[0]
         if not answer.came or (answer.tools and set(answer.tools.values()) == {NO_ROTATION}):
-            raise DeviceError(f"{port.name}: {self._unfit(answer.read, before, came, rate=port.has_line_rate)}")
-        answer.tool, answer.reference = _chosen(answer.tools, tool, reference, port)
+            raise DeviceError(
+                f"{port.name}: {self._fault_words(answer.parsed, unasked, received, rate=port.has_line_rate)}"
+            )
+        answer.tool, answer.reference = _choose_tools(answer.tools, tool, reference, port)
         return answer
 
-    def _unfit(self, parser: Parser, before: bytes, came: bytes, *, rate: bool) -> str:
-        """What came in place of a record."""
-        wanted = f"a record of {self.title} was expected"
+    def _fault_words(self, parser: Parser, unasked: bytes, received: bytes, *, rate: bool) -> str:
+        """What came instead of a record, in words."""
+        expected = f"a record of {self.title} was expected"
         if parser.fault:
-            return f"{wanted}; {parser.fault}"
-        if not came:
-            before_words = f" (before it was asked: {shown(before)})" if before else ""
-            return f"{wanted}, nothing came{before_words}; {self.hint}"
-        what = f"{wanted}, {shown(came)} came ({len(came)} bytes)"
+            return f"{expected}; {parser.fault}"
+        if not received:
+            before_words = f" (before it was asked: {preview(unasked)})" if unasked else ""
+            return f"{expected}, nothing came{before_words}; {self.hint}"
+        fault = f"{expected}, {preview(received)} came ({len(received)} bytes)"
         for name, driver in TRACKERS.items():
-            if sum(isinstance(one, PoseReading | HelloReading) for one in driver.parser().feed(before + came)) > 1:
-                return f"{what}: these are records of {driver.title}; give --tracker-protocol {name}"
-        return f"{what}; give another --tracker-protocol{', or its line rate' if rate else ''}"
+            records = driver.parser().feed(unasked + received)
+            if sum(isinstance(record, PoseReading | HelloReading) for record in records) > 1:
+                return f"{fault}: these are records of {driver.title}; give --tracker-protocol {name}"
+        return f"{fault}; give another --tracker-protocol{', or its line rate' if rate else ''}"
 
 
-def _called(tools: Iterable[str], name: str) -> list[str]:
-    """Tools by a name: in full, or without the frame they are given in (ProbeToTracker) or the part number."""
-    for whole in (name, name[:NAME_BYTES]):  # servers cut names
-        if whole in tools:
-            return [whole]
-    return [one for one in tools if re.match(rf"{re.escape(name)}(To[A-Z]|-)", one)]
+def _tools_named(tools: Iterable[str], name: str) -> list[str]:
+    """Tools that a name stands for: the full name, or the name without its frame (ProbeToTracker) or part number."""
+    for full_name in (name, name[:NAME_BYTES]):  # servers cut names
+        if full_name in tools:
+            return [full_name]
+    return [tool for tool in tools if re.match(rf"{re.escape(name)}(To[A-Z]|-)", tool)]
 
 
-def _chosen(tools: Mapping[str, str], tool: str | None, reference: str | None, port: Port) -> tuple[str, str | None]:
+def _choose_tools(
+    tools: Mapping[str, str], tool: str | None, reference: str | None, port: Port
+) -> tuple[str, str | None]:
     """Full names of the tool to follow and of the reference."""
     listed = ", ".join(f"{name!r}{f' (no pose: {why})' if why else ''}" for name, why in sorted(tools.items()))
-    full: list[str | None] = []
+    full_names: list[str | None] = []
     for name, option in ((tool, "--tool"), (reference, "--reference")):
-        found = [] if name is None else _called(tools, name)
-        if name is not None and len(found) != 1:
+        matches = [] if name is None else _tools_named(tools, name)
+        if name is not None and len(matches) != 1:
             none = f"no pose of a tool {name!r} comes (is it in sight?)"
-            what = f"{len(found)} tools are called {name!r}" if found else none
+            fault = f"{len(matches)} tools are called {name!r}" if matches else none
             sent = listed or "one without a name"
-            raise DeviceError(f"{port.name}: {what}; it sends {sent}: give {option} one of them")
-        full.append(found[0] if found else None)
-    left = [name for name in tools if name != full[1]]
-    if full[0] is None and len(left) > 1:
+            raise DeviceError(f"{port.name}: {fault}; it sends {sent}: give {option} one of them")
+        full_names.append(matches[0] if matches else None)
+    candidates = [name for name in tools if name != full_names[1]]
+    if full_names[0] is None and len(candidates) > 1:
         raise UsageError(
             f"{port.name} sends several tools: {listed}; name the one on the head with --tool, and one that is fixed "
             "to the body with --reference"
         )
-    if full[0] is None and full[1] is not None and not left:
-        raise UsageError(f"{port.name} sends only the reference, {full[1]!r}; is the tool on the head in sight?")
-    followed = full[0] if full[0] is not None else (left[0] if left else "")
-    if followed == full[1]:
-        raise UsageError(f"{port.name}: the tool and its reference are both {full[1]!r}; give two tools")
-    return followed, full[1]
+    if full_names[0] is None and full_names[1] is not None and not candidates:
+        raise UsageError(f"{port.name} sends only the reference, {full_names[1]!r}; is the tool on the head in sight?")
+    followed = full_names[0] if full_names[0] is not None else (candidates[0] if candidates else "")
+    if followed == full_names[1]:
+        raise UsageError(f"{port.name}: the tool and its reference are both {full_names[1]!r}; give two tools")
+    return followed, full_names[1]
 
 
 def _open_framing(title: str, baud: int) -> TrackerDriver:
@@ -340,13 +345,13 @@ def _open_framing(title: str, baud: int) -> TrackerDriver:
 
 
 def _fastrak(words: str, form: bytes, closing: bytes, parser: Callable[[], Parser]) -> TrackerDriver:
-    """A FASTRAK in one form of records; the items are set for each station: the command knows none for all."""
+    """Driver of a FASTRAK in one form of records; no command sets the items for all stations, so each is set."""
     items = [b"O%d,2,11,%b\r" % (station, closing) for station in range(1, 5)]
     return TrackerDriver(f"a Polhemus FASTRAK ({words})", 115_200, parser, (b"U", *items, form), b"P", b"C", b"c")
 
 
 def _liberty(words: str, form: bytes, closing: bytes, parser: Callable[[], Parser]) -> TrackerDriver:
-    """A LIBERTY or PATRIOT in one form of records."""
+    """Driver of a LIBERTY or PATRIOT in one form of records."""
     title = f"a Polhemus LIBERTY or PATRIOT ({words})"
     commands = (b"U0\r", form, b"O*,2,7,8,11,%b\r" % closing, b"Q0\r")
     return TrackerDriver(title, 115_200, parser, commands, b"P", b"C\r", b"P")
@@ -382,7 +387,7 @@ TRACKERS: Final[dict[str, TrackerDriver]] = {
 
 
 def open_tracker(protocol: str, url: str, *, baud: int | None = None, roms: Sequence[Path] = ()) -> Port:
-    """Open the port of a tracker, by default at the protocol's own rate; `roms` describe wireless NDI tools."""
+    """Open the port of a tracker, by default at the protocol's rate; `roms` describe wireless NDI tools."""
     if protocol == "ndi":
         return NdiPort(url, roms=roms)
     return Port(url, baud=baud or TRACKERS[protocol].baud or 9600, role="tracker")
@@ -391,32 +396,32 @@ def open_tracker(protocol: str, url: str, *, baud: int | None = None, roms: Sequ
 def check_head(port: Port, *, every: int = 1) -> HelloReading:
     """Ask a head for its identity, and refuse a line too slow for its frames."""
     port.write(head.encode_command(head.STOP))
-    came, parser, begun = port.drain(), head.HeadParser(), time.monotonic()
-    heard = begun
-    while parser.hello is None and time.monotonic() < min(heard + _RESTART_S, begun + _BOOT_S):
-        # again and again: one may get lost, and a board may restart meanwhile
+    received, parser, begun = port.drain(), head.HeadParser(), time.monotonic()
+    heard_at = begun
+    while parser.hello is None and time.monotonic() < min(heard_at + _RESTART_S, begun + _BOOT_S):
+        # repeated: a question may get lost, and a board may restart meanwhile
         port.write(head.encode_command(head.ASK))
         data = port.read_some(_ASK_AGAIN_S)
-        heard = time.monotonic() if data else heard
-        came += data[: _MOST_KEPT - len(came)]
+        heard_at = time.monotonic() if data else heard_at
+        received += data[: _MOST_KEPT - len(received)]
         parser.feed(data)
     if parser.hello is None:
-        raise DeviceError(f"{port.name}: a HELLO packet was expected, {_no_hello(parser, came, port)}")
+        raise DeviceError(f"{port.name}: a HELLO packet was expected, {_no_hello(parser, received, port)}")
     if port.has_line_rate:
         head.check_link_rate(parser.hello, baud=port.baud, every=every, port=port.name)
     return parser.hello
 
 
-def _no_hello(parser: head.HeadParser, came: bytes, port: Port) -> str:
-    """What came in place of a HELLO."""
+def _no_hello(parser: head.HeadParser, received: bytes, port: Port) -> str:
+    """What came instead of a HELLO, in words."""
     if parser.fault:
         return f"but {parser.fault}; the layout is in docs/scan-head-protocol.md"
-    if not came:
+    if not received:
         return f"nothing came; check its power and {'cable' if port.has_line_rate else 'its server'}"
     for driver in TRACKERS.values():
-        if any(isinstance(one, PoseReading) for one in driver.parser().feed(came)):
+        if any(isinstance(reading, PoseReading) for reading in driver.parser().feed(received)):
             return f"records of {driver.title} came; give the port of the head"
-    return f"{shown(came)} came ({len(came)} bytes); give its line rate with --head-baud, or the head's port"
+    return f"{preview(received)} came ({len(received)} bytes); give its line rate with --head-baud, or the head's port"
 
 
 def probe(url: str) -> str:

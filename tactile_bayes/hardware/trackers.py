@@ -1,4 +1,4 @@
-"""Trackers: NDI, OpenIGTLink."""
+"""Trackers with protocols of their own: OpenIGTLink and NDI."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ _ANY_HEADER: Final = re.compile(rb"\0[\x01-\x03][A-Z][A-Z0-9_]{1,11}\0")
 _TURNED_HEADER: Final = re.compile(rb"[\x01-\x03]\0(?:%b)\0" % b"|".join(_POSES))
 _LONGEST: Final = 1 << 14  # body of a message with poses
 _MOST_LOOKS: Final = 8
-# Bytes whose checksums are computed for the bytes that come: sound messages need each once.
+# Budget of bytes whose checksums are computed: a constant, and a multiple of the bytes that come (sound messages: one).
 _FEWEST_CHECKED: Final = 1 << 15
 _CHECKED_SHARE: Final = 4
 _MOST_KINDS: Final = 5
@@ -105,11 +105,11 @@ ASK_FOR_TDATA: Final = _HEADER.pack(1, b"STT_TDATA", b"", 0, 0, len(_NO_WISHES),
 
 
 class IgtlinkParser(Parser):
-    """Parser of messages with poses; it passes over others, whatever their size.
+    """Parser of messages with poses; it skips others, whatever their size.
 
-    The header has no checksum, so a spoilt size may claim much of what follows: wherever a message is passed over or
-    waited for, a whole one with poses inside shows that the size was wrong. A checksum of 0 counts as none. An exact
-    identity is what servers send of a tool out of sight.
+    The header has no checksum, so a spoilt size may cover messages that follow. Where a message is skipped or not yet
+    complete, a complete message with poses inside it shows that its size was wrong. A checksum of 0 counts as none.
+    Servers send an exact identity for a tool out of sight.
     """
 
     def __init__(self) -> None:
@@ -119,34 +119,34 @@ class IgtlinkParser(Parser):
         self._others: set[str] = set()
 
     def feed(self, data: bytes) -> list[Reading]:
-        buffer, place = self._rest + data, 0
-        found: list[Reading] = []
+        buffer, index = self._rest + data, 0
+        all_readings: list[Reading] = []
         self._checks = _FEWEST_CHECKED + _CHECKED_SHARE * len(data)
-        while len(buffer) - place >= _HEADER.size:
-            if self._checks < 0:  # headers after headers: somebody wants this program to be busy
-                self.garbage_bytes, self._over, place = self.garbage_bytes + len(buffer) - place, 0, len(buffer)
+        while len(buffer) - index >= _HEADER.size:
+            if self._checks < 0:  # headers after headers: an attack on this program's time
+                self.garbage_bytes, self._over, index = self.garbage_bytes + len(buffer) - index, 0, len(buffer)
                 break
             readings: list[Reading] = []
-            used = self._message(buffer, place, readings) if _POSE_HEADER.match(buffer, place) else -1
-            if used < 0:
-                used = self._pass_over(buffer, place)
-            elif used:
+            size = self._message(buffer, index, readings) if _POSE_HEADER.match(buffer, index) else -1
+            if size < 0:
+                size = self._pass_over(buffer, index)
+            elif size:
                 self._over = 0
-            else:  # it waits for its end
-                used = self._whole_inside(buffer, place) - place
-                self.garbage_bytes += used
-                if not used:
+            else:  # the message is not complete
+                size = self._next_message(buffer, index) - index
+                self.garbage_bytes += size
+                if not size:
                     break
-            place += used
-            found += readings
-        self._rest = buffer[place:]
-        return found
+            index += size
+            all_readings += readings
+        self._rest = buffer[index:]
+        return all_readings
 
-    def _message(self, buffer: bytes, place: int, found: list[Reading]) -> int:
-        """Size of a message with poses, whose readings go to `found`; 0 while its end is missing, -1 for none."""
+    def _message(self, buffer: bytes, index: int, readings: list[Reading]) -> int:
+        """Size of a message with poses, which are added to `readings`; 0 while incomplete, -1 for no message."""
         size: int
-        version, kind, device, seconds, fraction, size, crc = _HEADER.unpack_from(buffer, place)
-        kind, tool, end = kind.rstrip(b"\0"), _name(device), place + _HEADER.size + size
+        version, kind, device, seconds, fraction, size, crc = _HEADER.unpack_from(buffer, index)
+        kind, tool, end = kind.rstrip(b"\0"), _name(device), index + _HEADER.size + size
         if kind not in _POSES:
             return -1  # something stands in the padding
         if size > _LONGEST or (version == 1 and not _fits(kind, size)):
@@ -154,10 +154,10 @@ class IgtlinkParser(Parser):
             return -1
         if end > len(buffer):
             return 0
-        body = buffer[place + _HEADER.size : end]
+        body = buffer[index + _HEADER.size : end]
         self._checks -= size
-        if crc and (right := crc64(body)) != crc:
-            self.fault = f"{kind.decode()} of {tool!r} has the checksum {crc:016x}, its body gives {right:016x}"
+        if crc and (computed := crc64(body)) != crc:
+            self.fault = f"{kind.decode()} of {tool!r} has the checksum {crc:016x}, its body gives {computed:016x}"
             return -1
         content, facts = _parts(body, version, kind)
         if content is None:
@@ -166,72 +166,76 @@ class IgtlinkParser(Parser):
         if not crc:
             self.remark = "records carry no checksum (CRC 0), so damaged ones pass for poses"
         device_ns = seconds * 1_000_000_000 + (fraction * 1_000_000_000 >> 32) or None
-        head, numbers = _POSES[kind]
-        for start in range(0, len(content), head + numbers.size):
-            name = _name(content[start : start + NAME_BYTES]) if head else tool
-            values = numbers.unpack_from(content, start + head)
-            found.append(self._reading(values, tool=name, unseen=_unseen(facts), device_ns=device_ns))
-        return end - place
+        prefix, numbers = _POSES[kind]
+        for start in range(0, len(content), prefix + numbers.size):
+            name = _name(content[start : start + NAME_BYTES]) if prefix else tool
+            values = numbers.unpack_from(content, start + prefix)
+            readings.append(self._reading(values, tool=name, unseen=_unseen(facts), device_ns=device_ns))
+        return end - index
 
     def _reading(self, values: tuple[float, ...], *, tool: str, unseen: str, device_ns: int | None) -> Reading:
         x, y, z = values[-3:] if len(values) == _COLUMNS else values[:3]
-        turn = _turn_of_matrix(values[:-3]) if len(values) == _COLUMNS else (values[6], *values[3:6])
+        quaternion = _quaternion_of_matrix(values[:-3]) if len(values) == _COLUMNS else (values[6], *values[3:6])
         if unseen:
             return MissingReading(unseen, tool)
-        if turn is None or not plausible((x, y, z), turn):
+        if quaternion is None or not plausible((x, y, z), quaternion):
             self.fault = f"what {tool!r} sends is no rotation and place in mm: {' '.join(f'{v:g}' for v in values)}"
             return MissingReading(NO_ROTATION, tool)
-        if (x, y, z, *map(abs, turn)) == (0, 0, 0, 1, 0, 0, 0):
+        if (x, y, z, *map(abs, quaternion)) == (0, 0, 0, 1, 0, 0, 0):
             return MissingReading("identity sent", tool)
-        return PoseReading((x, y, z), (turn[0], turn[1], turn[2], turn[3]), device_ns, tool=tool)
+        w, i, j, k = quaternion
+        return PoseReading((x, y, z), (w, i, j, k), device_ns, tool=tool)
 
-    def _whole_inside(self, buffer: bytes, place: int) -> int:
-        """Index of the first whole message with poses behind a place; the place itself without one."""
-        inside = place
+    def _next_message(self, buffer: bytes, index: int) -> int:
+        """Index of the first complete message with poses after `index`; `index` itself without one."""
+        inside = index
         for _ in range(_MOST_LOOKS):
             inside = _find_header(buffer, inside + 1)
             if inside < 0 or inside + _HEADER.size > len(buffer):
                 break
             if self._message(buffer, inside, []) > 0:
                 return inside
-        return place
+        return index
 
-    def _pass_over(self, buffer: bytes, place: int) -> int:
-        """Bytes to leave out before the next place where a message with poses may begin; counts those of no message."""
-        if not self._over and (header := _ANY_HEADER.match(buffer, place)):
-            kind, size = header[0][2:-1], _HEADER.unpack_from(buffer, place)[5]
+    def _pass_over(self, buffer: bytes, index: int) -> int:
+        """Bytes to skip before a message with poses may begin; counts those that belong to no message."""
+        if not self._over and (header := _ANY_HEADER.match(buffer, index)):
+            kind, size = header[0][2:-1], _HEADER.unpack_from(buffer, index)[5]
             if kind not in _POSES:
                 self._over = _HEADER.size + size
                 if kind.decode() not in self._others and len(self._others) < _MOST_KINDS:
                     self._others.add(kind.decode())
-                    wanted = ", ".join(one.decode() for one in _POSES)
-                    self.fault = f"{', '.join(sorted(self._others))} came, but no {wanted}"
+                    pose_types = ", ".join(one.decode() for one in _POSES)
+                    self.fault = f"{', '.join(sorted(self._others))} came, but no {pose_types}"
         if self._over:
-            begin = _find_header(buffer, place + 1)
+            begin = _find_header(buffer, index + 1)
         else:
-            found = _ANY_HEADER.search(buffer, place + 1)
-            begin = found.start() if found else -1
-        used = (begin if begin >= 0 else max(place + 1, len(buffer) - _HEADER.size + 1)) - place
+            header_match = _ANY_HEADER.search(buffer, index + 1)
+            begin = header_match.start() if header_match else -1
+        skipped = (begin if begin >= 0 else max(index + 1, len(buffer) - _HEADER.size + 1)) - index
         if self._over:
-            used = min(used, self._over)
-            self._over -= used
+            skipped = min(skipped, self._over)
+            self._over -= skipped
         else:
-            self.garbage_bytes += used
-            if _TURNED_HEADER.match(buffer, place):
+            self.garbage_bytes += skipped
+            if _TURNED_HEADER.match(buffer, index):
                 self.fault = "its numbers are little-endian; OpenIGTLink is big-endian"
-        return used
+        return skipped
 
 
 def _find_header(buffer: bytes, start: int) -> int:
-    """Index of the first header of a message with poses from `start` on; -1 without one. Images are searched so."""
-    found = -1
+    """Index of the first header of a message with poses from `start` on; -1 without one.
+
+    Messages of images are large: `bytes.find` searches them faster than the pattern does.
+    """
+    first = -1
     for kind in _KINDS:
-        at = buffer.find(kind, start + 2, None if found < 0 else found + _HEADER.size)
+        at = buffer.find(kind, start + 2, None if first < 0 else first + _HEADER.size)
         while at >= 0 and not _POSE_HEADER.match(buffer, at - 2):
-            at = buffer.find(kind, at + 1, None if found < 0 else found + _HEADER.size)
-        if at >= 0 and (found < 0 or at - 2 < found):
-            found = at - 2
-    return found
+            at = buffer.find(kind, at + 1, None if first < 0 else first + _HEADER.size)
+        if at >= 0 and (first < 0 or at - 2 < first):
+            first = at - 2
+    return first
 
 
 def _name(data: bytes) -> str:
@@ -245,7 +249,7 @@ def _fits(kind: bytes, size: int) -> bool:
 
 
 def _parts(body: bytes, version: int, kind: bytes) -> tuple[bytes | None, dict[str, str]]:
-    """Content and metadata of a body; no content where its size is not one of its kind."""
+    """Content and metadata of a body; no content where its size does not fit its kind."""
     if version > 1 and len(body) >= _EXTENDED.size:
         size, header_bytes, data_bytes, _ = _EXTENDED.unpack_from(body)
         end = len(body) - header_bytes - data_bytes
@@ -255,17 +259,17 @@ def _parts(body: bytes, version: int, kind: bytes) -> tuple[bytes | None, dict[s
 
 
 def _metadata(header: bytes, data: bytes) -> dict[str, str]:
-    """Pairs of key and value; those cut off are left out."""
-    found, place = {}, 0
+    """Pairs of key and value; pairs that are cut off are left out."""
+    pairs, index = {}, 0
     for key_bytes, _, value_bytes in _PAIR.iter_unpack(header[2 : 2 + (len(header) - 2) // _PAIR.size * _PAIR.size]):
-        value_at = place + key_bytes
-        found[data[place:value_at].decode("latin-1")] = data[value_at : value_at + value_bytes].decode("latin-1")
-        place = value_at + value_bytes
-    return found
+        value_at = index + key_bytes
+        pairs[data[index:value_at].decode("latin-1")] = data[value_at : value_at + value_bytes].decode("latin-1")
+        index = value_at + value_bytes
+    return pairs
 
 
 def _unseen(facts: Mapping[str, str]) -> str:
-    """Why a tool has no pose, by a message's metadata; empty where it has one."""
+    """Why a tool has no pose, by a message's metadata; empty where it has a pose."""
     status = facts.get("TransformStatus", "OK").strip("\0 ").upper().removeprefix("TOOL_")
     if re.fullmatch("SWITCH[0-9]_IS_ON", status):
         return ""  # of the tool's own button; PLUS then says that the transform is not valid
@@ -274,7 +278,7 @@ def _unseen(facts: Mapping[str, str]) -> str:
     return "invalid" if facts.get("TransformValid", "").strip("\0 ").lower() in ("false", "0", "no") else ""
 
 
-def _turn_of_matrix(columns: tuple[float, ...]) -> tuple[float, ...] | None:
+def _quaternion_of_matrix(columns: tuple[float, ...]) -> tuple[float, ...] | None:
     """Quaternion, scalar first, of a rotation matrix given by columns; None for another matrix."""
     rotation = np.array(columns, dtype=np.float64).reshape(3, 3).T
     if not np.isfinite(rotation).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID_SLACK:
@@ -283,10 +287,10 @@ def _turn_of_matrix(columns: tuple[float, ...]) -> tuple[float, ...] | None:
 
 
 def encode_transform(pose: ToolReading) -> bytes:
-    """Encode a pose with its rotation matrix as a message of header version 1; of a missing one an identity."""
+    """Encode a pose as a TRANSFORM message of header version 1; a missing pose is an identity."""
     if isinstance(pose, PoseReading):
-        turn = rotation_from_quaternion(np.array(pose.quaternion_wxyz))
-        body, device_ns = _MATRIX.pack(*turn.T.ravel(), *pose.position_mm), pose.device_ns or 0
+        rotation = rotation_from_quaternion(np.array(pose.quaternion_wxyz))
+        body, device_ns = _MATRIX.pack(*rotation.T.ravel(), *pose.position_mm), pose.device_ns or 0
     else:
         body, device_ns = _MATRIX.pack(*np.eye(3).ravel(), 0, 0, 0), 0
     seconds, rest_ns = divmod(device_ns, 1_000_000_000)
@@ -297,9 +301,9 @@ def encode_transform(pose: ToolReading) -> bytes:
 
 # --- NDI Polaris, Vega and Aurora trackers, through the combined API library `ndicapi` (extra ``[ndi]``).
 #
-# These trackers answer questions and send nothing by themselves. A process of its own asks the tracker for every
-# new frame and speaks the open framing to this program, so that to everybody else it is a tracker like any other.
-# The library holds the interpreter while it waits for the line, which is one more reason for a process.
+# These trackers answer questions and send nothing by themselves. A separate process asks the tracker for every new
+# frame and speaks the open framing to this program, which then treats it as any other tracker. The library holds the
+# interpreter while it waits for the line, which is one more reason for a process.
 
 MODULE: Final = "ndicapy"  #: The module that the package ``ndicapi`` installs.
 NETWORK_PORT: Final = 8765
@@ -307,7 +311,7 @@ NETWORK_PORT: Final = 8765
 READY_S: Final = 30.0
 _ASK_EVERY_S: Final = 0.002
 _LOOK_S: Final = 0.01
-_PATIENCE: Final = 5  #: A reply may be spoilt on the line; so many in a row are a tracker that has gone.
+_PATIENCE: Final = 5  #: A reply may be spoilt on the line; this many in a row mean that the tracker has gone.
 _WIRELESS: Final = "PHRQ:*********1****"
 _TRANSFORMS: Final = 0x0001  # without 0x0800: a tool outside the volume that was characterised is missing
 _PART_NUMBER: Final = 0x0004
@@ -316,7 +320,7 @@ _PARTLY_OUT: Final = 0x80
 
 
 class NdiTracker:
-    """A connected NDI tracker with its tools, through the module ``ndicapy`` or one that does the same.
+    """A connected NDI tracker with its tools, through the module ``ndicapy`` or a stand-in with the same functions.
 
     `url` is a serial device or ``socket://HOST:PORT``. `roms` describe wireless tools, which are named by these files;
     tools on a wire bring their own and are named by port handle and part number, such as ``0A-8700339``.
@@ -349,8 +353,8 @@ class NdiTracker:
             self._command(_WIRELESS)
             handle = api.ndiGetPHRQHandle(self._device)
             if api.ndiPVWRFromFile(self._device, handle, str(rom)) != 0:
-                what = f"the tool's description {rom} was refused by the tracker"
-                raise DeviceError(f"{what}; check that it is the tool's .rom file")
+                fault = f"the tool's description {rom} was refused by the tracker"
+                raise DeviceError(f"{fault}; check that it is the tool's .rom file")
             described[handle] = rom.stem
         for handle in self._handles(2):
             self._command("PINIT:%02X", handle)
@@ -376,7 +380,7 @@ class NdiTracker:
         return reply if isinstance(reply, str) else ""
 
     def _handles(self, kind: int) -> list[int]:
-        """Port handles of a kind: 1 to be freed, 2 to be initialised, 3 to be enabled, 4 enabled."""
+        """Handles of ports in a state: 1 to be freed, 2 to be initialised, 3 to be enabled, 4 enabled."""
         self._command(f"PHSR:{kind:02X}")
         number = self._api.ndiGetPHSRNumberOfHandles(self._device)
         return [self._api.ndiGetPHSRHandle(self._device, one) for one in range(number)]
@@ -388,7 +392,7 @@ class NdiTracker:
         return f"{handle:02X}-{part}" if part else f"{handle:02X}"
 
     def readings(self) -> list[ToolReading]:
-        """Next reading of each tool; none while there is no new frame. Several silences in a row are a DeviceError."""
+        """Next reading of each tool; none without a new frame. Several failures in a row are a `DeviceError`."""
         try:
             self._command(f"BX:{_TRANSFORMS:04X}")
         except DeviceError:
@@ -405,12 +409,12 @@ class NdiTracker:
 
     def _reading(self, handle: int) -> ToolReading:
         port, tool = bytes([handle]), self.tools[handle]
-        found = self._api.ndiGetBXTransform(self._device, port)
+        transform = self._api.ndiGetBXTransform(self._device, port)
         status = self._api.ndiGetBXPortStatus(self._device, port)
-        if isinstance(found, str):
-            out = found == "MISSING" and status & _OUT_OF_VOLUME
-            return MissingReading("out of volume" if out else found.lower(), tool)
-        w, i, j, k, x, y, z = (float(value) for value in found[:7])
+        if isinstance(transform, str):
+            out = transform == "MISSING" and status & _OUT_OF_VOLUME
+            return MissingReading("out of volume" if out else transform.lower(), tool)
+        w, i, j, k, x, y, z = (float(value) for value in transform[:7])
         if not plausible((x, y, z), (w, i, j, k)):
             return MissingReading(NO_ROTATION, tool)
         return PoseReading((x, y, z), (w, i, j, k), None, ("partly out of volume",) * bool(status & _PARTLY_OUT), tool)
@@ -452,18 +456,22 @@ class NdiPort(Port):
         if find_spec(MODULE) is None:
             raise DeviceError(f"{self.name}: needs the package ndicapi; pip install 'tactile-bayes[ndi]'")
         ours, theirs = socket.socketpair()
-        words = [sys.executable, "-m", "tactile_bayes.hardware.trackers", str(theirs.fileno()), url, *map(str, roms)]
+        command = [sys.executable, "-m", "tactile_bayes.hardware.trackers", str(theirs.fileno()), url, *map(str, roms)]
         self._process = subprocess.Popen(
-            words, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, start_new_session=True
+            command,
+            pass_fds=[theirs.fileno()],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            start_new_session=True,
         )
         theirs.close()
         self._serial = _SocketLine(fileno=ours.detach())
         pipe = self._process.stdout
         assert pipe is not None
-        told = pipe.readline().decode().strip() if select.select([pipe], [], [], READY_S)[0] else ""
-        if told != "ready":
+        answer = pipe.readline().decode().strip() if select.select([pipe], [], [], READY_S)[0] else ""
+        if answer != "ready":
             self.close()
-            raise DeviceError(f"{self.name}: {told or 'the tracker said nothing; check its power'}")
+            raise DeviceError(f"{self.name}: {answer or 'the tracker said nothing; check its power'}")
 
     def close(self) -> None:
         """Close the line, on which the process ends."""
@@ -486,11 +494,11 @@ class _SocketLine(socket.socket):
         """Do nothing: a socket has no buffer to flush here."""
 
 
-def main(words: list[str]) -> int:
+def main(arguments: list[str]) -> int:
     """Run ``python -m tactile_bayes.hardware.trackers FD URL [ROM...]``: prints ``ready``, or what is wrong."""
-    line = socket.socket(fileno=int(words[0]))
+    line = socket.socket(fileno=int(arguments[0]))
     try:
-        tracker = NdiTracker(importlib.import_module(MODULE), words[1], roms=[*map(Path, words[2:])])
+        tracker = NdiTracker(importlib.import_module(MODULE), arguments[1], roms=[*map(Path, arguments[2:])])
     except DeviceError as error:
         os.write(sys.stdout.fileno(), f"{error}\n".encode())
         return error.exit_code

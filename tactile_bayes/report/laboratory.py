@@ -34,7 +34,7 @@ def sbc_document(
     """All results as plain data; `maps_per_s` is of the maps that this run made, None where it made none."""
     ranked = [one.outcome for one in maps if one.ranks is not None]
     silent = [one.outcome for one in maps if one.ranks is None and one.probability is None]
-    tests, others = sbc.rank_tests(list(maps)), sbc.other_rises(list(maps))
+    tests, others = sbc.rank_tests(list(maps)), sbc.count_other_rises(list(maps))
     return {
         "schema": SCHEMA,
         "method": method,

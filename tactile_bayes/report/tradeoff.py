@@ -16,12 +16,12 @@ from tactile_bayes.report.figure_file import figure_file
 from tactile_bayes.studies.estimate_tradeoff import (
     SIZE,
     WIDTHS,
-    Ladder,
+    MeasuredSetting,
     PooledRow,
-    Priced,
     Reference,
     Seconds,
     SizeAnswer,
+    Tradeoff,
 )
 from tactile_bayes.studies.tradeoffs import AMPLITUDE, ELEMENT
 
@@ -33,13 +33,13 @@ if TYPE_CHECKING:
 # --- One paragraph at the end of a trade-off: which setting is enough, and what would help instead.
 
 
-def advice(ladder: Ladder) -> list[str]:
+def advice(ladder: Tradeoff) -> list[str]:
     """What to choose, why more buys nothing, and what moves the answer more than any arithmetic."""
     answer, limit = ladder.reference.answer, ladder.tolerance_mm
     if answer is None:
         return [_without_number(ladder), *ladder.notes]
     lines = [f"Advice: {_enough(ladder, answer)}"]
-    far = [f"{one.label} {one.ends_off_mm:.1f} mm" for one in ladder.rows if ladder.beyond(one)]
+    far = [f"{one.label} {one.ends_off_mm:.1f} mm" for one in ladder.rows if ladder.exceeds_tolerance(one)]
     if far:
         lines.append(f"What moves the ends more than {limit:g} mm: {'; '.join(far)}.")
     silent = [one.label for one in ladder.rows if one.answer.reported is None]
@@ -59,8 +59,8 @@ def advice(ladder: Ladder) -> list[str]:
     return [*lines, *ladder.notes]
 
 
-def _enough(ladder: Ladder, reference: SizeAnswer) -> str:
-    best, default, shares = ladder.enough(), ladder.default, reference.variance_share
+def _enough(ladder: Tradeoff, reference: SizeAnswer) -> str:
+    best, default, shares = ladder.cheapest_sufficient(), ladder.default, reference.variance_share
     half = f"the interval's half width is {reference.half_width_mm:.1f} mm"
     if best is None or best.ends_off_mm is None:
         off = math.nan if default.ends_off_mm is None else default.ends_off_mm
@@ -79,7 +79,7 @@ def _enough(ladder: Ladder, reference: SizeAnswer) -> str:
     return f"{text}, and {rest:.0f} % of its variance is no error of the map ({share:.0f} % is {SOURCES[source]})."
 
 
-def _without_number(ladder: Ladder) -> str:
+def _without_number(ladder: Tradeoff) -> str:
     """Nothing to compare: what the settings say of a lump."""
     sized = [one.label for one in ladder.rows if one.answer.reported is not None]
     chances = [one for row in ladder.rows if (one := row.answer.detected_probability) is not None]
@@ -109,7 +109,7 @@ class TradeoffFile(Record):
     varied: Varied
     tolerance_mm: Annotated[float, Meta(gt=0)]
     reference: Reference
-    settings: Annotated[tuple[Priced, ...], Meta(min_length=1)]
+    settings: Annotated[tuple[MeasuredSetting, ...], Meta(min_length=1)]
     enough: str | None  #: The cheapest usable setting within the tolerance.
     pooled: tuple[PooledRow, ...]
     shared_cpu_s: Seconds
@@ -118,9 +118,9 @@ class TradeoffFile(Record):
     research_use: Annotated[str, Meta(min_length=1)]
 
 
-def ladder_file(ladder: Ladder, *, varied: Varied, provenance: Mapping[str, Any]) -> TradeoffFile:
+def ladder_file(ladder: Tradeoff, *, varied: Varied, provenance: Mapping[str, Any]) -> TradeoffFile:
     """A ladder as its file."""
-    enough = ladder.enough()
+    enough = ladder.cheapest_sufficient()
     return TradeoffFile(
         "tactile-bayes/tradeoff/1",
         varied,
@@ -144,7 +144,7 @@ _SHORT = {"estimate": "est."}
 _NUMBERS = 36  #: Columns of a size with its interval and how far that is off.
 
 
-def tradeoff_text(ladders: Mapping[str, Ladder]) -> str:
+def tradeoff_text(ladders: Mapping[str, Tradeoff]) -> str:
     """The whole report, ending with the research-use line; several ladders each under their title."""
     if len(ladders) == 1:
         return "\n".join([*map(ladder_text, ladders.values()), RESEARCH_USE])
@@ -152,7 +152,7 @@ def tradeoff_text(ladders: Mapping[str, Ladder]) -> str:
     return "\n".join([*parts, RESEARCH_USE])
 
 
-def ladder_text(ladder: Ladder) -> str:
+def ladder_text(ladder: Tradeoff) -> str:
     """What to choose, the table behind it, and notes."""
     parts, width = [_SHORT.get(name, name) for name in ladder.default.cpu_s], _name(ladder)
     costs, units = ("".join(f"{word:>{_COST}}" for word in words) for words in (parts, ["s"] * len(parts)))
@@ -171,17 +171,17 @@ def ladder_text(ladder: Ladder) -> str:
     return "\n".join([*lines, "", *_notes(ladder)])
 
 
-def _name(ladder: Ladder) -> int:
+def _name(ladder: Tradeoff) -> int:
     """Columns of a setting's name."""
     return _COLUMNS - _NUMBERS - _COST * len(ladder.default.cpu_s)
 
 
-def sized(ladder: Ladder) -> bool:
+def sized(ladder: Tradeoff) -> bool:
     """Whether what is reported is a size; without a calibration it is a width."""
     return any(SIZE in one.answer.quantities for one in ladder.rows) or ladder.reference.answer is None
 
 
-def _row(one: Priced, ladder: Ladder) -> list[str]:
+def _row(one: MeasuredSetting, ladder: Tradeoff) -> list[str]:
     """The setting's name with its numbers beside it, or below where it is long, and notes."""
     name, width = f"{'*' if one.default else ' '} {one.label}", _name(ladder)
     numbers = "".join(f"{seconds:>{_COST}.3f}" for seconds in one.cpu_s.values()) + _number(one.answer)
@@ -209,7 +209,7 @@ def _number(answer: SizeAnswer) -> str:
     return f"  {reason}" if named else f"  probability of a lump {chance:.2g}: {reason}"
 
 
-def _pooled(one: PooledRow, ladder: Ladder) -> list[str]:
+def _pooled(one: PooledRow, ladder: Tradeoff) -> list[str]:
     name = f"  {one.maps} map{'s' if one.maps > 1 else ''}"
     line = f"{name:<{_name(ladder)}}{one.cpu_s:>{_COST}.3f}{_number(one.answer)}"
     if one.answer.reported is None:
@@ -225,7 +225,7 @@ def _exact(answer: SizeAnswer) -> bool:
     return AMPLITUDE in answer.quantities
 
 
-def _exact_maps(ladder: Ladder) -> Iterator[str]:
+def _exact_maps(ladder: Tradeoff) -> Iterator[str]:
     """Of maps without errors what they show, and how far that is off the reference, with its sign."""
     best = ladder.reference.answer
     if best is None or not _exact(best):
@@ -243,7 +243,7 @@ def _exact_maps(ladder: Ladder) -> Iterator[str]:
         yield line.rstrip()
 
 
-def _notes(ladder: Ladder) -> Iterator[str]:
+def _notes(ladder: Tradeoff) -> Iterator[str]:
     reference, interval, error = ladder.reference, "of this exam", ""
     if reference.answer is not None and _exact(reference.answer):
         interval = "what the calibration leaves"
@@ -272,7 +272,7 @@ Box = tuple[float, float, float, float]
 _LEAST_MM = 1e-3  #: Smaller distances are drawn here: below rounding of what anybody reads.
 
 
-def draw_ladders(ladders: Mapping[str, Ladder], path: Path, *, force: bool = False) -> None:
+def draw_ladders(ladders: Mapping[str, Tradeoff], path: Path, *, force: bool = False) -> None:
     """Draw every setting as a point, with the frontier and the lines that say what matters; ladders by their titles.
 
     Without a reference there is no distance: then the probability of a lump is drawn.
@@ -286,7 +286,7 @@ def draw_ladders(ladders: Mapping[str, Ladder], path: Path, *, force: bool = Fal
             part.legend(loc="outside right upper", fontsize=8, frameon=False)
 
 
-def _draw_ladder(figure: Figure, axes: Axes, ladder: Ladder) -> None:
+def _draw_ladder(figure: Figure, axes: Axes, ladder: Tradeoff) -> None:
     shown = [one for one in ladder.rows if math.isfinite(_height(one, ladder))]
     for i, axis in enumerate(dict.fromkeys(one.axis for one in shown)):
         rows = [one for one in shown if one.axis == axis]
@@ -316,14 +316,14 @@ def _draw_ladder(figure: Figure, axes: Axes, ladder: Ladder) -> None:
     axes.set_xlabel("CPU time, s")
 
 
-def _height(one: Priced, ladder: Ladder) -> float:
+def _height(one: MeasuredSetting, ladder: Tradeoff) -> float:
     """Distance from the reference, mm; without a reference the probability of a lump."""
     if ladder.reference.answer is not None:
         return math.nan if one.ends_off_mm is None else max(one.ends_off_mm, _LEAST_MM)
     return math.nan if one.answer.detected_probability is None else one.answer.detected_probability
 
 
-def _places(rows: Sequence[Priced], ladder: Ladder) -> tuple[list[float], list[float]]:
+def _places(rows: Sequence[MeasuredSetting], ladder: Tradeoff) -> tuple[list[float], list[float]]:
     return [max(one.seconds, 1e-4) for one in rows], [_height(one, ladder) for one in rows]
 
 
@@ -336,7 +336,7 @@ def _draw_level(axes: Axes, value: float | None, colour: str, style: str, name: 
         axes.annotate(text, place, xytext=(-4, 3), fontsize=8, ha="right", color=colour, **how)
 
 
-def _draw_names(figure: Figure, axes: Axes, shown: Sequence[Priced], ladder: Ladder) -> None:
+def _draw_names(figure: Figure, axes: Axes, shown: Sequence[MeasuredSetting], ladder: Tradeoff) -> None:
     """A name beside each point, moved up or down until it covers no other name and no point."""
     figure.draw_without_rendering()
     scale = 72.0 / figure.dpi

@@ -1,4 +1,4 @@
-"""The trade-off ladder, and that of an estimate, with the numbers that it is read by."""
+"""Trade-off of CPU time against accuracy: how any is measured, and that of an estimate."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from tactile_bayes.presets import INTERVAL, MOST_FIELD_COSINES, Background
 from tactile_bayes.progress import Progress, no_progress
 from tactile_bayes.size.pooling import Calibration
 
-# --- The reported numbers of one setting, and how far they lie from a reference.
+# --- The reported numbers of one setting, and their distance from a reference.
 
 SIZE = "max_size_mm"
 WIDTHS = ("sigma_x_mm", "sigma_y_mm")
 
 
-class Interval(Record):
+class IntervalWithError(Record):
     """A median with its interval."""
 
     median: float
@@ -41,60 +41,63 @@ class SizeAnswer(Record):
     reason: str  #: Why there is no number; empty where there is one.
     detected_probability: Annotated[float, Meta(ge=0, le=1)] | None
     method: str  #: The method that drew.
-    quantities: dict[str, Interval]
+    quantities: dict[str, IntervalWithError]
     """Medians and 95 % intervals, mm: max_size_mm, sigma_x_mm, sigma_y_mm; of a forward model also amplitude, and
     element_mm of its mesh."""
     variance_share: dict[str, float]  #: Percent of the variance of ln(largest size) by source.
 
     @property
-    def reported(self) -> Interval | None:
+    def reported(self) -> IntervalWithError | None:
         """The largest size; without a calibration the width across the head, without an estimate None."""
         return self.quantities.get(SIZE, self.quantities.get(WIDTHS[0]))
 
     @property
     def half_width_mm(self) -> float | None:
-        """Half the width of the reported interval; None where there is none."""
-        found = self.reported
-        return None if found is None else 0.5 * (found.high - found.low)
+        """Half the width of the reported interval; None without one."""
+        reported = self.reported
+        return None if reported is None else 0.5 * (reported.high - reported.low)
 
 
 class Unconverged(SizeAnswer):
-    """An answer without numbers because no method converged."""
+    """An answer without numbers, because no method converged."""
 
 
-def no_number(reason: str, probability: float | None = None, *, converged: bool = True) -> SizeAnswer:
-    """An answer without numbers, with the probability of a lump where that could be tested."""
+def answer_without_number(reason: str, probability: float | None = None, *, converged: bool = True) -> SizeAnswer:
+    """An answer without numbers; with the probability of a lump where that could be tested."""
     kind = SizeAnswer if converged else Unconverged
     return kind(reason, probability, "", {}, {})
 
 
 def answer_of(estimate: Estimate, *, probability: float) -> SizeAnswer:
-    """An estimate as its reported numbers, with intervals of the given probability."""
+    """The reported numbers of an estimate, with intervals of the given probability."""
     if estimate.map_posterior is None or estimate.draws is None:
-        return no_number(estimate.reason, estimate.probability, converged=estimate.code != "method")
+        return answer_without_number(estimate.reason, estimate.probability, converged=estimate.code != "method")
     replicates = estimate.draws.replicates
-    found = {
+    quantities = {
         name: summarise(getattr(estimate.map_posterior, name), probability=probability, replicates=replicates)
         for name in WIDTHS
     }
     if estimate.size is not None:
-        found[SIZE] = estimate.size.summarise(SIZE, probability=probability)
+        quantities[SIZE] = estimate.size.summarise(SIZE, probability=probability)
     shares = {} if estimate.size is None else estimate.size.variance_share
-    return SizeAnswer("", estimate.probability, estimate.draws.method, intervals(found), shares)
+    return SizeAnswer("", estimate.probability, estimate.draws.method, intervals(quantities), shares)
 
 
-def intervals(found: Mapping[str, Quantity]) -> dict[str, Interval]:
-    """Of summaries what a trade-off reports."""
-    return {name: Interval(one.median, one.low, one.high, one.mc_error) for name, one in found.items()}
+def intervals(quantities: Mapping[str, Quantity]) -> dict[str, IntervalWithError]:
+    """Summaries as a trade-off reports them."""
+    return {
+        name: IntervalWithError(quantity.median, quantity.low, quantity.high, quantity.mc_error)
+        for name, quantity in quantities.items()
+    }
 
 
 Distances = tuple[float | None, float | None, float | None]
 
 
 def distances(answers: Sequence[SizeAnswer], reference: SizeAnswer | None) -> Distances:
-    """How far answers lie from a reference, mm: the reported median, the ends of its interval, and those of the widths.
+    """Distances from a reference, mm: of the reported median, of the ends of its interval, and of those of the widths.
 
-    Root mean squares over answers and ends; None where one of them, or the reference, has no number of the same kind.
+    Root mean squares over answers and ends; None where an answer or the reference lacks a number.
     """
     if reference is None or reference.reported is None or not answers:
         return None, None, None
@@ -102,51 +105,51 @@ def distances(answers: Sequence[SizeAnswer], reference: SizeAnswer | None) -> Di
         return None, None, None
     name, widths = SIZE if SIZE in reference.quantities else WIDTHS[0], [x for x in WIDTHS if x in reference.quantities]
 
-    def apart(names: Sequence[str], ends: Sequence[str]) -> float:
+    def distance(names: Sequence[str], ends: Sequence[str]) -> float:
         pairs = [(one.quantities[name], reference.quantities[name]) for one in answers for name in names]
         gaps = [getattr(ours, end) - getattr(theirs, end) for ours, theirs in pairs for end in ends]
         return float(np.sqrt(np.mean(np.square(gaps))))
 
-    return apart([name], ["median"]), apart([name], ["low", "high"]), apart(widths, ["low", "high"])
+    return distance([name], ["median"]), distance([name], ["low", "high"]), distance(widths, ["low", "high"])
 
 
-# --- Settings with what each costs and answers, against one reference; the frontier, and which setting is enough.
+# --- Settings with their cost and answer, against one reference; the frontier, and the cheapest sufficient setting.
 
 Clock = Callable[[], float]
 Seconds = Annotated[dict[str, float], described("CPU seconds by part.")]
-WORTH = 0.8  #: A setting that takes more than this share of the default's time is not worth a choice.
-MOST_S = 4.0  #: CPU seconds after which a setting is not run again: its least time is known well enough.
+WORTHWHILE_SHARE = 0.8  #: A setting that takes more than this share of the default's time saves too little.
+MOST_CPU_S = 4.0  #: CPU seconds after which a setting is not run again: its least time is known well enough.
 
 
-class Work(Record):
-    """How a study is run."""
+class StudyRun(Record):
+    """How a trade-off is measured."""
 
     clock: Clock  #: CPU seconds so far.
-    tolerance_mm: float  #: See `Ladder`.
-    runs: int = 3  #: Of each setting: times are the least of them, distances their root mean square.
+    tolerance_mm: float  #: See `Tradeoff`.
+    runs: int = 3  #: Runs of each setting; its time is the least of theirs, its distances their root mean square.
     announce: Callable[[float], None] = lambda _seconds: None
-    """Called once, when the default has been timed, with about how many CPU seconds the rest will take."""
-    progress: Progress = no_progress  #: Called with settings done and in all.
-    seed: int = 1  #: Of the random numbers.
-    probability: float = INTERVAL  #: Of the intervals.
+    """Called once, when the default has been timed, with a forecast of the CPU seconds of the rest."""
+    progress: Progress = no_progress  #: Called with the settings done and in all.
+    seed: int = 1  #: Random seed.
+    probability: float = INTERVAL  #: Probability of the intervals.
 
 
-How = TypeVar("How")
+Options = TypeVar("Options")
 
 
-class Choice(Record, Generic[How]):
-    """A setting to be tried."""
+class Setting(Record, Generic[Options]):
+    """A setting to measure."""
 
-    axis: str  #: What is varied.
+    axis: str  #: The property that is varied.
     label: str  #: The setting in a few words; an option of the command line where there is one.
-    how: How  #: Options of the estimate, or of the map.
-    weight: float = 1.0  #: About how many times the default's CPU time it takes, for a forecast.
-    default: bool = False  #: Whether this is what the program does by itself.
+    options: Options  #: Options of the estimate, or of the map.
+    weight: float = 1.0  #: Its CPU time over the default's, roughly, for a forecast.
+    default: bool = False  #: True for the program's default.
     usable: bool = True
-    """Whether a user can choose it to save or to spend time; other rows show what the answer depends on."""
+    """True if a user can choose it to save or to spend time; other settings show what the answer depends on."""
 
 
-class Priced(Record):
+class MeasuredSetting(Record):
     """One setting, its cost and its distance from the reference."""
 
     axis: str
@@ -177,8 +180,8 @@ class Reference(Record):
     answer: SizeAnswer | None
 
 
-def reference_of(words: str, answer: SizeAnswer | None, cpu_s: float) -> Reference:
-    """A reference with the half width of its reported interval and the Monte-Carlo error of its ends."""
+def make_reference(words: str, answer: SizeAnswer | None, cpu_s: float) -> Reference:
+    """Reference with the half width of its reported interval and the Monte-Carlo error of its ends."""
     if answer is None or answer.reported is None:
         return Reference(words, None, None, cpu_s, answer)
     return Reference(words, answer.reported.mc_error, answer.half_width_mm, cpu_s, answer)
@@ -193,10 +196,10 @@ class PooledRow(Record):
     another_half_width_mm: float | None  #: Half width of the interval of another exam, mm.
 
 
-class Ladder(Record):
+class Tradeoff(Record):
     """All settings of a study."""
 
-    rows: tuple[Priced, ...]  #: In the order of the table.
+    rows: tuple[MeasuredSetting, ...]  #: In the order of the table.
     reference: Reference  #: What they are compared with.
     tolerance_mm: float  #: Distance of interval ends below which more is not worth its cost.
     shared_cpu_s: dict[str, float] = field(default_factory=dict)
@@ -206,75 +209,79 @@ class Ladder(Record):
     notes: tuple[str, ...] = ()  #: What else matters for the choice, in sentences.
 
     @property
-    def default(self) -> Priced:
-        """What the program does by itself."""
+    def default(self) -> MeasuredSetting:
+        """The program's default."""
         return next(one for one in self.rows if one.default)
 
-    def enough(self) -> Priced | None:
+    def cheapest_sufficient(self) -> MeasuredSetting | None:
         """The cheapest usable setting within the tolerance, or the default where that costs hardly more."""
-        within = [one for one in self.rows if one.usable and not self.beyond(one) and one.ends_off_mm is not None]
+        within = [
+            one for one in self.rows if one.usable and not self.exceeds_tolerance(one) and one.ends_off_mm is not None
+        ]
         if not within:
             return None
         best = min(within, key=lambda one: one.seconds)
-        return self.default if self.default in within and best.seconds > WORTH * self.default.seconds else best
+        return (
+            self.default if self.default in within and best.seconds > WORTHWHILE_SHARE * self.default.seconds else best
+        )
 
-    def beyond(self, one: Priced) -> bool:
-        """Whether a setting's interval ends are further off than the tolerance."""
+    def exceeds_tolerance(self, one: MeasuredSetting) -> bool:
+        """True if a setting's interval ends are further off than the tolerance."""
         return one.ends_off_mm is not None and one.ends_off_mm > self.tolerance_mm
 
-    def frontier(self) -> list[Priced]:
+    def frontier(self) -> list[MeasuredSetting]:
         """The settings that no other beats in time and distance at once, the cheapest first."""
-        found: list[Priced] = []
+        frontier: list[MeasuredSetting] = []
         least = math.inf
-        known = [(one.seconds, one.ends_off_mm, one) for one in self.rows if one.ends_off_mm is not None]
-        for _, off, one in sorted(known, key=lambda each: each[:2]):
+        measured = [(row.seconds, row.ends_off_mm, row) for row in self.rows if row.ends_off_mm is not None]
+        for _, off, row in sorted(measured, key=lambda each: each[:2]):
             if off < least:
-                found.append(one)
+                frontier.append(row)
                 least = off
-        return found
+        return frontier
 
 
-Run = Callable[[How, int], tuple[dict[str, float], SizeAnswer]]
-"""From a setting and the number of the run, which seeds its random numbers, to CPU seconds by part, and the answer."""
+Run = Callable[[Options, int], tuple[dict[str, float], SizeAnswer]]
+"""Runs a setting: from its options and the number of the run, which seeds it, to CPU seconds by part and the answer."""
 
 
-def priced(one: Choice[How], run: Run[How], reference: Reference, *, runs: int) -> Priced:
-    """Run a setting so often, or twice where that took `MOST_S`, and compare its answers with the reference."""
+def measure_setting(one: Setting[Options], run: Run[Options], reference: Reference, *, runs: int) -> MeasuredSetting:
+    """Run a setting `runs` times, or twice where that took `MOST_CPU_S`, and compare its answers with the reference."""
     spent: list[dict[str, float]] = []
     answers: list[SizeAnswer] = []
     for number in range(runs):
-        seconds, answer = run(one.how, number)
+        seconds, answer = run(one.options, number)
         spent.append(seconds)
         answers.append(answer)
         # the first run also imports: a second one is worth its wait
-        if number >= 1 and sum(sum(parts.values()) for parts in spent) > MOST_S:
+        if number >= 1 and sum(sum(parts.values()) for parts in spent) > MOST_CPU_S:
             break
     least, off = min(spent, key=lambda parts: sum(parts.values())), distances(answers, reference.answer)
-    return Priced(one.axis, one.label, one.default, one.usable, len(answers), least, *off, answers[0], False)
+    return MeasuredSetting(one.axis, one.label, one.default, one.usable, len(answers), least, *off, answers[0], False)
 
 
-def climbed(
-    choices: Sequence[Choice[How]],
-    run: Run[How],
+def run_tradeoff(
+    choices: Sequence[Setting[Options]],
+    run: Run[Options],
     reference: Callable[[], Reference],
-    work: Work,
+    work: StudyRun,
     *,
-    worth: Callable[[SizeAnswer], Sequence[Choice[How]]] | None = None,
-) -> Ladder:
-    """Say how long it takes, make the reference and price every setting.
+    relevant: Callable[[SizeAnswer], Sequence[Setting[Options]]] | None = None,
+) -> Tradeoff:
+    """Forecast the time, make the reference and measure every setting.
 
-    `worth` says which settings can make a difference where the default gives an answer; without it all are tried.
+    `relevant` returns the settings that can make a difference beside the default's answer; without it all are measured.
     """
-    default = next(one.how for one in choices if one.default)
-    run(default, 0)  # twice: imports and first calls cost nothing afterwards
+    default = next(one.options for one in choices if one.default)
+    run(default, 0)  # run twice: the first run also imports
     seconds, answer = run(default, 0)
-    choices = choices if worth is None else worth(answer)
+    choices = choices if relevant is None else relevant(answer)
     work.announce(sum(seconds.values()) * (4.0 + work.runs * sum(one.weight for one in choices)))
     made, rows = reference(), []
     for number, one in enumerate(choices, start=1):
-        rows.append(priced(one, run, made, runs=work.runs))
+        rows.append(measure_setting(one, run, made, runs=work.runs))
         work.progress(number, len(choices))
-    ladder = Ladder(tuple(rows), made, work.tolerance_mm)
+    ladder = Tradeoff(tuple(rows), made, work.tolerance_mm)
     best = set(map(id, ladder.frontier()))
     return replace(ladder, rows=tuple(replace(one, frontier=id(one) in best) for one in rows))
 
@@ -291,120 +298,126 @@ RADII_MM = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)
 METHOD, ACCURACY, FIELD, WINDOW = "method", "draws", "noise field", "fit window"
 
 
-Setting = Choice[SamplerSettings]
+EstimateSetting = Setting[SamplerSettings]
 
 
-def settings_of(options: SamplerSettings, *, level_known: bool) -> list[Setting]:
-    """Everything that is tried, the default, what `estimate` takes by itself for this map, first.
+def settings_of(options: SamplerSettings, *, level_known: bool) -> list[EstimateSetting]:
+    """Settings to measure; the default, which `estimate` chooses for this map, comes first.
 
-    `level_known` is whether the map has a background that the paper's least squares can be fixed at.
+    `level_known`: the map has a background at which the paper's least squares can be fixed.
     """
-    found = [Setting(METHOD, f"--method {options.method}", options, default=True)]
+    settings = [EstimateSetting(METHOD, f"--method {options.method}", options, default=True)]
     if options.method != "optimise":
         level: Background = "fixed" if level_known else "free"
         # another model: no noise field, no prior
         plain = replace(
             options, method="optimise", scene="auto", accuracy_mm=None, noise="independent", background=level
         )
-        found.append(Setting(METHOD, "--method optimise", plain, 0.5, usable=False))
+        settings.append(EstimateSetting(METHOD, "--method optimise", plain, 0.5, usable=False))
     for method, weight in (("laplace", 1.0), ("importance", 1.0), ("ensemble", 8.0)):
         if method != options.method:
-            found.append(Setting(METHOD, f"--method {method}", _by(options, method), weight))
+            settings.append(EstimateSetting(METHOD, f"--method {method}", _with_method(options, method), weight))
     for number in LAPLACE_DRAWS if options.correlated else ():
-        drawn = replace(_by(options, "laplace"), draws=number)
-        found.append(Setting(ACCURACY, f"laplace, {number} draws", drawn, usable=False))
+        drawn = replace(_with_method(options, "laplace"), draws=number)
+        settings.append(EstimateSetting(ACCURACY, f"laplace, {number} draws", drawn, usable=False))
     for accuracy in ACCURACIES_SD:
-        drawn = _by(options, "importance", accuracy)
-        found.append(Setting(ACCURACY, f"--accuracy-sd {accuracy:g}", drawn, 1.0 + 0.005 / accuracy))
+        drawn = _with_method(options, "importance", accuracy)
+        settings.append(EstimateSetting(ACCURACY, f"--accuracy-sd {accuracy:g}", drawn, 1.0 + 0.005 / accuracy))
     for accuracy in CHAIN_ACCURACIES_SD if options.correlated else ():
-        drawn = _by(options, "ensemble", accuracy)
-        found.append(Setting(ACCURACY, f"--method ensemble --accuracy-sd {accuracy:g}", drawn, 25.0))
+        drawn = _with_method(options, "ensemble", accuracy)
+        settings.append(EstimateSetting(ACCURACY, f"--method ensemble --accuracy-sd {accuracy:g}", drawn, 25.0))
     for number in FIELDS if options.correlated else ():
         finer, weight = replace(options, field_cosines=number), max(0.7, (number / 18.0) ** 3.2)
-        found.append(Setting(FIELD, f"field_cosines {number}", finer, weight, usable=False))
+        settings.append(EstimateSetting(FIELD, f"field_cosines {number}", finer, weight, usable=False))
     for radius in RADII_MM:
         if radius != options.fit_radius_mm:
-            other = replace(options, fit_radius_mm=radius)
-            found.append(Setting(WINDOW, f"fit_radius_mm {radius:g}", other, usable=False))
-    return found
+            resized = replace(options, fit_radius_mm=radius)
+            settings.append(EstimateSetting(WINDOW, f"fit_radius_mm {radius:g}", resized, usable=False))
+    return settings
 
 
-def worth_trying(settings: list[Setting], answer: SizeAnswer) -> list[Setting]:
+def relevant_settings(settings: list[EstimateSetting], answer: SizeAnswer) -> list[EstimateSetting]:
     """The settings that can make a difference where the default gives this answer.
 
-    Without draws their number plays no part. Where the default has fallen through to chains, noise fields and windows
-    are tried by laplace: chains for each would take minutes.
+    Without draws, the settings of their number are left out. Where the default has resorted to chains, noise fields and
+    windows are measured by laplace: chains for each would take minutes.
     """
     if answer.reported is None and not isinstance(answer, Unconverged):
-        kept = [one for one in settings if one.axis != ACCURACY]
-        return [replace(one, weight=min(one.weight, 1.0)) if one.axis == METHOD else one for one in kept]
-    default = settings[0].how
+        without_accuracy = [one for one in settings if one.axis != ACCURACY]
+        return [replace(one, weight=min(one.weight, 1.0)) if one.axis == METHOD else one for one in without_accuracy]
+    default = settings[0].options
     if answer.method != "ensemble" or default.method == "ensemble":
         return settings
     return [settings[0], *map(_beside_chains, settings[1:])]
 
 
-def _beside_chains(one: Setting) -> Setting:
+def _beside_chains(one: EstimateSetting) -> EstimateSetting:
     """A setting with a weight against chains; by laplace if it is another model."""
-    if one.how.method == "ensemble":
+    if one.options.method == "ensemble":
         return replace(one, weight=one.weight / 8.0)
     if one.axis in (FIELD, WINDOW):
-        return replace(one, label=f"{one.label}, laplace", how=_by(one.how, "laplace"), weight=0.05 * one.weight)
+        return replace(
+            one, label=f"{one.label}, laplace", options=_with_method(one.options, "laplace"), weight=0.05 * one.weight
+        )
     return replace(one, weight=0.2 * one.weight)
 
 
-def _by(options: SamplerSettings, method: Any, accuracy_sd: float | None = None) -> SamplerSettings:
-    """The options with another method, which stands for itself: where it fails no other one is tried."""
+def _with_method(options: SamplerSettings, method: Any, accuracy_sd: float | None = None) -> SamplerSettings:
+    """The options with another method, after which no other one is tried if it fails."""
     return replace(options, method=method, accuracy_sd=accuracy_sd, accuracy_mm=None, step_up=False)
 
 
-class Estimator(Record):
+class MapEstimator(Record):
     """Estimates of one map, seeded by the map and the number of the run."""
 
     tactile_map: TactileMap
-    calibration: Calibration | None  #: From widths to sizes; None stops at widths.
-    work: Work
+    calibration: Calibration | None  #: Calibration from widths to sizes; None for an estimate without sizes.
+    work: StudyRun
 
     def run(self, options: SamplerSettings, number: int) -> tuple[dict[str, float], SizeAnswer]:
-        """A whole estimate, from the map to the size.
+        """Estimate the map, up to the size.
 
-        The calibration counts as learned from maps fitted as the options say: `estimate` refuses a size from a map
-        fitted in another way, and here it is wanted, to see how far off it would be.
+        The calibration's recipe is replaced by the options': `estimate` refuses a size from a map that was fitted in
+        another way, but here that size shows how far off it would be.
         """
         calibration = self.calibration
         if calibration is not None:
-            used = {"background": options.background, "radius_mm": options.fit_radius_mm, "noise": options.noise}
-            calibration = replace(calibration, recipe=replace(calibration.recipe, **used))
+            recipe = {"background": options.background, "radius_mm": options.fit_radius_mm, "noise": options.noise}
+            calibration = replace(calibration, recipe=replace(calibration.recipe, **recipe))
         rng = np.random.default_rng([self.work.seed, number, self.tactile_map.fingerprint])
         begun = self.work.clock()
         try:
-            found = estimate_map(self.tactile_map, calibration=calibration, options=options, rng=rng)
-            answer = answer_of(found, probability=self.work.probability)
+            estimate = estimate_map(self.tactile_map, calibration=calibration, options=options, rng=rng)
+            answer = answer_of(estimate, probability=self.work.probability)
         except NotConvergedError as error:
-            answer = no_number(str(error), converged=False)
+            answer = answer_without_number(str(error), converged=False)
         return {"estimate": self.work.clock() - begun}, answer
 
     def reference(self, options: SamplerSettings) -> Reference:
-        """The same posterior by the first long run that converges; without one, or without a lump, no answer."""
+        """Reference from the first long run of the same posterior that converges; without an answer if none does."""
         spent, why = 0.0, ""
         for method, accuracy in LONG_RUNS:
-            seconds, answer = self.run(_by(options, method, accuracy), -1 % 2**32)
+            seconds, answer = self.run(_with_method(options, method, accuracy), -1 % 2**32)
             spent, why = spent + seconds["estimate"], answer.reason
             if answer.reported is not None:
                 name = "importance sampling" if method == "importance" else "MCMC (four ensembles)"
                 words = f"{name} of the default's posterior, asked for {accuracy:g} SD"
-                return reference_of(words, answer, spent)
-            if not isinstance(answer, Unconverged):  # no draws are made, so none can be more exact
+                return make_reference(words, answer, spent)
+            if not isinstance(answer, Unconverged):  # no draws are made, so a longer run changes nothing
                 break
-        return reference_of(f"none: {why}", None, spent)
+        return make_reference(f"none: {why}", None, spent)
 
 
 def measure(
-    tactile_map: TactileMap, *, calibration: Calibration | None, options: SamplerSettings, work: Work
-) -> Ladder:
-    """Run every setting on one map, from the calibration and options that `estimate` takes by itself for it."""
-    estimator = Estimator(tactile_map, calibration, work)
+    tactile_map: TactileMap, *, calibration: Calibration | None, options: SamplerSettings, work: StudyRun
+) -> Tradeoff:
+    """Measure every setting on one map; `calibration` and `options` are those that `estimate` chooses for it."""
+    estimator = MapEstimator(tactile_map, calibration, work)
     settings = settings_of(options, level_known=tactile_map.background is not None)
-    return climbed(
-        settings, estimator.run, lambda: estimator.reference(options), work, worth=partial(worth_trying, settings)
+    return run_tradeoff(
+        settings,
+        estimator.run,
+        lambda: estimator.reference(options),
+        work,
+        relevant=partial(relevant_settings, settings),
     )

@@ -25,12 +25,12 @@ from tactile_bayes.studies.paper import HARD_RATIO, PAPER_DIAMETERS_MM, MapFit, 
 
 # --- Tables 1 and 2 of the paper and the phantoms of its section 2.3: the empirical model against the elastic one.
 #
-# The paper prints a mean squared difference without saying of what. Here it is
+# The paper prints a mean squared difference without its definition. Here it is
 #
 # .. math:: \mathrm{MSD}(u, v) = \sum_i (u_i - v_i)^2 / \sum_i v_i^2
 #
-# with v the elastic model, and beside it the same relative to what the lump adds, :math:`\sum_i (v_i - 1)^2`, for
-# maps. The first hides a bump under the background of 1 (decision record 0007); the second does not.
+# with v the elastic model; for maps also relative to the pressure that the lump adds, :math:`\sum_i (v_i - 1)^2`.
+# The background of 1 dominates the first (decision record 0007), not the second.
 
 TABLE_DIAMETERS_MM = PAPER_DIAMETERS_MM
 TABLE_DEPTH_RATIOS = (0.6, 1.8)
@@ -77,7 +77,7 @@ NEAREST_HEADS = {
 class TableScene(Record):
     """A lump for which both models are compared."""
 
-    name: str  #: For people.
+    name: str  #: Name in messages.
     d_mm: float
     depth_ratio: float
     seat: float  #: These as in `tissue.Body`.
@@ -85,7 +85,7 @@ class TableScene(Record):
 
 
 class Agreement(Record):
-    """How far the empirical model is from the elastic one; differences as shares, not percent."""
+    """Differences of the empirical model from the elastic one, as shares, not percent."""
 
     scene: TableScene  #: The lump compared.
     centred_frame: float
@@ -100,7 +100,8 @@ class Agreement(Record):
     """`elastic`, `empirical`: Eq 5 fitted to both maps."""
     normalised_frame: float  #: As `centred_frame`, of frames divided by their means.
     others: tuple[tuple[float, float, float], ...]
-    """By each of `OTHER_DEFINITIONS`: of the frame centred on the lump, of the same divided by its mean, of the map."""
+    """Differences by each of `OTHER_DEFINITIONS`: of the frame centred on the lump, of that frame divided by its mean,
+    and of the map."""
 
 
 def table_scenes(seat: float) -> list[TableScene]:
@@ -116,10 +117,10 @@ def phantom_scenes(seat: float) -> list[TableScene]:
 def scene_frames(
     scene: TableScene, settings: StudySettings, *, surface: plane.SurfaceCompliance | None = None
 ) -> tuple[plane.LineFrames, plane.LineFrames]:
-    """Frames of the elastic and the empirical model at the same positions; the latter is fitted to what the taxels see
-    far from and over the lump.
+    """Frames of the elastic and the empirical model at the same positions; the latter is fitted to the taxels' frames
+    far from the lump and over it.
 
-    `surface` is the scene's body condensed onto its skin, where it is at hand.
+    `surface` is the scene's body condensed onto its skin, by default computed here.
     """
     if surface is None:
         surface = settings.surface(settings.body(scene.d_mm, scene.depth_ratio, seat=scene.seat))
@@ -129,18 +130,21 @@ def scene_frames(
 
 
 def compare(scene: TableScene, *, settings: StudySettings, surface: plane.SurfaceCompliance | None = None) -> Agreement:
-    """One scene's figures; `surface` as in `scene_frames`."""
+    """Compare both models of one scene; `surface` as in `scene_frames`."""
     elastic, empirical = scene_frames(scene, settings, surface=surface)
     elastic_map, empirical_map = plane.build_line(elastic), plane.build_line(empirical)
     inside = np.abs(elastic_map.x_mm) <= settings.fit_radius_mm
     ours, theirs = empirical_map.mean[inside], elastic_map.mean[inside]
-    fitted, seen = empirical.as_taxels(presets.HEAD_PITCH_MM), elastic.as_taxels(presets.HEAD_PITCH_MM)
-    frames = fitted.at(0.0), seen.at(0.0)
+    empirical_taxels, elastic_taxels = (
+        empirical.as_taxels(presets.HEAD_PITCH_MM),
+        elastic.as_taxels(presets.HEAD_PITCH_MM),
+    )
+    frames = empirical_taxels.at(0.0), elastic_taxels.at(0.0)
     shares = frames[0] / frames[0].mean(), frames[1] / frames[1].mean()
     return Agreement(
         scene,
         mean_squared_difference(*frames),
-        mean_squared_difference(fitted.pressure_kpa, seen.pressure_kpa),
+        mean_squared_difference(empirical_taxels.pressure_kpa, elastic_taxels.pressure_kpa),
         mean_squared_difference(ours, theirs),
         float(np.sum((ours - theirs) ** 2) / np.sum((theirs - 1.0) ** 2)),
         fit_line(elastic_map, settings.fit_radius_mm),
@@ -151,20 +155,20 @@ def compare(scene: TableScene, *, settings: StudySettings, surface: plane.Surfac
 
 
 def compare_heads(scene: TableScene, *, settings: StudySettings, heads: Sequence[Head]) -> list[Agreement]:
-    """One scene's figures under each of several heads; the body is condensed once."""
+    """Compare both models of one scene under each of several heads; the body is condensed once."""
     widest = max(heads, key=lambda head: head.half_face_mm)
     body = settings.body(scene.d_mm, scene.depth_ratio, seat=scene.seat)
     surface = replace(settings, head=widest).surface(body)
     return [compare(scene, settings=replace(settings, head=head), surface=surface) for head in heads]
 
 
-def table_distance(found: Sequence[Agreement]) -> float:
+def table_distance(agreements: Sequence[Agreement]) -> float:
     """Root mean square difference from the printed cells of Tables 1 and 2, in percentage points."""
     gaps = []
-    for one in found:
-        column = TABLE_DIAMETERS_MM.index(one.scene.d_mm)
-        gaps.append(100 * one.centred_frame - PRINTED_FRAMES[one.scene.depth_ratio][column])
-        gaps.append(100 * one.map - PRINTED_MAPS[one.scene.depth_ratio][column])
+    for agreement in agreements:
+        column = TABLE_DIAMETERS_MM.index(agreement.scene.d_mm)
+        gaps.append(100 * agreement.centred_frame - PRINTED_FRAMES[agreement.scene.depth_ratio][column])
+        gaps.append(100 * agreement.map - PRINTED_MAPS[agreement.scene.depth_ratio][column])
     return float(np.sqrt(np.mean(np.square(gaps))))
 
 
@@ -181,9 +185,9 @@ LEAST_TAXELS = 4
 class MeasuredFrame(Record, eq=False):
     """One frame along the centre line of the head."""
 
-    x_c_mm: float  #: Where the head's centre stands, from the lump's axis.
-    s_mm: FloatArray  #: (n,) array: Taxel positions from the head's centre.
-    pressure_kpa: FloatArray  #: (n,) array: What the taxels read.
+    x_c_mm: float  #: Position of the head's centre from the lump's axis.
+    s_mm: FloatArray  #: (n,) array: Positions of the taxels from the head's centre.
+    pressure_kpa: FloatArray  #: (n,) array: Pressures of the taxels.
 
     def __post_init__(self) -> None:
         if len(self.s_mm) < LEAST_TAXELS or not self.pressure_kpa.mean() > 0:
@@ -195,9 +199,9 @@ class MeasuredFrame(Record, eq=False):
 
 
 class FrameAgreement(Record, eq=False):
-    """A measured frame and both models at its place and mean pressure."""
+    """A measured frame and both models at its position and mean pressure."""
 
-    measured: MeasuredFrame  #: As given.
+    measured: MeasuredFrame
     elastic_kpa: FloatArray
     empirical_kpa: FloatArray
     """`elastic_kpa`, `empirical_kpa` (n,) arrays: The models at the same taxels."""
@@ -205,17 +209,19 @@ class FrameAgreement(Record, eq=False):
     @property
     def differences(self) -> tuple[float, float]:
         """Mean squared differences from the elastic and the empirical model, as shares of their sums of squares."""
-        seen = self.measured.pressure_kpa
-        return mean_squared_difference(seen, self.elastic_kpa), mean_squared_difference(seen, self.empirical_kpa)
+        measured = self.measured.pressure_kpa
+        return mean_squared_difference(measured, self.elastic_kpa), mean_squared_difference(
+            measured, self.empirical_kpa
+        )
 
 
 def compare_frames(
     frames: Sequence[MeasuredFrame], d_mm: float, depth_ratio: float, *, seat: float, settings: StudySettings
 ) -> list[FrameAgreement]:
-    """Both models of a hard lump at the places and mean pressures of measured frames.
+    """Compare both models of a hard lump with measured frames, at their positions and mean pressures.
 
-    The empirical model is fitted at the settings' mean pressure and scaled with the frame's. A taxel outside the head,
-    or a head beyond the study's positions, is an error.
+    The empirical model is fitted at the settings' mean pressure and scaled to the frame's. `BadDataError` for a taxel
+    outside the head, or a head beyond the study's positions.
     """
     half, most = settings.head.half_width_mm, max(abs(end) for end in settings.positions_mm[:2])
     for frame in frames:
@@ -230,35 +236,34 @@ def compare_frames(
     places = np.array([frame.x_c_mm for frame in frames])
     means = np.array([frame.pressure_kpa.mean() for frame in frames])
     solved = plane.press(surface, HARD_RATIO, places, head=head, mean_kpa=means).as_taxels(presets.HEAD_PITCH_MM)
-    found = []
+    agreements = []
     for frame, elastic, mean in zip(frames, solved.pressure_kpa, means, strict=True):
         empirical = mean / nominal * model.surface_pressure(frame.s_mm, np.full(len(frame.s_mm), frame.x_c_mm))
-        found.append(FrameAgreement(frame, np.interp(frame.s_mm, solved.s_mm, elastic), empirical))
-    return found
+        agreements.append(FrameAgreement(frame, np.interp(frame.s_mm, solved.s_mm, elastic), empirical))
+    return agreements
 
 
 # --- A scan against a forward model of a scene: the same poses and mean pressures, frame by frame and as maps.
 #
-# Section 2.3 of the paper compares rubber models with its forward models so: frames within 15 %, maps within 2.6 %. It
-# does not define its mean squared difference; here it is the sum of squared differences over the sum of squares of the
-# model (docs/decisions/0007).
+# Section 2.3 of the paper compares rubber models with its forward models in this way: frames within 15 %, maps within
+# 2.6 %. Mean squared differences are defined as above (docs/decisions/0007).
 
 NEAR_MM = 40.0  #: Maps are compared within this distance of the lump.
-# Readings of a model travel as whole numbers, this many a kPa: up to the 34 kPa at which a taxel saturates.
+# A model's readings are stored as whole numbers, in counts per kPa: up to the 34 kPa at which a taxel saturates.
 _COUNTS_PER_KPA = 1900.0
 
 
 class MeasuredScan(Record, eq=False):
     """The frames of a scan that are compared."""
 
-    scan: Scan  #: These frames alone, at one pose a frame as before.
+    scan: Scan  #: The scan with these frames only.
     pressure_kpa: FloatArray  #: (n, rows, columns) array: NaN for taxels that are left out.
     rotation: FloatArray
     origin_mm: FloatArray
-    """`rotation`, `origin_mm` (n, 3, 3), (n, 3) arrays: Of the head in the map's plane."""
+    """`rotation`, `origin_mm` (n, 3, 3), (n, 3) arrays: Poses of the head in the map's plane."""
     level_kpa: FloatArray  #: (n,) array: Mean over the valid taxels.
-    tactile_map: TactileMap  #: Of these frames.
-    place_mm: tuple[float, float]  #: The lump on the map: where the scene's first lump is put.
+    tactile_map: TactileMap  #: Map of these frames.
+    place_mm: tuple[float, float]  #: Position of the lump on the map; the scene's first lump is put there.
     lump: BumpFit | None  #: The bump of Eq 7 there; None where none was fitted.
 
     @property
@@ -268,7 +273,7 @@ class MeasuredScan(Record, eq=False):
 
 
 class ModelComparison(Record, eq=False):
-    """How far one model is from the measured frames and map."""
+    """Difference of one model from the measured frames and map."""
 
     fidelity: str  #: Which of `forward.simulate.FIDELITIES`.
     pressure_kpa: FloatArray  #: (n, rows, columns) array: The model's frames.
@@ -285,80 +290,83 @@ def measured_frames(
     latency_ms: float = 0.0,
     place_mm: tuple[float, float] | None = None,
 ) -> MeasuredScan:
-    """Every n-th frame of a scan that a map takes, their poses in its plane, and the place of the lump.
+    """Every n-th of the frames that a map uses, their poses in its plane, and the position of the lump.
 
-    Settings are as in `mapping.build.build_map`; without a place it is the highest bump that can be a lump.
+    Settings are as in `mapping.build.build_map`. Without `place_mm` the lump is the highest bump that can be one.
     """
     selected = select_frames(scan, pressure_window_kpa=pressure_window_kpa, latency_ms=latency_ms)
     used = np.flatnonzero(selected.used)[::every]
     part = replace(scan, frames=PressureFrames(scan.frames.time_s[used], scan.frames.counts[used]))
-    made = build_map(
+    tactile_map = build_map(
         part, cell_mm=cell_mm, pressure_window_kpa=pressure_window_kpa, latency_ms=latency_ms, normalise="mean"
     )
-    assert made.plane_from_base is not None
-    tracker_from_head, turn = inverse(scan.head.scanhead_from_tracker), made.plane_from_base[:3, :3]
+    assert tactile_map.plane_from_base is not None
+    tracker_from_head, plane_rotation = inverse(scan.head.scanhead_from_tracker), tactile_map.plane_from_base[:3, :3]
     on_base = selected.poses.rotation[used]
     origin = selected.poses.position_mm[used] + on_base @ tracker_from_head[:3, 3]
-    origin, rotation = origin @ turn.T + made.plane_from_base[:3, 3], turn @ on_base @ tracker_from_head[:3, :3]
+    origin, rotation = (
+        origin @ plane_rotation.T + tactile_map.plane_from_base[:3, 3],
+        plane_rotation @ on_base @ tracker_from_head[:3, :3],
+    )
     pressure = scan.element_calibration.to_kpa(scan.frames.counts[used])
     pressure[:, ~selected.good_taxels] = np.nan
-    lump = _bump(made, place_mm)
+    lump = _bump(tactile_map, place_mm)
     if place_mm is None:
         if lump is None:
             raise BadDataError("no lump is found on the scan's map", way_out="say where it is: --at X Y")
         place_mm = float(lump.theta[1]), float(lump.theta[2])
-    return MeasuredScan(part, pressure, rotation, origin, selected.level_kpa[used], made, place_mm, lump)
+    return MeasuredScan(part, pressure, rotation, origin, selected.level_kpa[used], tactile_map, place_mm, lump)
 
 
 def compare_model(
     measured: MeasuredScan, scene: Scene, *, fidelity: str, head: str | None = None, progress: Progress = no_progress
 ) -> ModelComparison:
-    """One model of a scene, with its first lump put where the measured one is, against measured frames.
+    """Compare measured frames with one model of a scene, whose first lump is put where the measured one is.
 
-    Figures are differences as shares of the model's sum of squares: of frames, the mean over them of all taxels, along
-    the head's centre line, and of the latter in frames within 12 mm of the lump (``frames_...``); of the map within 40
-    mm of the lump, of its centre line across the lump, and relative to map - 1 (``map_...``). Further the root mean
-    square difference of a taxel (``rms_kpa``), the bumps on the model's map, and the residual map's slope.
+    Figures are differences as shares of the model's sum of squares. ``frames_...``: the mean over the frames, of all
+    taxels, along the head's centre line, and along it in frames within 12 mm of the lump. ``map_...``: of the map
+    within 40 mm of the lump, along its centre line across the lump, and relative to map - 1. Besides these the root
+    mean square difference of a taxel (``rms_kpa``), the bumps on the model's map, and the residual map's slope.
     """
     _check_array(measured.scan, scene)
     lump = scene.solid_lumps[0] if scene.solid_lumps else scene.lumps[0] if scene.lumps else None
-    at = measured.place_mm if lump is None else (lump.x_mm, lump.y_mm)
+    lump_mm = measured.place_mm if lump is None else (lump.x_mm, lump.y_mm)
     origin = measured.origin_mm.copy()
-    origin[:, :2] += np.subtract(at, measured.place_mm)
+    origin[:, :2] += np.subtract(lump_mm, measured.place_mm)
     pressure = felt_at_poses(
         scene, measured.rotation, origin, mean_kpa=measured.level_kpa, fidelity=fidelity, head=head, progress=progress
     )
-    made = _model_map(measured, pressure)
-    model, seen = pressure.reshape(len(pressure), -1), measured.pressure_kpa.reshape(len(pressure), -1)
-    line, line_seen = centre_line(pressure), centre_line(measured.pressure_kpa)
+    model_map = _model_map(measured, pressure)
+    model_taxels, taxels = pressure.reshape(len(pressure), -1), measured.pressure_kpa.reshape(len(pressure), -1)
+    model_line, measured_line = centre_line(pressure), centre_line(measured.pressure_kpa)
     near = np.hypot(*(measured.origin_mm[:, :2] - measured.place_mm).T) <= 12.0
-    frames = _shares(line_seen, line)
-    cells = _map_cells(measured, made)
-    ours, theirs = measured.tactile_map.mean[cells], made.mean[cells]
+    frames = _shares(measured_line, model_line)
+    cells = _map_cells(measured, model_map)
+    ours, theirs = measured.tactile_map.mean[cells], model_map.mean[cells]
     row = cells & _centre_row(measured)[:, None]
     figures = {
-        "frames_all": np.mean(_shares(seen, model)),
+        "frames_all": np.mean(_shares(taxels, model_taxels)),
         "frames_centre": np.mean(frames),
         "frames_near": np.mean(frames[near]) if near.any() else np.nan,
         "map_all": mean_squared_difference(ours, theirs),
-        "map_centre": mean_squared_difference(measured.tactile_map.mean[row], made.mean[row]),
+        "map_centre": mean_squared_difference(measured.tactile_map.mean[row], model_map.mean[row]),
         "map_strict": np.sum((ours - theirs) ** 2) / np.sum((theirs - 1.0) ** 2),
-        "rms_kpa": np.sqrt(np.nanmean((seen - model) ** 2)),
-        **_bumps(measured, made, _bump(made, measured.place_mm)),
-        **residual_slope(measured, made),
+        "rms_kpa": np.sqrt(np.nanmean((taxels - model_taxels) ** 2)),
+        **_bumps(measured, model_map, _bump(model_map, measured.place_mm)),
+        **residual_slope(measured, model_map),
     }
-    return ModelComparison(fidelity, pressure, made, {name: float(value) for name, value in figures.items()})
+    return ModelComparison(fidelity, pressure, model_map, {name: float(value) for name, value in figures.items()})
 
 
 def _bumps(measured: MeasuredScan, tactile_map: TactileMap, lump: BumpFit | None) -> dict[str, float]:
-    """Eq 7 of a map, NaN where no bump was fitted, and Eq 5 of its centre line."""
+    """Parameters of Eq 7 on a map, NaN where no bump was fitted, and of Eq 5 on its centre line."""
     theta, widths = ((np.nan,), (np.nan,) * 3) if lump is None else (lump.theta, lump.widths())
-    found = dict(zip(("amplitude", "sigma_x_mm", "sigma_y_mm"), (float(theta[0]), *widths[:2]), strict=True))
-    return found | dict(zip(("line_amplitude", "line_sigma_mm"), line_bump(measured, tactile_map), strict=True))
+    figures = dict(zip(("amplitude", "sigma_x_mm", "sigma_y_mm"), (float(theta[0]), *widths[:2]), strict=True))
+    return figures | dict(zip(("line_amplitude", "line_sigma_mm"), line_bump(measured, tactile_map), strict=True))
 
 
 def centre_row(measured: MeasuredScan, tactile_map: TactileMap) -> tuple[FloatArray, FloatArray]:
-    """Places from the lump (k,) and the map there (k,), along the rows of cells within 1.5 mm of its centre."""
+    """Distances from the lump (k,) and the map there (k,), along the rows of cells within 1.5 mm of its centre."""
     rows = tactile_map.mean[_centre_row(measured)]
     read = np.isfinite(rows).any(axis=0)
     return tactile_map.x_mm[read] - measured.place_mm[0], np.asarray(np.nanmean(rows[:, read], axis=0))
@@ -373,26 +381,30 @@ def line_bump(measured: MeasuredScan, tactile_map: TactileMap) -> tuple[float, f
         return plane.lump_pressure(x[near], height_kpa=1.0, width_mm=float(np.exp(log_width)))
 
     ends = np.log([0.5 * tactile_map.recipe.cell_mm, presets.FIT_RADIUS_MM])
-    found = plane.fit_shape(bump, mean[near] - 1.0, grid=np.linspace(ends[0], ends[1], 60))
-    return found.height, float(np.exp(found.parameter))
+    fit = plane.fit_shape(bump, mean[near] - 1.0, grid=np.linspace(ends[0], ends[1], 60))
+    return fit.height, float(np.exp(fit.parameter))
 
 
-def residual_slope(measured: MeasuredScan, made: TactileMap) -> dict[str, float]:
-    """Slope of what a model's map leaves of the measured one along x and y, and the root mean square beside it.
+def residual_slope(measured: MeasuredScan, model_map: TactileMap) -> dict[str, float]:
+    """Slope along x and y of the measured map less the model's, and the root mean square residual beside it.
 
     A slope is a tilt of the real head against the modelled one: the map's plane is not quite that of the skin.
     """
-    cells = _map_cells(measured, made)
+    cells = _map_cells(measured, model_map)
     y, x = np.nonzero(cells)
-    design = np.stack([np.ones(len(x)), made.x_mm[x] / 10.0, made.y_mm[y] / 10.0], axis=1)
-    residual = (measured.tactile_map.mean - made.mean)[cells]
-    found = np.linalg.lstsq(design, residual, rcond=None)[0]
-    beside = float(np.sqrt(np.mean((residual - design @ found) ** 2)))
-    return {"slope_x_per_10mm": float(found[1]), "slope_y_per_10mm": float(found[2]), "rms_beside_slope": beside}
+    design = np.stack([np.ones(len(x)), model_map.x_mm[x] / 10.0, model_map.y_mm[y] / 10.0], axis=1)
+    residual = (measured.tactile_map.mean - model_map.mean)[cells]
+    coefficients = np.linalg.lstsq(design, residual, rcond=None)[0]
+    rms = float(np.sqrt(np.mean((residual - design @ coefficients) ** 2)))
+    return {
+        "slope_x_per_10mm": float(coefficients[1]),
+        "slope_y_per_10mm": float(coefficients[2]),
+        "rms_beside_slope": rms,
+    }
 
 
 def _model_map(measured: MeasuredScan, pressure_kpa: FloatArray) -> TactileMap:
-    """The map of the model's frames by the road of the measured ones; taxels left out there are left out here."""
+    """Build the map of the model's frames as that of the measured ones, without the same taxels."""
     counts = np.clip(np.rint(pressure_kpa * _COUNTS_PER_KPA), 0, np.iinfo(np.uint16).max - 1).astype(np.uint16)
     bad = np.isnan(measured.pressure_kpa).all(axis=0)
     gain = np.where(bad, 0.0, 1.0 / _COUNTS_PER_KPA)
@@ -411,15 +423,18 @@ def _model_map(measured: MeasuredScan, pressure_kpa: FloatArray) -> TactileMap:
     )
 
 
-def _map_cells(measured: MeasuredScan, made: TactileMap) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+def _map_cells(measured: MeasuredScan, model_map: TactileMap) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     """(ny, nx) cells within `NEAR_MM` of the lump that both maps cover."""
-    mine = measured.tactile_map
-    if mine.mean.shape != made.mean.shape or not np.allclose(mine.x_mm, made.x_mm):
+    measured_map = measured.tactile_map
+    if measured_map.mean.shape != model_map.mean.shape or not np.allclose(measured_map.x_mm, model_map.x_mm):
         raise BadDataError(
-            f"the maps have {mine.mean.shape} and {made.mean.shape} cells", way_out="some frames of the model are bad"
+            f"the maps have {measured_map.mean.shape} and {model_map.mean.shape} cells",
+            way_out="some frames of the model are bad",
         )
-    far = np.hypot(mine.x_mm[None, :] - measured.place_mm[0], mine.y_mm[:, None] - measured.place_mm[1])
-    return np.asarray(mine.covered & made.covered & (far <= NEAR_MM))
+    distance_mm = np.hypot(
+        measured_map.x_mm[None, :] - measured.place_mm[0], measured_map.y_mm[:, None] - measured.place_mm[1]
+    )
+    return np.asarray(measured_map.covered & model_map.covered & (distance_mm <= NEAR_MM))
 
 
 def _centre_row(measured: MeasuredScan) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
@@ -427,26 +442,29 @@ def _centre_row(measured: MeasuredScan) -> np.ndarray[tuple[int, ...], np.dtype[
     return np.asarray(np.abs(measured.tactile_map.y_mm - measured.place_mm[1]) <= max(1.5, 0.51 * cell))
 
 
-def _shares(seen: FloatArray, model: FloatArray) -> FloatArray:
+def _shares(measured: FloatArray, model: FloatArray) -> FloatArray:
     """(n,) difference of each frame as a share of the model's sum of squares, over the taxels that are valid."""
-    valid = np.isfinite(seen)
-    gap = np.where(valid, seen - model, 0.0)
+    valid = np.isfinite(measured)
+    gap = np.where(valid, measured - model, 0.0)
     return np.asarray((gap**2).sum(axis=1) / (np.where(valid, model, 0.0) ** 2).sum(axis=1))
 
 
-def _bump(made: TactileMap, place_mm: tuple[float, float] | None) -> BumpFit | None:
+def _bump(tactile_map: TactileMap, place_mm: tuple[float, float] | None) -> BumpFit | None:
     """Eq 7 with a background of 1: at a place, or at the highest bump that can be a lump."""
     options = SamplerSettings()
     if place_mm is not None:
-        return fit_bump(made, place_mm, options=options)[0]
-    return next((one.fit for one in fitted_candidates(made, options) if one.fit is not None and not one.fault), None)
+        return fit_bump(tactile_map, place_mm, options=options)[0]
+    return next(
+        (one.fit for one in fitted_candidates(tactile_map, options) if one.fit is not None and not one.fault), None
+    )
 
 
 def _check_array(scan: Scan, scene: Scene) -> None:
-    wanted, given = scan.head.shape, (scene.head.rows, scene.head.columns)
-    if wanted != given or abs(scan.head.pitch_mm - scene.head.pitch_mm) > 1e-6:
+    scan_head, scene_head = scan.head, scene.head
+    scan_shape, scene_shape = scan_head.shape, (scene_head.rows, scene_head.columns)
+    if scan_shape != scene_shape or abs(scan_head.pitch_mm - scene_head.pitch_mm) > 1e-6:
         raise BadDataError(
-            f"the scene's head has {given[0]} x {given[1]} taxels {scene.head.pitch_mm:g} mm apart, the scan's "
-            f"{wanted[0]} x {wanted[1]} taxels {scan.head.pitch_mm:g} mm apart",
+            f"the scene's head has {scene_shape[0]} x {scene_shape[1]} taxels {scene_head.pitch_mm:g} mm apart, "
+            f"the scan's {scan_shape[0]} x {scan_shape[1]} taxels {scan_head.pitch_mm:g} mm apart",
             way_out="give the scan's head in [head] of the scene",
         )

@@ -1,4 +1,4 @@
-"""The paper's forward study on a line, and the head that presses most evenly."""
+"""The paper's forward study on a line, lookalike frames, and the head that presses most evenly."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PAPER_DIAMETERS_MM = (5.0, 10.0, 15.0, 20.0, 25.0)
 PAPER_DEPTH_RATIOS = (0.6, 0.8, 1.0, 1.2, 1.5, 2.0)
 PAPER_STIFFNESS_RATIOS = (2.0, 5.0, 8.0, 10.0, 100.0)
 FIT_RADIUS_MM = 48.0
-# A bump lower than this share of the background is not called detectable, nor one whose width is not resolved.
+# A bump is detectable if it is at least this share of the background high and its width is resolved.
 DETECTABLE = 0.02
 HARD_RATIO = 100.0
 _NO_CHANGE_MM = 1e6  #: The line is a map that does not change in y: a bump of this width there.
@@ -48,10 +48,10 @@ class CaseSettings(CaseOptions, kw_only=True):
         return Body(d_mm, depth_ratio, seat, self.thickness_mm, self.fat_kpa, self.gland_ratio, self.poisson)
 
     def maps(self, body: Body) -> Callable[[float], Any]:
-        """From a stiffness ratio of the body's lump to its map; what all ratios share is computed here."""
+        """Function from the lump's stiffness ratio to its map; the part that all ratios share is computed here."""
         raise NotImplementedError
 
-    def fitted(self, made: Any) -> MapFit:
+    def fitted(self, tactile_map: Any) -> MapFit:
         """The Gaussian of a map."""
         raise NotImplementedError
 
@@ -60,21 +60,21 @@ class CaseSettings(CaseOptions, kw_only=True):
         raise NotImplementedError
 
     def rows(self, geometry: Geometry) -> list[StudyRow]:
-        """The rows of one geometry: the body is condensed once for all stiffnesses of its lump."""
+        """The rows of one geometry; the body is condensed once for all stiffnesses of its lump."""
         body = self.body(geometry.d_mm, geometry.depth_ratio, seat=geometry.seat)
         case = seat_name(geometry.seat), geometry.d_mm, geometry.depth_ratio
         setting = body.layers.thickness_mm, self.head.radius_mm, self.head.shoulders
         maps, rows, recipe = self.maps(body), [], {"normalise": "mean", "noise": "independent", **self.recipe()}
         for ratio in geometry.stiffness_ratios:
-            found = self.fitted(maps(ratio))
-            a, (sigma_x, sigma_y) = found.amplitude, found.widths_mm
-            detectable = bool(a >= DETECTABLE and found.resolved)
-            rows.append(StudyRow(*case, ratio, a, sigma_x, found.rms, detectable, sigma_y, *setting, **recipe))
+            fit = self.fitted(maps(ratio))
+            a, (sigma_x, sigma_y) = fit.amplitude, fit.widths_mm
+            detectable = bool(a >= DETECTABLE and fit.resolved)
+            rows.append(StudyRow(*case, ratio, a, sigma_x, fit.rms, detectable, sigma_y, *setting, **recipe))
         return rows
 
 
 class StudySettings(CaseSettings, kw_only=True):
-    """Settings of a study: everything but its cases that the table depends on."""
+    """Settings of a study: all that its table depends on besides its cases."""
 
     head: Head = field(default_factory=Head)  #: Cross-section of the head.
     positions_mm: tuple[float, float, float] = plane.POSITIONS_MM
@@ -89,8 +89,8 @@ class StudySettings(CaseSettings, kw_only=True):
         surface = self.surface(body)
         return lambda ratio: plane.build_line(self.frames(surface, ratio))
 
-    def fitted(self, made: plane.TactileLine) -> MapFit:
-        return fit_line(made, self.fit_radius_mm)
+    def fitted(self, line: plane.TactileLine) -> MapFit:
+        return fit_line(line, self.fit_radius_mm)
 
     def surface(self, body: Body) -> plane.SurfaceCompliance:
         """The body condensed onto the surface that the head travels over."""
@@ -117,10 +117,10 @@ class StudySettings(CaseSettings, kw_only=True):
         return plane.press_layers(layers, head=self.head, mean_kpa=self.mean_kpa, cell_mm=self.cell_mm)
 
     def empirical(self, d_mm: float, layers: Layers, over: plane.LineFrames) -> plane.EmpiricalModel:
-        """The empirical model, fitted to what taxels see far from a lump and `over` it."""
-        seen, far = over.as_taxels(HEAD_PITCH_MM), self.far(layers).as_taxels(HEAD_PITCH_MM)
+        """The empirical model, fitted to the taxels' frames far from a lump and `over` it."""
+        taxels, far = over.as_taxels(HEAD_PITCH_MM), self.far(layers).as_taxels(HEAD_PITCH_MM)
         half_width = self.head.half_width_mm
-        return plane.fit_empirical(seen.s_mm, far.at(0.0), seen.at(0.0), d_mm=d_mm, half_width_mm=half_width)
+        return plane.fit_empirical(taxels.s_mm, far.at(0.0), taxels.at(0.0), d_mm=d_mm, half_width_mm=half_width)
 
 
 class Geometry(Record):
@@ -143,14 +143,14 @@ class MapFit(Record):
 
     amplitude: float  #: a: height above the level, in units of the map.
     widths_mm: tuple[float, float | None]  #: Sigma across and along the head; a line has no width along it.
-    rms: float  #: Root mean square of what the Gaussian leaves, in units of the background.
-    resolved: bool = True  #: True when the widths are ones that array and window can tell, and not at an end of them.
+    rms: float  #: Root mean square residual, in units of the background.
+    resolved: bool = True  #: True if array and window resolve the widths, and none is at an end of its range.
 
 
 def fit_line(line: plane.TactileLine, radius_mm: float) -> MapFit:
     """Fit Eq 5 with background 1 and the bump on the lump's axis, averaged over cells as for a patient's map.
 
-    Only widths from half a cell to three quarters of the radius count, also as for a patient's map. A bump that runs to
+    Widths range from half a cell to three quarters of the radius, also as for a patient's map; a bump that runs to
     either end is reported there.
     """
     inside = (np.abs(line.x_mm) <= radius_mm) & (line.count > 0)
@@ -161,10 +161,10 @@ def fit_line(line: plane.TactileLine, radius_mm: float) -> MapFit:
         return cell_mean_gaussian(x, np.zeros_like(x), covariance_mm2=covariance, cell_mm=line.cell_mm)
 
     ends = np.log([LEAST_WIDTH_IN_CELLS * line.cell_mm, WIDEST_IN_RADII * radius_mm])
-    found = plane.fit_shape(bump, excess, grid=np.linspace(ends[0], ends[1], 60))
-    resolved = bool(ends[0] + 1e-6 < found.parameter < ends[1] - 1e-6)
-    width = float(np.exp(found.parameter))
-    return MapFit(found.height, (width, None), float(np.sqrt(found.sse / len(x))), resolved)
+    fit = plane.fit_shape(bump, excess, grid=np.linspace(ends[0], ends[1], 60))
+    resolved = bool(ends[0] + 1e-6 < fit.parameter < ends[1] - 1e-6)
+    width = float(np.exp(fit.parameter))
+    return MapFit(fit.height, (width, None), float(np.sqrt(fit.sse / len(x))), resolved)
 
 
 class StudyRow(Record):
@@ -207,18 +207,18 @@ def paper_grid(seat: float) -> list[Geometry]:
 
 
 def group_cases(cases: Iterable[tuple[float, float, float, float]]) -> list[Geometry]:
-    """Geometries of cases (seat, d_mm, depth_ratio, stiffness_ratio), in the order in which they first appear; a case
-    that appears twice is an error."""
+    """Group cases (seat, d_mm, depth_ratio, stiffness_ratio) into geometries, in the order in which these first appear;
+    `BadDataError` if a case appears twice."""
     ratios: dict[tuple[float, float, float], list[float]] = {}
     for seat, d, h, ratio in cases:
-        known = ratios.setdefault((seat, d, h), [])
-        if ratio in known:
+        listed = ratios.setdefault((seat, d, h), [])
+        if ratio in listed:
             raise BadDataError(
                 f"the case seat {seat_name(seat)}, d {d:g} mm, h/d {h:g}, E2/E1 {ratio:g} appears twice",
                 way_out="keep it once",
             )
-        known.append(ratio)
-    return [Geometry(*geometry, tuple(found)) for geometry, found in ratios.items()]
+        listed.append(ratio)
+    return [Geometry(*geometry, tuple(listed)) for geometry, listed in ratios.items()]
 
 
 class PrintedEq6(Record):
@@ -228,7 +228,7 @@ class PrintedEq6(Record):
     b_mm: float  #: `m`, `b_mm`: Line of d on sigma at one diameter depth.
     e: float
     f: float  #: `e`, `f`: Power law of the width change on the amplitude.
-    cases: int  #: Hard, detectable cases that e and f were learned from.
+    cases: int  #: Number of hard, detectable cases that e and f were learned from.
 
 
 def hard_cases(rows: Sequence[StudyRow]) -> list[StudyRow]:
@@ -264,7 +264,7 @@ def stiffness_changes(rows: Sequence[StudyRow], *, least_ratio: float = 8.0) -> 
 
 
 def learn_as_printed(rows: Sequence[StudyRow], *, axis: str = "x") -> PrintedEq6 | None:
-    """Eq 6 in two stages from the hard, detectable cases of one seat; None where they are too few.
+    """Learn Eq 6 in two stages from the hard, detectable cases of one seat; None where they are too few.
 
     Figure 8: least squares of d on sigma at h/d = 1, and of ln Delta sigma on ln a over all depths. The sigma is along
     the head's `axis`, ``"x"`` across it.
@@ -281,22 +281,22 @@ def learn_as_printed(rows: Sequence[StudyRow], *, axis: str = "x") -> PrintedEq6
     return PrintedEq6(float(m), float(b), float(np.exp(log_e)), float(f), int(known.sum()))
 
 
-# --- Lumps of different size whose frames look alike (Fig 5b of the paper), sought over sizes and depths.
+# --- Lumps of different size whose frames look alike (Fig 5b of the paper), searched over sizes and depths.
 #
 # The paper says that some combinations of size and depth lead to identical pressure distributions over the lump.
-# How alike two frames are is measured against what the lump itself adds: frames of two faint lumps are alike
-# because both are those of no lump.
+# The difference of two frames is taken relative to the pressure that the lump adds: frames of two faint lumps are
+# alike because both are those of no lump.
 
 DEPTH_RATIOS = (0.6, 0.7, 0.8, 0.9, 1.0, 1.2, 1.5)
 LEAST_RISE = 0.1
 """A lump takes part when it raises the middle of the head by this share of the frame's mean: five times the noise."""
 LEAST_SIZE_RATIO = 1.5  #: Of the larger lump's diameter to the smaller one's.
 ALIKE = 0.05  #: Frames that differ by less than this share of what the lump adds are called indistinguishable.
-_STEP = 0.01  #: Of the depths in diameters that are tried by interpolation between those solved.
+_STEP = 0.01  #: Step of the depths, in diameters, that are interpolated between those solved.
 
 
 def centre_line(values: FloatArray) -> FloatArray:
-    """Mean over the two middle ones of (..., n) taxels: of frames (m, rows, columns) what is along the centre line."""
+    """Mean of the two middle ones of (..., n) taxels: the centre line of frames (m, rows, columns)."""
     half = values.shape[-1] // 2
     return np.asarray(values[..., half - 1 : half + 1].mean(axis=-1))
 
@@ -344,12 +344,11 @@ def find_lookalikes(
     diameters_mm: Sequence[float] = PAPER_DIAMETERS_MM,
     depth_ratios: Sequence[float] = DEPTH_RATIOS,
 ) -> Lookalikes | None:
-    """The pair of visible hard lumps whose frames are most alike though one's diameter is `LEAST_SIZE_RATIO` times the
-    other's; None where no two are visible.
+    """The two visible hard lumps with the most alike frames among those whose diameters differ by a factor of
+    `LEAST_SIZE_RATIO` or more; None where no two are visible.
 
-    Diameters and depths rise; depths between the first and the last are tried in steps of 0.01. Frames are interpolated
-    between the depths solved (cubic splines in h/d); the best depth of the larger lump of the best pair is then sought
-    with the model itself.
+    `diameters_mm` and `depth_ratios` must rise. Frames are interpolated in steps of 0.01 between the depths solved
+    (cubic splines in h/d); the depth of the larger lump of the best pair is then refined with the model itself.
     """
     coarse = replace(settings, fineness=1)
     tried = np.round(np.arange(depth_ratios[0], depth_ratios[-1] + 1e-9, _STEP), 6)
@@ -377,8 +376,8 @@ def find_lookalikes(
         return Lookalikes(small, centred_frame(d_mm, depth_ratio, settings=settings, seat=seat))
 
     ends = max(depth - 2 * _STEP, depth_ratios[0]), min(depth + 2 * _STEP, depth_ratios[-1])
-    found = minimize_scalar(lambda h: pair(h).difference, bounds=ends, method="bounded", options={"xatol": 1e-3})
-    return pair(float(found.x))
+    best = minimize_scalar(lambda h: pair(h).difference, bounds=ends, method="bounded", options={"xatol": 1e-3})
+    return pair(float(best.x))
 
 
 def _rms(values: FloatArray) -> float:
@@ -387,9 +386,9 @@ def _rms(values: FloatArray) -> float:
 
 # --- The homogeneous-pressure condition of section 2.1: how evenly a head presses on tissue without layers or lump.
 #
-# The paper's finite elements find the pressure across its indentor within 7.5 % of the mean, for moduli of 15-25
-# kPa under mean pressures of 5-14 kPa, and say neither the radius of the head nor the thickness of the tissue. The
-# model is linear, so that only the ratio of mean pressure to modulus matters.
+# In the paper's finite elements the pressure across the indentor lies within 7.5 % of the mean, for moduli of 15-25
+# kPa under mean pressures of 5-14 kPa; the paper gives neither the radius of the head nor the thickness of the tissue.
+# The model is linear, so that only the ratio of mean pressure to modulus matters.
 
 RADII_MM = (13.0, 16.0, 20.0, 25.0, 30.0, 35.0, 45.0, 60.0, 70.0, 80.0, 100.0, 150.0, 300.0, np.inf)
 SHOULDERS_MM = (0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0, 12.0, 15.0, 20.0)
@@ -470,8 +469,8 @@ def search_heads(
     radii_mm: Sequence[float] = RADII_MM,
     shoulders_mm: Sequence[float] = SHOULDERS_MM,
 ) -> list[Uniformity]:
-    """Uniformity of every head of a grid of places (`presets.HEADS`) and radii of arc and shoulders; sections that
-    cannot be are left out."""
+    """Uniformity of every head on a grid of shoulder positions (`presets.HEADS`) and radii of arc and shoulders;
+    impossible sections are left out."""
     sections = [
         Head(radius_mm=radius, shoulder_mm=shoulder, shoulders=kind)
         for kind in kinds
@@ -482,17 +481,17 @@ def search_heads(
     return [uniformity(section, tissue) for section in sections]
 
 
-def most_even(found: Sequence[Uniformity]) -> Uniformity:
-    """The head with the least of the largest departures."""
-    return min(found, key=lambda one: one.worst)
+def most_even(heads: Sequence[Uniformity]) -> Uniformity:
+    """The head whose largest departure is smallest."""
+    return min(heads, key=lambda head: head.worst)
 
 
-def narrowest(found: Sequence[Uniformity], *, limit: float, by_rms: bool = False) -> Uniformity | None:
+def narrowest(heads: Sequence[Uniformity], *, limit: float, by_rms: bool = False) -> Uniformity | None:
     """The head with the narrowest face, and of those the most even, whose largest departure as a share of the mean is
     within `limit`; None without any.
 
-    `by_rms` holds the root mean square departure to it: another reading of the paper's "variation".
+    `by_rms` limits the root mean square departure instead: another reading of the paper's "variation".
     """
-    departure = {id(one): one.worst_rms if by_rms else one.worst for one in found}
-    within = [one for one in found if departure[id(one)] <= limit]
-    return min(within, key=lambda one: (round(one.face_mm, 6), departure[id(one)]), default=None)
+    departure = {id(head): head.worst_rms if by_rms else head.worst for head in heads}
+    within = [head for head in heads if departure[id(head)] <= limit]
+    return min(within, key=lambda head: (round(head.face_mm, 6), departure[id(head)]), default=None)

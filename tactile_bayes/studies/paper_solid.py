@@ -1,4 +1,4 @@
-"""The forward study in the solid."""
+"""The forward study in three dimensions: frames over a ball, their maps, and the Gaussian of each map."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ from tactile_bayes.studies.paper import HARD_RATIO, CaseSettings, MapFit, centre
 
 # --- Maps of a study's raster of frames, built and fitted like a patient's.
 
-# Readings travel as whole numbers: this many a unit of the frame's mean, so that 30 times the mean still fits.
+# Readings are stored as whole numbers, in counts per mean of the frame: 30 times the mean still fits.
 _COUNTS: Final = 2048
-_WINDOW: Final = (0.5, 2.0)  #: Where the rest of the program would leave out frames by their mean, which here is 1.
-# A narrower bump than this share of the taxels' pitch is one that the pitch does not resolve.
+_WINDOW: Final = (0.5, 2.0)  #: Pressure window of the map; every frame's mean is 1 here, so that none is left out.
+# The pitch does not resolve a bump that is narrower than this share of it.
 _LEAST_WIDTH_IN_PITCHES: Final = 0.8
-_TRIED: Final = 14  #: Widths that are tried before the best pair of them is refined, along each axis.
+_WIDTHS_ON_GRID: Final = 14  #: Widths along each axis of the grid whose best pair is refined.
 
 
 def raster_map(frames: RasterFrames) -> TactileMap:
     """Build the map of a raster with cells of half a pitch, so that every reading lies in the middle of one.
 
     Poses are level and in the body's frame, readings are over the frame's mean. Where the raster has a plain frame, the
-    head's own response is taken off as `map --flat-field` takes off a patient's. There it is found from the scan's own
-    calm frames; here it is known.
+    frames are divided by the head's own response as by `map --flat-field`, which estimates it from the calm frames of a
+    patient's scan; here it is known.
     """
     count, head = len(frames.x_mm), frames.head
     time, shape = np.arange(float(count)) / 100.0, (head.rows, head.columns)
@@ -68,35 +68,35 @@ def _readings(pressure_kpa: FloatArray) -> CountArray:
     return counts
 
 
-def fit_raster(made: TactileMap, settings: SolidSettings) -> MapFit:
+def fit_raster(tactile_map: TactileMap, settings: SolidSettings) -> MapFit:
     """Fit Eq 7 about the lump's axis with equal weights; the level is fitted or 1, by the settings.
 
-    All readings of a cell come from its middle, so the Gaussian is not averaged over it. A patient's readings are
-    spread over their cells and the Gaussian is averaged there; what remains in both is the average over a taxel.
+    All readings of a cell come from its middle, so the Gaussian is not averaged over the cell, as it is for a patient's
+    map, whose readings are spread over their cells. Both maps average over a taxel.
 
-    The lowest minimum between widths of half a taxel and three quarters of the radius is sought with the amplitude, and
-    a free level, eliminated, as in `paper.fit_line` (see `plane.fit_shape`).
+    The widths are searched for the lowest minimum between half a taxel and three quarters of the radius, with the
+    amplitude, and a free level, eliminated, as in `paper.fit_line` (see `plane.fit_shape`).
     """
     radius_mm, free = settings.fit_radius_mm, settings.background == "free"
-    cells = replace(window_cells(made, (0.0, 0.0), radius_mm=radius_mm), cell_mm=0.0)
+    cells = replace(window_cells(tactile_map, (0.0, 0.0), radius_mm=radius_mm), cell_mm=0.0)
     pitch = settings.head.pitch_mm
     ends = np.log([LEAST_WIDTH_IN_CELLS * pitch, WIDEST_IN_RADII * radius_mm])
 
-    def left(log_widths: FloatArray) -> float:
+    def misfit(log_widths: FloatArray) -> float:
         return _height(log_widths, cells, free=free)[1]
 
-    line = np.linspace(ends[0], ends[1], _TRIED)
-    start: FloatArray = min((np.array([x, y], dtype=np.float64) for x in line for y in line), key=left)
+    line = np.linspace(ends[0], ends[1], _WIDTHS_ON_GRID)
+    start: FloatArray = min((np.array([x, y], dtype=np.float64) for x in line for y in line), key=misfit)
     inwards = np.where(start > ends.mean(), -0.4, 0.4) * (line[1] - line[0])
     simplex = start + inwards * np.array([[0, 0], [1, 0], [0, 1]])
-    found = minimize(
-        left,
+    best = minimize(
+        misfit,
         start,
         method="Nelder-Mead",
         bounds=[(float(ends[0]), float(ends[1]))] * 2,
         options={"xatol": 1e-9, "fatol": np.inf, "maxiter": 400, "initial_simplex": simplex},
     )
-    log_widths = np.asarray(found.x, dtype=np.float64)
+    log_widths = np.asarray(best.x, dtype=np.float64)
     amplitude, sse = _height(log_widths, cells, free=free)
     narrow, wide = sorted(np.exp(log_widths))
     resolved = (
@@ -109,19 +109,19 @@ def fit_raster(made: TactileMap, settings: SolidSettings) -> MapFit:
 
 
 def _height(log_widths: FloatArray, cells: FitCells, *, free: bool) -> tuple[float, float]:
-    """Best amplitude of a bump of given widths on a level of 1 or a free one, and the remaining sum of squares."""
+    """Best amplitude of a bump of given widths on a level of 1 or a free one, and the residual sum of squares."""
     p, q = np.array([[0.5, 0.5], [0.5, -0.5]]) @ log_widths
     shape = Bump(background=1.0).unit_bump(np.array([[1.0, 0.0, 0.0, p, q]]), cells)[0]
     excess = cells.value - 1.0
     if free:
-        # what is left of both once a level is taken off
+        # residuals of both after a level is fitted
         shape, excess = shape - shape.mean(), excess - excess.mean()
     return fit_height(shape, excess)
 
 
 # --- The forward study in three dimensions: the frames over a ball, over sizes, depths, stiffnesses and seats.
 #
-# The head stands on a raster of places about the lump. By symmetry a quarter of them is solved and the rest
+# The head stands on a raster of positions about the lump. By symmetry a quarter of them is solved and the rest
 # mirrored.
 
 REACH_MM = 33.0
@@ -130,13 +130,13 @@ _LEVEL = np.eye(3)
 
 
 class SolidSettings(CaseSettings, kw_only=True):
-    """Settings of a solid study: everything but its cases that the table depends on."""
+    """Settings of a solid study: all that its table depends on besides its cases."""
 
     head: Head = field(default_factory=Head)  #: The array and the rim around it.
     reach_mm: float = REACH_MM
     lines_mm: tuple[float, ...] = LINES_MM
-    """`reach_mm`, `lines_mm`: The head stands at steps of the taxels' pitch out to `reach_mm` either side across it, on
-    lines at these distances either side along it, which must be whole steps."""
+    """`reach_mm`, `lines_mm`: Across itself the head stands at steps of the taxels' pitch out to `reach_mm` on either
+    side; along itself on lines at these distances on either side, which must be whole steps."""
     fit_radius_mm: float = FIT_RADIUS_MM  #: Eq 7 is fitted within this distance of the lump's axis.
     rank_tolerance: float = RANK_TOLERANCE  #: See `simulate.skin_perturbation`.
     mesh_reach_mm: float = MeshSize().reach_mm  #: Radius at which the mesh ends, on a rim that does not move.
@@ -154,8 +154,8 @@ class SolidSettings(CaseSettings, kw_only=True):
         head, condensed = self.on(body), self.condensed(body)
         return lambda ratio: raster_map(raster_frames(head, [self.placed(condensed, ratio)], self))
 
-    def fitted(self, made: TactileMap) -> MapFit:
-        return fit_raster(made, self)
+    def fitted(self, tactile_map: TactileMap) -> MapFit:
+        return fit_raster(tactile_map, self)
 
     def geometry(self, body: Body) -> LumpGeometry:
         """The ball in the body."""
@@ -201,26 +201,26 @@ class SolidSettings(CaseSettings, kw_only=True):
 
 
 class RasterFrames(Record, eq=False):
-    """Frames of a level head on a raster of places."""
+    """Frames of a level head on a raster of positions."""
 
     x_mm: FloatArray
     y_mm: FloatArray
     depth_mm: FloatArray
-    """`x_mm`, `y_mm`, `depth_mm` (n,) arrays: Where the apex of the head's face is, from the lump's axis and from the
-    undisturbed skin."""
+    """`x_mm`, `y_mm`, `depth_mm` (n,) arrays: Position of the apex of the head's face from the lump's axis, and its
+    depth below the undisturbed skin."""
     pressure_kpa: FloatArray  #: (n, rows, columns) array.
-    head: Head  #: The head that was pressed.
+    head: Head
     plain_kpa: FloatArray | None = None
-    """(rows, columns) array: The head's frame over the same body without the lump, where the map is to be divided by
+    """(rows, columns) array: The head's frame over the same body without the lump; None where the map is not divided by
     it."""
 
 
 def raster_frames(head: SolidHead, lumps: Sequence[SkinPerturbation], settings: SolidSettings) -> RasterFrames:
-    """Frames of the raster over lumps on its middle, or over the plain body.
+    """Frames of the raster over lumps at its middle, or over the plain body.
 
     The lump is symmetric about both axes of the level head, so the frame at (-x, y) is the one at (x, y) with its rows
-    turned about, and that at (x, -y) with its columns. The layers are alike everywhere, so one frame tells all that the
-    head reads without the lump.
+    reversed, and that at (x, -y) with its columns reversed. The layers are the same everywhere, so the head has one
+    frame without the lump.
     """
     pitch = settings.head.pitch_mm
     count = int(np.floor(settings.reach_mm / pitch + 1e-9))

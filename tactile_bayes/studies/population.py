@@ -1,4 +1,4 @@
-"""Exams of varied bodies, simulated and fitted."""
+"""Simulated exams of varied bodies, and the fits of their maps."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tactile_bayes.size.draws import ShapeDraws
 from tactile_bayes.size.learn.regression import PopulationTable
 from tactile_bayes.size.terms import LOGGED
 
-# --- Simulated exams that vary as bodies and examiners do: the training set of a size calibration.
+# --- Priors of simulated exams, which vary as bodies and examiners do: the training set of a size calibration.
 
 Range = tuple[float, float]
 Diameter = Annotated[float, Meta(gt=0, le=100)]
@@ -47,14 +47,14 @@ FRAME_RATE_HZ = 100.0
 
 
 class _Ranges(Record):
-    """Ranges, the low end first."""
+    """Fields that are ranges, the low end first."""
 
     def __post_init__(self) -> None:
         for name in names_of(self):
             low, high = getattr(self, name)
             if low > high:
-                what = f"{name} runs backwards, from {low:g} to {high:g}"
-                raise BadDataError(what, way_out="give the lower end first")
+                fault = f"{name} runs backwards, from {low:g} to {high:g}"
+                raise BadDataError(fault, way_out="give the lower end first")
 
 
 class BodyPrior(_Ranges):
@@ -97,8 +97,8 @@ class ExamPrior(_Ranges):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.drift_kpa[1] >= self.mean_kpa[0]:
-            what = f"drift_kpa reaches {self.drift_kpa[1]:g}, and mean_kpa begins at {self.mean_kpa[0]:g}"
-            raise BadDataError(what, way_out="keep the drift below the mean pressure")
+            fault = f"drift_kpa reaches {self.drift_kpa[1]:g}, and mean_kpa begins at {self.mean_kpa[0]:g}"
+            raise BadDataError(fault, way_out="keep the drift below the mean pressure")
 
 
 class BodiesFile(Record):
@@ -119,7 +119,7 @@ def draw_body(prior: BodyPrior, rng: np.random.Generator) -> tuple[SceneBody, So
     ratio, seat = rng.uniform(*prior.depth_ratio), rng.uniform(*prior.seat)
     stiffness = _log_uniform(prior.stiffness_ratio, rng)
     fat_kpa, gland = _log_uniform(prior.fat_kpa, rng), _log_uniform(prior.gland_ratio, rng)
-    # room below the lump and for some gland below the fat
+    # at least this thick, for room below the lump and for some gland below the fat
     least = ratio * d + max(0.6, 0.5 * seat + 0.05) * d + 4.0
     thickness = max(rng.uniform(*prior.thickness_mm), least)
     body = SceneBody(fat_kpa=fat_kpa, gland_ratio=gland, thickness_mm=thickness)
@@ -129,15 +129,15 @@ def draw_body(prior: BodyPrior, rng: np.random.Generator) -> tuple[SceneBody, So
 def draw_exam(prior: ExamPrior, rng: np.random.Generator) -> Scene:
     """Draw one examination of a body; the lump lies in the middle, shifted by `off_centre_mm`."""
 
-    def drawn(*names: str) -> dict[str, Any]:
+    def draw(*names: str) -> dict[str, Any]:
         return {name: rng.uniform(*getattr(prior, name)) for name in names}
 
     lines = int(rng.integers(prior.lines[0], prior.lines[1] + 1))
     return Scene(  # drawn in this order
-        background=Background(**drawn("mean_kpa", "drift_kpa"), drift_period_s=rng.uniform(1.5, 5.0)),
-        strokes=Strokes(lines=lines, **drawn("spacing_mm", "half_length_mm", "wander_mm", "tilt_deg", "yaw_deg")),
-        noise=Noise(**drawn("element_kpa", "tracker_mm", "tracker_deg", "gain_share")),
-        tracker=Tracker(**drawn("latency_ms")),
+        background=Background(**draw("mean_kpa", "drift_kpa"), drift_period_s=rng.uniform(1.5, 5.0)),
+        strokes=Strokes(lines=lines, **draw("spacing_mm", "half_length_mm", "wander_mm", "tilt_deg", "yaw_deg")),
+        noise=Noise(**draw("element_kpa", "tracker_mm", "tracker_deg", "gain_share")),
+        tracker=Tracker(**draw("latency_ms")),
         duration_s=lines * rng.uniform(*prior.line_s),
         frame_rate_hz=FRAME_RATE_HZ,
     )
@@ -157,11 +157,11 @@ BODY_COLUMNS = names_of(BodyPrior)
 
 
 def measuring_options() -> SamplerSettings:
-    """Fit options for a population's maps: as for a patient's, along the head's axes, by mode and curvature."""
+    """Fit options for a population's maps: as for a patient's, with axes along the head's, by mode and curvature."""
     return SamplerSettings(method="laplace", background="free", rotation="off", noise="field")
 
 
-class MassRow(Record):
+class ExamRow(Record):
     """One exam of one mass: true properties and measurements; the fields are the table's columns."""
 
     body: int  #: Number of the mass: exams of one share it.
@@ -201,7 +201,7 @@ class MassRow(Record):
 
 
 class Population(Record):
-    """Masses to be drawn and examined: all that the rows of a table depend on."""
+    """Population of masses to draw and examine: all that the rows of a table depend on."""
 
     scans: int  #: Exams of each mass.
     seed: int
@@ -226,36 +226,37 @@ class Population(Record):
             scenes.append(replace(exam, seed=seed, body=body, solid_lumps=(placed,), head=self.head))
         return scenes
 
-    def rows(self, index: int, scan: Callable[[Scene], Scan] | None = None) -> list[MassRow]:
-        """Scan each exam of a mass, by default with the scene's seed, map and fit it; a row for each normalisation."""
+    def rows(self, index: int, scan: Callable[[Scene], Scan] | None = None) -> list[ExamRow]:
+        """Scan, map and fit each exam of a mass, a row per normalisation; `scan` simulates by default, with the scene's
+        seed."""
         scan = scan or (lambda scene: simulate(scene, rng=np.random.default_rng(scene.seed)).scan)
-        made = [(i, one, scan(one)) for i, one in enumerate(self.scenes(index))]
+        scans = [(i, one, scan(one)) for i, one in enumerate(self.scenes(index))]
         return [
-            measure_exam(scene, scanned, body=index, exam=i, normalise=way)
-            for i, scene, scanned in made
-            for way in self.normalise
+            measure_exam(scene, exam_scan, body=index, exam=i, normalise=normalise)
+            for i, scene, exam_scan in scans
+            for normalise in self.normalise
         ]
 
 
-def measure_exam(scene: Scene, scan: Scan, *, body: int, exam: int, normalise: str = DEFAULT_NORMALISE) -> MassRow:
-    """Row of one exam; the measured columns are empty where no map can be built or no lump is detected."""
+def measure_exam(scene: Scene, scan: Scan, *, body: int, exam: int, normalise: str = DEFAULT_NORMALISE) -> ExamRow:
+    """Row of one exam; without a map or a detected lump the measured columns are empty."""
     lump, tissue = scene.solid_lumps[0], scene.body
     assert tissue is not None
     truth = as_dict(replace(lump, seat=lump.seat or 0.0)) | as_dict(tissue)
     columns = {name: truth[name] for name in BODY_COLUMNS} | head_columns(scene.head)
-    row = MassRow(body, exam, normalise=normalise, **columns)
+    row = ExamRow(body, exam, normalise=normalise, **columns)
     try:
         tactile_map = build_map(scan, normalise=normalise, as_stated=True)
         quality = tactile_map.quality
         profile: dict[str, Any] = {name: quality.get(name) for name in HEAD_PROFILE}
         row = replace(row, mean_kpa=quality["mean_pressure_kpa"], **profile)
         options, rng = measuring_options(), np.random.default_rng(_DRAWS_SEED)
-        found = estimate_map(tactile_map, calibration=None, options=options, rng=rng)
+        estimate = estimate_map(tactile_map, calibration=None, options=options, rng=rng)
     except TactileBayesError:
         return row
-    if found.status != "estimate" or found.map_posterior is None:
+    if estimate.status != "estimate" or estimate.map_posterior is None:
         return row
-    draws = ShapeDraws.of(found.map_posterior)
+    draws = ShapeDraws.of(estimate.map_posterior)
     shape = np.stack([draws.log_amplitude, draws.log_width, draws.q])
     shape = shape[:, np.isfinite(shape).all(axis=0)]
     mean, covariance = shape.mean(axis=1), np.cov(shape)
@@ -271,20 +272,20 @@ def measure_exam(scene: Scene, scan: Scan, *, body: int, exam: int, normalise: s
 
 
 def head_columns(head: Head) -> dict[str, Any]:
-    """Columns of a table that name its head."""
-    found: dict[str, Any] = {f"head_{name}": value for name, value in as_dict(head).items()}
-    return found | ({"head_radius_mm": None} if head.radius_mm >= FLAT_RADIUS_MM else {})
+    """Columns of a table that describe its head."""
+    columns: dict[str, Any] = {f"head_{name}": value for name, value in as_dict(head).items()}
+    return columns | ({"head_radius_mm": None} if head.radius_mm >= FLAT_RADIUS_MM else {})
 
 
 def table_head(columns: Mapping[str, Sequence[Any]]) -> HeadShape:
-    """Head that a table's maps were made with."""
+    """Head of a table's maps; `BadDataError` for several."""
     names = [f"head_{name}" for name in names_of(Head)]
-    found = set(zip(*(columns[name] for name in names), strict=True))
-    if len(found) > 1:
+    heads = set(zip(*(columns[name] for name in names), strict=True))
+    if len(heads) > 1:
         raise BadDataError("its maps were made with several heads", way_out="learn from the rows of one head")
-    rows, wide, pitch, radius, shoulder, rim = found.pop()
+    rows, wide, pitch, radius, shoulder, rim = heads.pop()
     head = Head(rows, wide, pitch, FLAT_MM if radius is None else radius, shoulder, rim)
-    Scene(head=head)  # refuses what is no head
+    Scene(head=head)  # refuses an impossible head
     return HeadShape.of(head.surface_mm(), head.pitch_mm, rim_mm=head.rim_mm)
 
 
@@ -294,36 +295,36 @@ def table_bodies(columns: Mapping[str, Sequence[float]]) -> dict[str, tuple[floa
 
 
 def population_table(columns: Mapping[str, Sequence[float | None]]) -> PopulationTable:
-    """Detected rows of a table with the fields of `MassRow`, in the form for learning.
+    """Detected rows of a table with the fields of `ExamRow`, in the form for learning.
 
-    A row without a profile of the head has NaN for it.
+    The head profile is NaN in a row without one, and None if no row has one.
     """
-    kept = np.flatnonzero(np.array(columns["detected"], dtype=bool))
+    detected = np.flatnonzero(np.array(columns["detected"], dtype=bool))
 
     def column(name: str) -> FloatArray:
-        return np.array(columns[name], dtype=np.float64)[kept]
+        return np.array(columns[name], dtype=np.float64)[detected]
 
-    covariance = np.empty((len(kept), 3, 3))
+    covariance = np.empty((len(detected), 3, 3))
     for (i, j), name in zip(zip(*np.triu_indices(3), strict=True), SHAPE_COVARIANCE, strict=True):
         covariance[:, i, j] = covariance[:, j, i] = column(name)
     sigma_x, sigma_y = np.log(column("sigma_x_mm")), np.log(column("sigma_y_mm"))
     varied = {name: column(name) for name in UNKNOWNS if name in columns}
     varied = {"depth_mm": column("depth_ratio") * column("d_mm"), **varied}
-    profile = None
+    known_profile = None
     if all(name in columns for name in HEAD_PROFILE):
-        found = np.stack([column(name) for name in HEAD_PROFILE], axis=1)
-        whole = np.isfinite(found).all(axis=1)
-        found[~whole] = np.nan
-        profile = found if whole.any() else None
+        profile = np.stack([column(name) for name in HEAD_PROFILE], axis=1)
+        complete = np.isfinite(profile).all(axis=1)
+        profile[~complete] = np.nan
+        known_profile = profile if complete.any() else None
     boundary = (column("depth_ratio") + column("seat") / 2) * column("d_mm")
     return PopulationTable(
-        body=np.array(columns["body"])[kept],
+        body=np.array(columns["body"])[detected],
         d_mm=column("d_mm"),
         log_amplitude=np.log(column("amplitude")),
         log_width=(sigma_x + sigma_y) / 2,
         half_log_ratio=(sigma_x - sigma_y) / 2,
         covariance=covariance,
         unknowns={name: np.log(varied[name]) if name in LOGGED else varied[name] for name in UNKNOWNS},
-        profile=profile,
-        log_fat=None if profile is None else np.log(boundary),
+        profile=known_profile,
+        log_fat=None if known_profile is None else np.log(boundary),
     )

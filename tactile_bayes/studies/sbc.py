@@ -35,8 +35,8 @@ LEAST_IN_BIN = 5
 IntArray = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 
-class Coverage(Record):
-    """Share of truths that a central interval of nominal probability covered, with its binomial standard error."""
+class RankCoverage(Record):
+    """Share of truths that a central interval of the nominal probability covered, with its binomial standard error."""
 
     probability: float
     covered: float
@@ -46,15 +46,15 @@ class Coverage(Record):
 class RankTest(Record):
     """Results of the tests on one parameter's ranks."""
 
-    name: str  #: Of the parameter.
-    n: int  #: Ranks.
+    name: str  #: Name of the parameter.
+    n: int  #: Number of ranks.
     chi2_p: float  #: P value of equal numbers in bins of ranks.
-    ecdf_p: float  #: Share of uniform samples whose ECDF strays at least as far, anywhere.
+    ecdf_p: float  #: Share of uniform samples whose ECDF departs at least as far, anywhere.
     mean_rank: float
     spread: float
-    """`mean_rank`, `spread`: Mean of (rank + 1/2) / (draws + 1), 0.5 when calibrated; and its SD over that of a uniform
-    one: above 1 the posterior is too narrow, below 1 too wide."""
-    coverage: tuple[Coverage, ...]  #: Of central intervals.
+    """`mean_rank`, `spread`: Mean of (rank + 1/2) / (draws + 1), 0.5 when calibrated; and its SD over that of uniform
+    ranks: above 1 the posterior is too narrow, below 1 too wide."""
+    coverage: tuple[RankCoverage, ...]  #: Coverage of central intervals.
 
     @property
     def inside(self) -> bool:
@@ -62,12 +62,12 @@ class RankTest(Record):
         return self.ecdf_p > 1.0 - BAND
 
 
-def rank_test(name: str, ranks: IntArray, *, draws: int, strays: FloatArray | None = None) -> RankTest:
-    """Run all tests on one parameter's (n,) ranks from 0 to `draws`; `strays` are from `uniform_strays`,
-    where at hand."""
-    known = uniform_strays(len(ranks), draws) if strays is None else strays
-    # equally likely strays of discrete counts differ by rounding
-    as_far = float(np.mean(known <= stray(ecdf_counts(ranks[None], draws), len(ranks))[0] * (1.0 + 1e-9)))
+def rank_test(name: str, ranks: IntArray, *, draws: int, tails: FloatArray | None = None) -> RankTest:
+    """Run all tests on one parameter's (n,) ranks from 0 to `draws`; `tails` are those of `uniform_least_tails`, by
+    default computed here."""
+    tails = uniform_least_tails(len(ranks), draws) if tails is None else tails
+    # equally likely tails of discrete counts differ by rounding
+    as_far = float(np.mean(tails <= least_tail(ecdf_counts(ranks[None], draws), len(ranks))[0] * (1.0 + 1e-9)))
     share = (ranks + 0.5) / (draws + 1)
     uniform_sd = np.sqrt((1.0 - 1.0 / (draws + 1) ** 2) / 12.0)
     return RankTest(
@@ -89,14 +89,16 @@ def chi2_p(ranks: IntArray, draws: int) -> float:
     return float(chisquare(np.bincount(ranks * bins[-1] // (draws + 1), minlength=bins[-1])).pvalue)
 
 
-def coverage(ranks: IntArray, draws: int, probability: float) -> Coverage:
-    """Share of truths in the central interval between two draws that holds exactly the nominal share of ranks. A
-    probability that no interval between draws has is a ValueError."""
+def coverage(ranks: IntArray, draws: int, probability: float) -> RankCoverage:
+    """Coverage by the central interval between two draws with exactly the nominal share of ranks; `ValueError` where
+    no interval between draws has the probability."""
     tail = (1.0 - probability) / 2.0 * (draws + 1)
     if abs(tail - round(tail)) > 1e-9:
         raise ValueError(f"{draws} draws have no central interval of probability {probability:g}")
-    held = (ranks >= round(tail)) & (ranks <= draws - round(tail))
-    return Coverage(probability, float(held.mean()), float(np.sqrt(probability * (1.0 - probability) / len(ranks))))
+    covered = (ranks >= round(tail)) & (ranks <= draws - round(tail))
+    return RankCoverage(
+        probability, float(covered.mean()), float(np.sqrt(probability * (1.0 - probability) / len(ranks)))
+    )
 
 
 def ecdf_counts(ranks: IntArray, draws: int) -> IntArray:
@@ -105,19 +107,19 @@ def ecdf_counts(ranks: IntArray, draws: int) -> IntArray:
     return np.asarray(below.sum(axis=-2))
 
 
-def stray(counts: IntArray, n: int) -> FloatArray:
+def least_tail(counts: IntArray, n: int) -> FloatArray:
     """(m,) smallest two-sided binomial tail of (m, draws) counts of n ranks: small where an ECDF departs somewhere."""
-    at = np.arange(1, counts.shape[-1] + 1) / (counts.shape[-1] + 1)
+    uniform = np.arange(1, counts.shape[-1] + 1) / (counts.shape[-1] + 1)
     number = np.arange(n + 1)[:, None]
-    tails = 2.0 * np.minimum(binom.cdf(number, n, at), binom.sf(number - 1, n, at))
-    return np.asarray(np.min(tails[counts, np.arange(len(at))], axis=-1))
+    tails = 2.0 * np.minimum(binom.cdf(number, n, uniform), binom.sf(number - 1, n, uniform))
+    return np.asarray(np.min(tails[counts, np.arange(len(uniform))], axis=-1))
 
 
-def uniform_strays(n: int, draws: int) -> FloatArray:
-    """(BAND_SIMULATIONS,) `stray` of n simulated uniform ranks, with a seed of their own."""
+def uniform_least_tails(n: int, draws: int) -> FloatArray:
+    """(BAND_SIMULATIONS,) `least_tail` of n simulated uniform ranks, with a seed of their own."""
     rng = np.random.default_rng([n, draws])
     number = rng.multinomial(n, np.full(draws + 1, 1.0 / (draws + 1)), size=BAND_SIMULATIONS)
-    return stray(np.cumsum(number, axis=1)[:, :-1], n)
+    return least_tail(np.cumsum(number, axis=1)[:, :-1], n)
 
 
 def ecdf_band(n: int, draws: int) -> tuple[FloatArray, FloatArray]:
@@ -125,9 +127,9 @@ def ecdf_band(n: int, draws: int) -> tuple[FloatArray, FloatArray]:
 
     Each point's binomial limits are as wide as makes the whole path stay inside with probability `BAND`.
     """
-    level = float(np.quantile(uniform_strays(n, draws), 1.0 - BAND))
-    at = np.arange(1, draws + 1) / (draws + 1)
-    return np.asarray(binom.ppf(level / 2.0, n, at) / n), np.asarray(binom.isf(level / 2.0, n, at) / n)
+    level = float(np.quantile(uniform_least_tails(n, draws), 1.0 - BAND))
+    uniform = np.arange(1, draws + 1) / (draws + 1)
+    return np.asarray(binom.ppf(level / 2.0, n, uniform) / n), np.asarray(binom.isf(level / 2.0, n, uniform) / n)
 
 
 # --- Simulation-based calibration of a map's posterior: ranks of true values drawn from its own prior.
@@ -145,10 +147,10 @@ def ecdf_band(n: int, draws: int) -> tuple[FloatArray, FloatArray]:
 #   window: what that approximation costs is part of what the ranks judge. (Cosines mirror a field at their rectangle's
 #   edge. Maps made of them had folds where they reached beyond, which other windows took for lumps.)
 #
-# Maps that give no estimate have no ranks: ranks are conditional on detection. Whether a map gives one depends on
-# the map alone, so that exact ranks stay uniform. Under a field much stronger than the bump another rise may be
-# taken for it. The estimate gives a probability that there is a lump, and the draws keep to the place where it was
-# found: such maps have no ranks either, but are held against the number that the probabilities announce.
+# Maps without an estimate have no ranks: ranks are conditional on detection. Whether a map has one depends on the map
+# alone, so that exact ranks stay uniform. Under a field much stronger than the bump the estimate may measure another
+# rise. It then has a probability that there is a lump, and all draws lie at that rise: such maps have no ranks either,
+# but their number is compared with the one that the probabilities predict.
 #
 # The size is that of a round lump: the true one is a draw of the size calibration's own law at the true amplitude
 # and widths.
@@ -195,7 +197,7 @@ class MapRanks(Record):
     outcome: str
     """The method that gave the draws, the code of the abstention, or `ELSEWHERE` when another rise was measured."""
     probability: float | None = None
-    """That the estimate gives to what it measured being a lump; None without an estimate."""
+    """Probability that the measured rise is a lump, by the estimate; None without an estimate."""
 
 
 def settings(method: str, seed: int, *, size: str = "", cosines: FieldCosines = "auto") -> dict[str, object]:
@@ -218,9 +220,9 @@ def settings(method: str, seed: int, *, size: str = "", cosines: FieldCosines = 
 def ranks_of_map(
     index: int, *, method: Method, seed: int, calibration: BodyCalibration | None = None, cosines: FieldCosines = "auto"
 ) -> MapRanks:
-    """Draw a map from the prior, estimate it and rank its truth; seed and index fix all random numbers.
+    """Draw a map from the prior, estimate it and rank its truth; the size only with a calibration.
 
-    Without a size calibration the size is not ranked.
+    `seed` and `index` fix all random numbers.
     """
     rng = np.random.default_rng([seed, index])
     prior = BumpPrior()
@@ -235,19 +237,19 @@ def ranks_of_map(
         **as_dict(prior),
     )
     try:
-        found = estimate_map(draw_map(truth, rng, prior), calibration=None, options=options, rng=rng)
+        estimate = estimate_map(draw_map(truth, rng, prior), calibration=None, options=options, rng=rng)
     except NotConvergedError:  # of the ensemble, which no method follows
         return MapRanks(index, truth, None, "method")
-    if found.map_posterior is None or found.draws is None or found.detection is None:
-        return MapRanks(index, truth, None, found.code or "none")
-    probability = found.detection.probability
-    if elsewhere(found.map_posterior, truth):
+    if estimate.map_posterior is None or estimate.draws is None or estimate.detection is None:
+        return MapRanks(index, truth, None, estimate.code or "none")
+    probability = estimate.detection.probability
+    if measured_other_rise(estimate.map_posterior, truth):
         return MapRanks(index, truth, None, ELSEWHERE, probability)
-    ranks = _ranks_in(found.map_posterior, truth, rng, calibration)
-    return MapRanks(index, truth, ranks, found.draws.method, probability)
+    ranks = _ranks_in(estimate.map_posterior, truth, rng, calibration)
+    return MapRanks(index, truth, ranks, estimate.draws.method, probability)
 
 
-def elsewhere(posterior: MapPosterior, truth: Truth) -> bool:
+def measured_other_rise(posterior: MapPosterior, truth: Truth) -> bool:
     """True when the estimate measured another rise: its centre is further from the true one than both widths."""
     away = np.hypot(np.median(posterior.x_mm) - truth.x_mm, np.median(posterior.y_mm) - truth.y_mm)
     widths = truth.sigma_x_mm, truth.sigma_y_mm, np.median(posterior.sigma_x_mm), np.median(posterior.sigma_y_mm)
@@ -257,9 +259,9 @@ def elsewhere(posterior: MapPosterior, truth: Truth) -> bool:
 class OtherRises(Record):
     """Maps whose estimate measured another rise than the true lump."""
 
-    number: int  #: Of them.
-    announced: float  #: How many the probabilities of all estimates lead one to expect.
-    chance: float  #: Of so many or more, were the probabilities right.
+    number: int  #: Number of such maps.
+    announced: float  #: Expected number, by the probabilities of all estimates.
+    chance: float  #: Probability of this number or more, if the estimates' probabilities are right.
 
     @property
     def too_many(self) -> bool:
@@ -267,7 +269,7 @@ class OtherRises(Record):
         return self.chance < MANY_ELSEWHERE
 
 
-def other_rises(maps: list[MapRanks]) -> OtherRises:
+def count_other_rises(maps: list[MapRanks]) -> OtherRises:
     """Compare the number of maps measured elsewhere with what their estimates predicted, by a Poisson probability."""
     number = sum(one.outcome == ELSEWHERE for one in maps)
     announced = sum(1.0 - one.probability for one in maps if one.probability is not None)
@@ -285,20 +287,20 @@ def _ranks_in(
     ranks = tuple(int(np.sum(drawn[name] < true[name])) for name in PARAMETERS)
     if calibration is None:
         return ranks
-    # sizes of all draws are spread evenly; some of them chosen by chance are as good as independent
+    # sizes of all draws are stratified; a random subset of them is as good as independent
     sizes = _sizes({name: getattr(posterior, name).ravel() for name in PARAMETERS}, calibration, rng)[chosen]
     return (*ranks, int(np.sum(sizes < _sizes(true, calibration, rng)[0])))
 
 
 def _sizes(bumps: Mapping[str, FloatArray], calibration: BodyCalibration, rng: np.random.Generator) -> FloatArray:
-    """(n,) sizes in mm, one per bump; without a rise there is none, which ranks as small."""
+    """(n,) sizes in mm, one per bump; 0 for a bump without a rise."""
     a, sigma_x, sigma_y = (bumps[name] for name in PARAMETERS[:3])
     draws = ShapeDraws.of(BumpDraws(a, sigma_x, sigma_y, np.zeros_like(a)))
     return np.nan_to_num(pooled_size([draws], calibration=calibration, priors=ROUND, rng=rng).max_size_mm.ravel())
 
 
 def draw_truth(rng: np.random.Generator, prior: BumpPrior) -> Truth:
-    """Draw bump and noise field from the prior of the field posterior; the module describes improper parts."""
+    """Draw bump and noise field from the field posterior's prior, with the choices above for its improper parts."""
     widest, p, q = np.log(WIDEST_IN_RADII * RADIUS_MM), np.inf, 0.0
     while p + abs(q) > widest:
         p = np.log(prior.width_median_mm) + prior.log_width_sd * rng.standard_normal()
@@ -353,5 +355,5 @@ def rank_tests(maps: list[MapRanks]) -> list[RankTest]:
     ranks = np.array([one.ranks for one in maps if one.ranks is not None])
     if not len(ranks):
         return []
-    strays = uniform_strays(len(ranks), DRAWS)
-    return [rank_test(name, column, draws=DRAWS, strays=strays) for name, column in zip(RANKED, ranks.T, strict=False)]
+    tails = uniform_least_tails(len(ranks), DRAWS)
+    return [rank_test(name, column, draws=DRAWS, tails=tails) for name, column in zip(RANKED, ranks.T, strict=False)]

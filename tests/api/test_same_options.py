@@ -16,7 +16,7 @@ import tactile_bayes as tb
 from tactile_bayes.cli import cli
 from tactile_bayes.declarations import names_of
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.exports.run import TAKES
+from tactile_bayes.exports.run import IDENTITY_FIELDS
 from tactile_bayes.options import PlanErrors
 from tactile_bayes.report import pages as printed
 
@@ -39,7 +39,7 @@ def keywords(function: Callable[..., Any]) -> set[str]:
 
 
 def test_every_option_of_export_is_a_keyword() -> None:
-    assert options("export") - {"output"} <= keywords(tb.export) | set(TAKES["dicom"])
+    assert options("export") - {"output"} <= keywords(tb.export) | set(IDENTITY_FIELDS["dicom"])
 
 
 def test_every_option_of_compare_is_a_keyword_or_a_member() -> None:

@@ -19,7 +19,7 @@ from tactile_bayes.forward.scene import rotation_from_vector
 from tactile_bayes.geometry import quaternion_from_rotation
 from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker, PtyLink
 from tactile_bayes.hardware.head import rotation_sense
-from tactile_bayes.hardware.ports import guess
+from tactile_bayes.hardware.ports import guess_device
 from tactile_bayes.scans import TrackerPoses
 
 
@@ -68,7 +68,7 @@ def test_too_little_turning_is_refused(options, words):
     ],
 )
 def test_a_guess_says_that_it_is_one(vendor, product, words):
-    assert words in guess(vendor, product)
+    assert words in guess_device(vendor, product)
 
 
 def test_ports_are_listed(run_cli):

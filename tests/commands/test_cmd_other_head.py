@@ -26,7 +26,7 @@ from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.options import LearnOptions
 from tactile_bayes.scans import DEFAULT_HEAD, HeadShape
-from tactile_bayes.studies.population import MassRow, head_columns
+from tactile_bayes.studies.population import ExamRow, head_columns
 
 FLAT = Head(rows=12, columns=12, pitch_mm=2.0, radius_mm=100_000.0)
 FINGER = Head(rows=10, columns=10, pitch_mm=1.5, radius_mm=20.0)
@@ -37,13 +37,13 @@ def shape_of(head: Head) -> HeadShape:
     return HeadShape.of(head.surface_mm(), head.pitch_mm)
 
 
-def row(body: int, exam: int, head: Head) -> MassRow:
+def row(body: int, exam: int, head: Head) -> ExamRow:
     """A row whose size follows the map: ln d = 2.6 + 0.3 ln a + ln sigma - 1.4."""
     rng = np.random.default_rng([0, body])
     log_a, log_s, seat = rng.normal(-1, 0.8), rng.normal(1.4, 0.4), rng.uniform(0, 1.2)
     d = float(np.exp(2.6 + 0.3 * log_a + log_s - 1.4 + rng.normal(0, 0.05)))
     shape = (float(np.exp(log_a)), float(np.exp(log_s)), float(np.exp(log_s)))
-    made = MassRow(body, exam, d, 1.0, 30.0, float(seat), 5.0, 10.0, 60.0, 9.5, True, *shape, 1e-4, 0, 0, 1e-4, 0, 1e-4)
+    made = ExamRow(body, exam, d, 1.0, 30.0, float(seat), 5.0, 10.0, 60.0, 9.5, True, *shape, 1e-4, 0, 0, 1e-4, 0, 1e-4)
     return replace(made, normalise="gain", **head_columns(head))
 
 

@@ -15,19 +15,19 @@ from tactile_bayes.files.size_json import read_size_calibration
 from tactile_bayes.files.tables import read_table
 from tactile_bayes.forward.scene import Head
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.studies.population import BodyPrior, MassRow, Population, head_columns
+from tactile_bayes.studies.population import BodyPrior, ExamRow, Population, head_columns
 
 PHANTOMS = Path(tactile_bayes.__file__).parent / "demo" / "phantoms.csv"
 
 
-def row(body: int, exam: int, *, seed: int = 0) -> MassRow:
+def row(body: int, exam: int, *, seed: int = 0) -> ExamRow:
     """A row whose size follows the map exactly: ln d = 2.6 + 0.3 ln a + ln sigma - 1.4."""
     rng = np.random.default_rng([seed, body])
     log_a, log_s, seat = rng.normal(-1, 0.8), rng.normal(1.4, 0.4), rng.uniform(0, 1.2)
     d = float(np.exp(2.6 + 0.3 * log_a + log_s - 1.4 + rng.normal(0, 0.05)))
     wobble = float(np.random.default_rng([seed, body, exam]).normal(0, 0.01))
     shape = (float(np.exp(log_a)), float(np.exp(log_s + wobble)), float(np.exp(log_s + wobble)))
-    made = MassRow(body, exam, d, 1.0, 30.0, float(seat), 5.0, 10.0, 60.0, 9.5, True, *shape, 1e-4, 0, 0, 1e-4, 0, 1e-4)
+    made = ExamRow(body, exam, d, 1.0, 30.0, float(seat), 5.0, 10.0, 60.0, 9.5, True, *shape, 1e-4, 0, 0, 1e-4, 0, 1e-4)
     return replace(made, **head_columns(Head()))
 
 
@@ -155,7 +155,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_table(tmp_path: Path, mon
     """With the simulation stood in for by rows that come from the mass's number alone."""
     calls: list[int] = []
 
-    def quick(population: Population, index: int) -> list[MassRow]:
+    def quick(population: Population, index: int) -> list[ExamRow]:
         calls.append(index)
         if index == 3 and calls.count(3) == 1:
             raise KeyboardInterrupt

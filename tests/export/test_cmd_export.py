@@ -142,7 +142,7 @@ def test_the_command_offers_every_format() -> None:
     from tactile_bayes.options import IdentityOptions
 
     assert export._FORMATS == run.FORMATS
-    assert names_of(IdentityOptions) == run.TAKES["dicom"]
+    assert names_of(IdentityOptions) == run.IDENTITY_FIELDS["dicom"]
 
 
 def test_the_guide_lists_the_codes_of_the_own_scheme() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tactile_bayes.errors import BadDataError, UsageError
-from tactile_bayes.exports.exam import Identity, Moment, identity_of, read_worklist
+from tactile_bayes.exports.exam import Identity, Moment, merged_identity, read_worklist
 
 
 @pytest.mark.parametrize(
@@ -23,7 +23,7 @@ from tactile_bayes.exports.exam import Identity, Moment, identity_of, read_workl
     ],
 )
 def test_a_moment_is_read(text: str, date: str, time: str, zone: str, fhir: str) -> None:
-    moment = Moment.of(text, name="study_date")
+    moment = Moment.parse(text, name="study_date")
     assert (moment.date, moment.time, moment.zone, moment.fhir) == (date, time, zone, fhir)
 
 
@@ -32,7 +32,7 @@ def test_a_moment_is_read(text: str, date: str, time: str, zone: str, fhir: str)
 )
 def test_what_is_no_moment_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match=r"study_date is .*YYYY-MM-DD"):
-        Moment.of(text, name="study_date")
+        Moment.parse(text, name="study_date")
 
 
 @pytest.mark.parametrize(
@@ -66,9 +66,9 @@ def test_what_dicom_cannot_hold_is_refused_with_its_name(name: str, value: str) 
 def test_an_option_that_contradicts_the_worklist_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "w.json"
     path.write_text(json.dumps({"patient_id": "A"}))
-    assert identity_of(path, {"patient_id": "A", "sex": "F"}).sex == "F"
+    assert merged_identity(path, {"patient_id": "A", "sex": "F"}).sex == "F"
     with pytest.raises(UsageError, match="'B' by the option and 'A' in the worklist"):
-        identity_of(path, {"patient_id": "B"})
+        merged_identity(path, {"patient_id": "B"})
 
 
 def test_plain_keys(tmp_path: Path) -> None:

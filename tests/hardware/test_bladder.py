@@ -31,7 +31,9 @@ def counts_at(kpa: float, *, bend: float = 0.0, frames: int = 50, noise: float =
 
 
 def fitted(change=lambda _, counts: counts, **options):
-    steps = [BladderStep.of(kpa, change(kpa, counts_at(kpa, **options)), saturation_count=4095) for kpa in PRESSURES]
+    steps = [
+        BladderStep.from_frames(kpa, change(kpa, counts_at(kpa, **options)), saturation_count=4095) for kpa in PRESSURES
+    ]
     return fit_array(steps, saturation_count=4095)
 
 
@@ -77,7 +79,7 @@ def test_dead_hot_and_saturated_taxels_are_told_and_left_out():
 
 
 def test_the_order_of_the_steps_does_not_matter():
-    steps = [BladderStep.of(kpa, counts_at(kpa), saturation_count=4095) for kpa in PRESSURES]
+    steps = [BladderStep.from_frames(kpa, counts_at(kpa), saturation_count=4095) for kpa in PRESSURES]
     one, other = fit_array(steps, saturation_count=4095), fit_array(steps[::-1], saturation_count=4095)
     np.testing.assert_array_equal(one.calibration.gain_kpa_per_count, other.calibration.gain_kpa_per_count)
 
@@ -85,18 +87,24 @@ def test_the_order_of_the_steps_does_not_matter():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: fit_array([BladderStep.of(5, counts_at(5), saturation_count=4095)] * 2, saturation_count=4095), "two"),
-        (lambda: BladderStep.of(-1, counts_at(5), saturation_count=4095), "-1"),
-        (lambda: BladderStep.of(1, counts_at(5)[:3], saturation_count=4095), "3 frames"),
         (
             lambda: fit_array(
-                [BladderStep.of(kpa, counts_at(0), saturation_count=4095) for kpa in PRESSURES], saturation_count=4095
+                [BladderStep.from_frames(5, counts_at(5), saturation_count=4095)] * 2, saturation_count=4095
+            ),
+            "two",
+        ),
+        (lambda: BladderStep.from_frames(-1, counts_at(5), saturation_count=4095), "-1"),
+        (lambda: BladderStep.from_frames(1, counts_at(5)[:3], saturation_count=4095), "3 frames"),
+        (
+            lambda: fit_array(
+                [BladderStep.from_frames(kpa, counts_at(0), saturation_count=4095) for kpa in PRESSURES],
+                saturation_count=4095,
             ),
             "does not answer",
         ),
         (
             lambda: fit_array(
-                [BladderStep.of(kpa, counts_at(20 - kpa), saturation_count=4095) for kpa in PRESSURES],
+                [BladderStep.from_frames(kpa, counts_at(20 - kpa), saturation_count=4095) for kpa in PRESSURES],
                 saturation_count=4095,
             ),
             "does not answer",

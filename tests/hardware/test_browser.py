@@ -16,7 +16,7 @@ from test_live import seen_of
 from test_orientation import UPPER_RIGHT, corner, live_state, lump_in_base
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.hardware.live import LiveMap, LiveServer, document
+from tactile_bayes.hardware.live import LiveMap, LiveServer, page_state
 
 pytestmark = [
     pytest.mark.slow,
@@ -57,7 +57,7 @@ def test_the_page_shows_the_map_and_its_tone_tells_low_in_range_and_high(page, t
             "if (d[i] > 200 && d[i + 1] > 200 && d[i + 3] === 255) n++; return n; })()"
         )
         assert 0 < bright < np.isfinite(state.tactile_map.mean).sum() / 4
-        sent = document(state)["map"]
+        sent = page_state(state)["map"]
         drawn = page.value(f"Array.from(element('map').getContext('2d').getImageData(0, 0, {columns}, {rows}).data)")
         shown = np.array(drawn).reshape(rows, columns, 4)
         known = np.array([one is not None for one in sent["levels"]]).reshape(rows, columns)

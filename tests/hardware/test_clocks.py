@@ -23,7 +23,7 @@ from tactile_bayes.hardware.readings import (
     PoseReading,
     wrap_period,
 )
-from tactile_bayes.hardware.recorder import Line, Recorder, Report
+from tactile_bayes.hardware.recorder import DeviceLine, Recorder, RecordingReport
 
 S = 1_000_000_000
 FRAME_NS = S // 200
@@ -77,7 +77,9 @@ class Session:
 
     def __init__(self, *, shared: bool = False, tracker: bool = True, **options) -> None:
         self.now_ns, self.sink = 0, Kept()
-        self.lines = [Line(role, FakePort(), FakeStream(), FakeParser(), b"", b"") for role in ("head", "tracker")]
+        self.lines = [
+            DeviceLine(role, FakePort(), FakeStream(), FakeParser(), b"", b"") for role in ("head", "tracker")
+        ]
         self.recorder = Recorder(
             self.lines[0],
             self.lines[1] if tracker else None,
@@ -89,17 +91,17 @@ class Session:
         self.recorder.recording = True
 
     def frame(self, device_ns: int, **more) -> None:
-        self.recorder._read(self.lines[0], FrameReading(COUNTS, device_ns, **more), self.now_ns)
+        self.recorder._process(self.lines[0], FrameReading(COUNTS, device_ns, **more), self.now_ns)
 
     def pose(self, device_ns: int | None, x_mm: float = 0.0) -> None:
-        self.recorder._read(self.lines[1], PoseReading((x_mm, 0, 0), (1, 0, 0, 0), device_ns), self.now_ns)
+        self.recorder._process(self.lines[1], PoseReading((x_mm, 0, 0), (1, 0, 0, 0), device_ns), self.now_ns)
 
-    def end(self) -> Report:
-        self.recorder._judge()
+    def end(self) -> RecordingReport:
+        self.recorder._add_cautions()
         return self.recorder.report
 
 
-def run_head(raw_of, *, seconds: float = 2.0, **options) -> tuple[Session, Report]:
+def run_head(raw_of, *, seconds: float = 2.0, **options) -> tuple[Session, RecordingReport]:
     """A head at 200 Hz whose clock says ``raw_of(true time in ns)``."""
     session = Session(tracker=False, **options)
     for i in range(round(seconds * 200)):
@@ -203,7 +205,7 @@ def test_a_duration_ends_whatever_the_clock_does(raw_of):
     for i in range(10 * 200):
         session.now_ns = i * FRAME_NS
         session.frame(raw_of(session.now_ns))
-        session.recorder._look_at_host_time(session.now_ns)
+        session.recorder._check_host_time(session.now_ns)
         if session.recorder.report.ended_by:
             break
     assert session.recorder.report.ended_by == "duration"
@@ -216,7 +218,7 @@ def test_a_clock_that_lags_ends_by_this_computers():
     for i in range(10 * 200):
         session.now_ns = i * FRAME_NS
         session.frame(session.now_ns // 1000)
-        session.recorder._look_at_host_time(session.now_ns)
+        session.recorder._check_host_time(session.now_ns)
         if session.recorder.report.ended_by:
             break
     assert session.recorder.report.ended_by == "duration, by this computer's clock"
@@ -252,7 +254,7 @@ def test_a_trackers_clock_may_do_all_that_too(shared, name, raw_of, steps, wraps
 def test_poses_keep_their_order_when_they_are_placed():
     clock = PoseClock(shared=False)
     clock.head.read(0, 0)
-    times = [clock.place(None, host).time_ns for host in (10, 30, 20, 40)]
+    times = [clock.time_of(None, host).time_ns for host in (10, 30, 20, 40)]
     assert times == sorted(times)
 
 
@@ -273,7 +275,7 @@ def test_a_damaged_frame_counter_is_told():
     assert report.cautions == ["the head's frame counter restarted or was damaged once"]
 
 
-def mismatch(frames: tuple[float, float], poses: tuple[float, float], *, rate_hz: float = 200.0) -> Report:
+def mismatch(frames: tuple[float, float], poses: tuple[float, float], *, rate_hz: float = 200.0) -> RecordingReport:
     """The account of frames and poses that were measured between these times in s."""
     session = Session(shared=True, rate_hz=rate_hz)
     times = np.arange(0, 6 * S, FRAME_NS)
@@ -330,12 +332,28 @@ def test_gaps_a_promise_not_kept_and_a_stuck_tracker_are_told():
             session.pose(session.now_ns)
         if i % 4 == 0 and not 500 <= i < 600:
             session.frame(session.now_ns)
-    session.recorder._read(session.lines[0], EndReading(800, 0), session.now_ns)
+    session.recorder._process(session.lines[0], EndReading(800, 0), session.now_ns)
     cautions = session.end().cautions
     assert "no pose for 0.50 s from 1.50 s on (longest gap)" in cautions
     assert "no frame for 0.52 s from 2.48 s on (longest gap)" in cautions
     assert any(text.startswith("the head promised 200 frames per second and measured 43") for text in cautions)
     assert "every pose is the same: the tracker does not follow the head" in cautions
+
+
+@pytest.mark.parametrize("speed", [0.05, 20.0])
+def test_a_replay_keeps_its_times_at_any_speed(speed):
+    """At twenty times the pace every replay had a caution, and a pause of 3 s was cut to 0.15 s."""
+    session = Session(tracker=False, speed=speed, rate_hz=200.0)
+    times_ns = [i * FRAME_NS for i in range(200)] + [4 * S + i * FRAME_NS for i in range(200)]
+    for time_ns in times_ns:
+        session.now_ns = round(time_ns / speed)
+        session.frame(time_ns)
+    report = session.end()
+    assert session.sink.frames == times_ns
+    assert report.head_clock_steps == 0
+    gap, pace = report.cautions
+    assert gap.startswith("no frame for 3.0")
+    assert pace.startswith("the head promised 200 frames per second")
 
 
 @pytest.mark.parametrize("topic", ["/pressure", "/pose"])

@@ -18,7 +18,7 @@ from tactile_bayes.actions.devices import _link
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.hardware import head
-from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker, Emulator, Faults, PtyLink, Stage, TcpLink
+from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker, Emulator, Faults, Playback, PtyLink, TcpLink
 from tactile_bayes.hardware.head import HeadParser, encode_command
 from tactile_bayes.hardware.ports import Port
 from tactile_bayes.hardware.readings import EndReading, FrameReading, PoseReading
@@ -93,7 +93,7 @@ def test_a_server_plays_for_each_host_that_connects():
 def test_once_ends_when_a_slow_host_has_read_the_last_frame(link_of):
     link = link_of()
     emulator = Emulator(
-        EmulatedHead(SCAN), link, faults=Faults(), rng=np.random.default_rng(1), stage=Stage(speed=10.0)
+        EmulatedHead(SCAN), link, faults=Faults(), rng=np.random.default_rng(1), stage=Playback(speed=10.0)
     )
     thread = threading.Thread(target=lambda: emulator.run(once=True), daemon=True)
     thread.start()
@@ -109,7 +109,7 @@ def test_once_ends_when_a_slow_host_has_read_the_last_frame(link_of):
 
 def test_a_tracker_waits_for_the_head_with_its_first_pose(monkeypatch):
     monkeypatch.setattr("tactile_bayes.hardware.emulated._SETTLE_S", 0.05)
-    stage, driver = Stage(), TRACKERS["liberty"]
+    stage, driver = Playback(), TRACKERS["liberty"]
     tracker = EmulatedTracker(SCAN.poses, protocol="liberty")
     with (
         serving(EmulatedHead(SCAN), PtyLink(), stage=stage) as leader,

@@ -81,14 +81,14 @@ def test_devices_that_vanish_at_the_end_leave_a_finished_file(tmp_path, child_en
         "import sys, termios\n"
         "import tactile_bayes.hardware.recorder as recorder\n"
         "from tactile_bayes.cli import main\n"
-        "hush = recorder.Recorder._hush\n"
+        "stop_devices = recorder.Recorder._stop_devices\n"
         "def gone(self):\n"
         "    def fail():\n"
         "        raise termios.error(5, 'Input/output error')\n"
         "    for line in self._lines:\n"
         "        line.port._serial.flush = fail\n"
-        "    hush(self)\n"
-        "recorder.Recorder._hush = gone\n"
+        "    stop_devices(self)\n"
+        "recorder.Recorder._stop_devices = gone\n"
         "main()\n"
     )
     with head_and_tracker(scan) as devices:

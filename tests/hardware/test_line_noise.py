@@ -109,7 +109,7 @@ def test_an_emulated_device_outlives_noise(name, kind):
     device = {"head": lambda: EmulatedHead(scan), "ndi": lambda: EmulatedNdi(scan.poses)}.get(
         name, lambda: EmulatedTracker(scan.poses, protocol=name)
     )()
-    assert held_through(device.hear, kind, 20_000) < MOST_BYTES
+    assert held_through(device.respond, kind, 20_000) < MOST_BYTES
 
 
 @pytest.mark.parametrize("payload", [b"", b"\0" * 11, b"\xff" * 58, b"x" * 900])

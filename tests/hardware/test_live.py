@@ -26,13 +26,13 @@ from tactile_bayes.hardware.live import (
     LiveMap,
     LiveServer,
     LiveState,
-    address_of,
-    document,
-    fed,
     grey_levels,
+    page_state,
+    parse_address,
+    read_feed,
 )
 from tactile_bayes.hardware.readings import PoseReading
-from tactile_bayes.hardware.recorder import Report
+from tactile_bayes.hardware.recorder import RecordingReport
 from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.cells import distinct_poses, poses_at
 from tactile_bayes.shell import has_styles
@@ -46,7 +46,7 @@ def scan():
 @pytest.fixture
 def pipe():
     theirs, ours = os.pipe()
-    return fed(theirs, 0.0), Feed(ours)
+    return read_feed(theirs, 0.0), Feed(ours)
 
 
 def pose_of(scan, index: int) -> PoseReading:
@@ -79,7 +79,7 @@ def test_what_is_fed_is_seen(scan, pipe):
     feed.frame(scan.frames.counts[3], 15_000_000)
     feed.pose(pose_of(scan, 2), 16_666_667)
     feed.landmark("xiphoid", np.array([1.0, -2.5, 3.0]))
-    feed.told(Report(frames=4, unseen="out of volume", other_tools="x" * 9999))
+    feed.report(RecordingReport(frames=4, unseen="out of volume", other_tools="x" * 9999))
     frame, pose, landmark, report = next(reader)
     assert landmark == ("landmark", "xiphoid", [1.0, -2.5, 3.0])
     np.testing.assert_array_equal(frame[-1], scan.frames.counts[3])
@@ -127,8 +127,8 @@ def test_the_tone_follows_the_window(kpa, tone, said):
     state = LiveState(pressure_kpa=kpa)
     assert state.tone == tone
     assert said in live_line(state)
-    assert document(state)["tone"] == tone
-    json.dumps(document(state), allow_nan=False)
+    assert page_state(state)["tone"] == tone
+    json.dumps(page_state(state), allow_nan=False)
 
 
 def test_a_view_says_why_there_is_no_size_yet(state):
@@ -290,7 +290,7 @@ def test_the_websocket_takes_its_own_page_only(server, state):
 @pytest.mark.parametrize("text", ["0.0.0.0:8000", "192.168.1.7:80", "example.org:80", "8000", "127.0.0.1:x", "::1"])
 def test_only_this_computer_can_be_served(text):
     with pytest.raises(UsageError):
-        address_of(text)
+        parse_address(text)
 
 
 @pytest.mark.parametrize(
@@ -298,7 +298,7 @@ def test_only_this_computer_can_be_served(text):
     [("127.0.0.1:0", ("127.0.0.1", 0)), ("localhost:8000", ("127.0.0.1", 8000)), ("[::1]:9", ("::1", 9))],
 )
 def test_an_address_of_this_computer(text, address):
-    assert address_of(text) == address
+    assert parse_address(text) == address
 
 
 def test_the_estimate_looks_at_one_rise_a_time_and_stays_where_a_lump_was():

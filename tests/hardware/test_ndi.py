@@ -215,10 +215,10 @@ def test_faults_have_nothing_to_act_on(run_cli, tmp_path):
 def test_the_emulated_tracker_speaks_as_the_guide_prints_it():
     assert crc16(b"123456789") == 0xBB3D
     device = EmulatedNdi(short_scan(0.2).poses)
-    assert device.hear(b"INIT:E3A5\r") == b"OKAYA896\r"
-    assert device.hear(b"INIT:0000\r") == b"ERROR04%04X\r" % crc16(b"ERROR04")
-    assert device.hear(b"TSTART \r").startswith(b"OKAY")
-    assert device.hear(b"BX 0001\r").startswith(b"ERROR")  # no tool was enabled yet
+    assert device.respond(b"INIT:E3A5\r") == b"OKAYA896\r"
+    assert device.respond(b"INIT:0000\r") == b"ERROR04%04X\r" % crc16(b"ERROR04")
+    assert device.respond(b"TSTART \r").startswith(b"OKAY")
+    assert device.respond(b"BX 0001\r").startswith(b"ERROR")  # no tool was enabled yet
 
 
 class Wireless(EmulatedNdi):

@@ -11,7 +11,7 @@ from mapping_scans import gaussian, make_scan, strokes
 
 from tactile_bayes.actions.live_view import live_text
 from tactile_bayes.declarations import replace
-from tactile_bayes.hardware.live import LiveMap, LiveState, document
+from tactile_bayes.hardware.live import LiveMap, LiveState, page_state
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap, orientation_of
 from tactile_bayes.posterior.verdict import missing_strokes
@@ -111,7 +111,7 @@ def test_the_live_terminal_shows_the_lump_on_the_upper_right(head_deg):
 @pytest.mark.parametrize("head_deg", [*HEADS, None])
 def test_the_live_page_is_sent_the_lump_on_the_upper_right(head_deg):
     state = live_state(head_deg)
-    sent = document(replace(state, lump_base_mm=lump_in_base(head_deg)))["map"]
+    sent = page_state(replace(state, lump_base_mm=lump_in_base(head_deg)))["map"]
     levels = np.array([np.nan if one is None else one for one in sent["levels"]], dtype=float)
     assert corner(levels.reshape(sent["rows"], sent["columns"])) == UPPER_RIGHT
     across, down = sent["lump"]

@@ -22,8 +22,8 @@ from tactile_bayes.files import scan_mcap
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid
 from tactile_bayes.hardware import reading
-from tactile_bayes.hardware.emulated import EmulatedTracker, Faults, within
-from tactile_bayes.hardware.ports import Port, Stream, read_in_process, shown
+from tactile_bayes.hardware.emulated import EmulatedTracker, Faults, is_during
+from tactile_bayes.hardware.ports import Port, Stream, preview, read_in_process
 from tactile_bayes.hardware.readings import ArrivalClock, PoseClock, PoseReading
 from tactile_bayes.hardware.recorder import LandmarkTouch
 from tactile_bayes.hardware.serial_trackers import PROTOCOLS, TRACKERS
@@ -151,7 +151,7 @@ def test_a_port_without_descriptor_is_read_all_the_same():
     ("data", "words"), [(b"", "nothing"), (b"hello\r\n", repr("hello\r\n")), (bytes(20), "00 00 00"), (b"\xff", "ff")]
 )
 def test_what_came_is_shown(data, words):
-    assert words in shown(data)
+    assert words in preview(data)
 
 
 @pytest.mark.parametrize("name", TRACKERS)
@@ -188,9 +188,9 @@ def test_a_driver_reads_what_the_emulated_tracker_says(name):
 
 def test_settings_and_letters_may_come_in_one_piece():
     tracker = EmulatedTracker(short_scan(0.2).poses, protocol="fastrak")
-    assert tracker.hear(b"cUO1,2,11,0\rf") == b""
-    assert len(tracker.hear(b"P")) == 32
-    tracker.hear(b"C")
+    assert tracker.respond(b"cUO1,2,11,0\rf") == b""
+    assert len(tracker.respond(b"P")) == 32
+    tracker.respond(b"C")
     assert tracker.streaming
 
 
@@ -218,14 +218,14 @@ def test_a_drifting_clock_is_followed():
 
 def test_poses_are_placed_by_arrival_or_by_a_shared_clock():
     shared, arrival, clocked = PoseClock(shared=True), PoseClock(shared=False), PoseClock(shared=False)
-    assert arrival.place(None, 10**9) is None  # no frame yet
+    assert arrival.time_of(None, 10**9) is None  # no frame yet
     for clock in (shared, arrival, clocked):
         clock.head.read(2 * 10**9, 5 * 10**9)  # the head's zero is 3 s into the host's time
-    assert shared.place(2_004_000_000, 5_010_000_000) == (2_004_000_000, "")
-    assert arrival.place(None, 5_010_000_000) == (2_010_000_000, "")
+    assert shared.time_of(2_004_000_000, 5_010_000_000) == (2_004_000_000, "")
+    assert arrival.time_of(None, 5_010_000_000) == (2_010_000_000, "")
     # with a clock of its own, a pose that was held up on its way keeps its place
-    first = clocked.place(100_000_000, 5_010_000_000)
-    late = clocked.place(110_000_000, 5_090_000_000)
+    first = clocked.time_of(100_000_000, 5_010_000_000)
+    late = clocked.time_of(110_000_000, 5_090_000_000)
     assert (first.time_ns, late.time_ns) == (2_010_000_000, 2_020_000_000)
 
 
@@ -265,7 +265,7 @@ def test_faults_come_as_often_as_asked():
     assert 0.16 < sum(one not in (b"", b"record") for one in sent) / 4000 < 0.20
     assert all(len(one) in (0, 6) for one in sent)
     assert Faults().disturb(b"record", rng) == b"record"
-    assert [within((1.0, 0.5), t) for t in (0.9, 1.0, 1.49, 1.5)] == [False, True, True, False]
+    assert [is_during((1.0, 0.5), t) for t in (0.9, 1.0, 1.49, 1.5)] == [False, True, True, False]
 
 
 @pytest.fixture

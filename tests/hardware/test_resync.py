@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tactile_bayes.hardware.readings import Parser, PoseReading
-from tactile_bayes.hardware.serial_trackers import PROTOCOLS, TRACKERS, encoded
+from tactile_bayes.hardware.serial_trackers import PROTOCOLS, TRACKERS, encode_record
 
 BEFORE, AFTER = 2, 5
 STREAMS = 40
@@ -48,7 +48,7 @@ def stream_of(name: str, seed: int) -> Stream:
         x, y, z = (float(v) for v in place)
         w, i, j, k = (float(v) for v in turn / np.linalg.norm(turn))
         pose = PoseReading((x, y, z), (w, i, j, k), 8_333_333 * (number + 1 + int(rng.integers(1000))))
-        record = encoded("bird" if name == GROUP else name, pose, number)
+        record = encode_record("bird" if name == GROUP else name, pose, number)
         records.append(record + (b"\x01" if name == GROUP else b""))
     poses = parser_of(name).feed(b"".join(records))
     assert len(poses) == len(records)

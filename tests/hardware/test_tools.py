@@ -214,7 +214,7 @@ def followed(follower: Follower, *readings: PoseReading | MissingReading, step_n
 def test_only_the_chosen_tool_is_followed_and_others_are_counted():
     follower = Follower("b")
     assert followed(follower, pose(1, "a"), pose(2, "b"), pose(3, "c"), MissingReading("hidden", "b")) == [2, "hidden"]
-    assert follower.others == {"a": 1, "c": 1}
+    assert follower.other_tools == {"a": 1, "c": 1}
     assert followed(Follower(), pose(1, "a"), pose(2, "b"), pose(3, "a")) == [1, 3]  # by default that seen first
 
 
@@ -318,7 +318,7 @@ def test_two_tools_are_refused_without_a_choice_and_followed_with_one(protocol):
 
 def test_a_name_may_leave_out_the_frame_but_not_part_of_the_name():
     tools = ("ProbeToTracker", "Probe2ToTracker", "ReferenceToTracker", "0A-8700339")
-    called = serial_trackers._called
+    called = serial_trackers._tools_named
     assert called(tools, "Probe") == called(tools, "ProbeToTracker") == ["ProbeToTracker"]
     assert called(tools, "0A") == ["0A-8700339"]
     assert called(tools, "Pro") == called(tools, ".*") == []
@@ -519,8 +519,8 @@ def test_headers_after_headers_do_not_keep_the_program_busy(monkeypatch):
 def test_names_without_end_are_counted_together():
     follower = Follower("tool")
     assert followed(follower, *(pose(0, f"made up {i}") for i in range(1000)), *[pose(0, "made up 3")] * 5) == []
-    assert len(follower.others) < 20
-    assert (follower.others.total(), follower.others["made up 3"]) == (1005, 6)
+    assert len(follower.other_tools) < 20
+    assert (follower.other_tools.total(), follower.other_tools["made up 3"]) == (1005, 6)
 
 
 def test_a_second_head_on_the_line_is_told_and_its_frames_are_left_out():

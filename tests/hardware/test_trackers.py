@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tactile_bayes.hardware.head import encode_pose
 from tactile_bayes.hardware.readings import PoseReading
-from tactile_bayes.hardware.serial_trackers import TRACKERS, record_bytes
+from tactile_bayes.hardware.serial_trackers import TRACKERS, encode_bird
 from tactile_bayes.hardware.trackers import crc64, encode_transform
 
 # One pose in every protocol: (10, -5, 1) inches, quaternion (.5, .5, -.5, .5).
@@ -138,7 +138,7 @@ def test_the_size_may_or_may_not_count_the_space(size):
 def test_bird_words_are_fourteen_bits():
     (pose,) = TRACKERS["bird"].parser().feed(BIRD)
     assert [mm / 25.4 for mm in pose.position_mm] == pytest.approx([9.99756, -5.00098, 0.99756], abs=1e-5)
-    assert record_bytes((10, -5, 1, 0.5, 0.5, -0.5, 0.5)) == BIRD
+    assert encode_bird((10, -5, 1, 0.5, 0.5, -0.5, 0.5)) == BIRD
     (second,) = FLOCK().feed(BIRD + b"\x02")
     assert second.tool == "2"
 

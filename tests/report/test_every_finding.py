@@ -33,7 +33,7 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.campaigns.report import Row, done_line, grown_line
 from tactile_bayes.declarations import replace
-from tactile_bayes.exports.exam import Identity, MapFile, estimate_of
+from tactile_bayes.exports.exam import Identity, MapFile, parse_estimate
 from tactile_bayes.exports.fhir import bundle_of
 from tactile_bayes.exports.redcap import records_csv
 from tactile_bayes.files.manifest_csv import Exam as Listed
@@ -104,11 +104,11 @@ class Made:
 
     @property
     def exported(self) -> Any:
-        return estimate_of(self.answer.document, Path("e.json"))
+        return parse_estimate(self.answer.document, Path("e.json"))
 
     @property
     def pooled_export(self) -> Any:
-        return estimate_of(self.pooled.document, Path("p.json"))
+        return parse_estimate(self.pooled.document, Path("p.json"))
 
     @property
     def map_file(self) -> MapFile:

@@ -32,17 +32,17 @@ from tactile_bayes.size.terms import Recipe
 from tactile_bayes.studies import estimate_tradeoff as study
 from tactile_bayes.studies.estimate_tradeoff import (
     SIZE,
-    Choice,
-    Estimator,
-    Ladder,
+    MapEstimator,
+    MeasuredSetting,
     PooledRow,
-    Priced,
-    Work,
+    Setting,
+    StudyRun,
+    Tradeoff,
+    answer_without_number,
     distances,
+    make_reference,
     measure,
-    no_number,
-    priced,
-    reference_of,
+    measure_setting,
 )
 
 Run = Callable[..., "CompletedProcess[str]"]
@@ -60,11 +60,11 @@ def inputs_of(tactile_map: TactileMap) -> tuple[Calibration | None, SamplerSetti
     return calibration, options
 
 
-def estimator_of(tactile_map: TactileMap, calibration: Calibration | None = None) -> Estimator:
-    return Estimator(tactile_map, calibration or inputs_of(tactile_map)[0], Work(time.process_time, 0.2))
+def estimator_of(tactile_map: TactileMap, calibration: Calibration | None = None) -> MapEstimator:
+    return MapEstimator(tactile_map, calibration or inputs_of(tactile_map)[0], StudyRun(time.process_time, 0.2))
 
 
-def ladder_of(tactile_map: TactileMap, **chosen: object) -> Ladder:
+def ladder_of(tactile_map: TactileMap, **chosen: object) -> Tradeoff:
     """A ladder of few settings, each run once, under a clock that ticks once a look."""
     ticks = itertools.count()
     calibration, options = inputs_of(tactile_map)
@@ -77,16 +77,16 @@ def ladder_of(tactile_map: TactileMap, **chosen: object) -> Ladder:
             tactile_map,
             calibration=calibration,
             options=options,
-            work=Work(lambda: float(next(ticks)), 0.2, 1),
+            work=StudyRun(lambda: float(next(ticks)), 0.2, 1),
         )
 
 
 @cache
-def ladder() -> Ladder:
+def ladder() -> Tradeoff:
     return ladder_of(field_map())
 
 
-def row(label: str) -> Priced:
+def row(label: str) -> MeasuredSetting:
     (found,) = (one for one in ladder().rows if one.label == label)
     return found
 
@@ -149,7 +149,7 @@ def test_wrong_settings_come_out_as_wrong():
     right = [row(label) for label in ("--method importance", "--method laplace", "--accuracy-sd 0.01")]
     assert row("field_cosines 8").ends_off_mm > 3 * max(one.ends_off_mm for one in right)
     assert row("fit_radius_mm 8").answer.reported is None
-    assert ladder().enough() in right
+    assert ladder().cheapest_sufficient() in right
     said = " ".join(advice(ladder()))
     assert re.search(rf"more than 0.2 mm: .*field_cosines 8 {row('field_cosines 8').ends_off_mm:.1f} mm\.", said)
     assert "No size by fit_radius_mm 8." in said
@@ -160,12 +160,14 @@ def test_an_answer_is_compared_with_one_of_its_kind_only():
     some = row("--method laplace").answer
     assert distances([some], some)[1] == 0.0
     assert distances([some], None)[1] is None
-    assert distances([no_number("no lump", 0.1)], some)[1] is None
+    assert distances([answer_without_number("no lump", 0.1)], some)[1] is None
     widths = replace(some, quantities={name: q for name, q in some.quantities.items() if name != SIZE})
     assert distances([widths], some)[1] is None
 
 
-def made(label: str, seconds: float, off: float | None, *, default: bool = False, usable: bool = True) -> Priced:
+def made(
+    label: str, seconds: float, off: float | None, *, default: bool = False, usable: bool = True
+) -> MeasuredSetting:
     """A row as if it had been measured."""
     some = row("--method importance")
     return replace(some, label=label, cpu_s={"estimate": seconds}, ends_off_mm=off, default=default, usable=usable)
@@ -181,13 +183,13 @@ def test_the_frontier_and_what_is_enough():
         made("slow and no better", 6.0, 0.03),
         made("another model", 0.01, 0.1, usable=False),
     )
-    found = Ladder(rows, ladder().reference, 0.2)
+    found = Tradeoff(rows, ladder().reference, 0.2)
     assert [one.label for one in found.frontier()] == ["another model", "default", "slow"]
-    assert found.enough().label == "quick"
+    assert found.cheapest_sufficient().label == "quick"
     hardly_quicker = replace(found, rows=(rows[0], made("quick", 0.9, 0.15)))
-    assert hardly_quicker.enough().label == "default"
+    assert hardly_quicker.cheapest_sufficient().label == "default"
     strict = replace(found, tolerance_mm=0.001)
-    assert strict.enough() is None
+    assert strict.cheapest_sufficient() is None
     assert "no setting has its interval ends within 0.001 mm" in advice(strict)[0]
 
 
@@ -195,15 +197,18 @@ def test_the_frontier_and_what_is_enough():
 def test_least_time_counts_and_a_slow_setting_is_run_twice():
     spent = iter([5.0, 4.0, 1.0])
     some = row("--method laplace").answer
-    found = priced(
-        Choice("a", "b", None), lambda *_: ({"estimate": next(spent)}, some), reference_of("", some, 0.0), runs=3
+    found = measure_setting(
+        Setting("a", "b", None), lambda *_: ({"estimate": next(spent)}, some), make_reference("", some, 0.0), runs=3
     )
     assert (found.seconds, found.runs) == (4.0, 2)
 
 
 @pytest.mark.long
 def test_it_can_be_read_printed_and_drawn(tmp_path: Path):
-    pooled = (PooledRow(1, 0.2, row("--method laplace").answer, 5.0), PooledRow(2, 0.4, no_number("1 of 2"), None))
+    pooled = (
+        PooledRow(1, 0.2, row("--method laplace").answer, 5.0),
+        PooledRow(2, 0.4, answer_without_number("1 of 2"), None),
+    )
     found = replace(ladder(), pooled=pooled, shared_cpu_s={"start": 0.2})
     text = tradeoff_text({"a map": found})
     assert "* --method importance" in text
@@ -256,21 +261,21 @@ def test_a_row_says_that_chains_took_over():
 def test_beside_chains_other_models_are_tried_by_laplace():
     settings = study.settings_of(SamplerSettings(background="free", noise="field"), level_known=True)
     chains, weights = row("--method ensemble").answer, row("--method importance").answer
-    assert study.worth_trying(settings, weights) == settings
-    tried = study.worth_trying(settings, chains)
+    assert study.relevant_settings(settings, weights) == settings
+    tried = study.relevant_settings(settings, chains)
     assert [one.axis for one in tried] == [one.axis for one in settings]
     others = [one for one in tried if one.axis in (study.FIELD, study.WINDOW)]
-    assert {one.how.method for one in others} == {"laplace"}
-    assert all(one.label.endswith(", laplace") and not one.how.step_up for one in others)
+    assert {one.options.method for one in others} == {"laplace"}
+    assert all(one.label.endswith(", laplace") and not one.options.step_up for one in others)
     assert sum(one.weight for one in tried) < 0.2 * sum(one.weight for one in settings)
-    silent = study.worth_trying(settings, no_number("no lump", 0.1))
+    silent = study.relevant_settings(settings, answer_without_number("no lump", 0.1))
     assert {one.axis for one in silent} == {study.METHOD, study.FIELD, study.WINDOW}
 
 
 def test_settings_that_disagree_are_not_believed():
-    none = replace(made("none", 1.0, None, default=True), answer=no_number("no lump", 0.9))
+    none = replace(made("none", 1.0, None, default=True), answer=answer_without_number("no lump", 0.9))
     some = replace(made("some", 1.0, None), answer=replace(row("--method laplace").answer, detected_probability=0.96))
-    said = advice(Ladder((none, some), reference_of("none: no lump", None, 1.0), 0.2))
+    said = advice(Tradeoff((none, some), make_reference("none: no lump", None, 1.0), 0.2))
     assert said == [
         "Advice: the default gives no size, 1 of 2 settings do (some) (probability of one 0.900 to 0.960): the map is "
         "at the limit of what can be sized. Believe none of them; scan the place again."

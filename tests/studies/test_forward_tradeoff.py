@@ -29,7 +29,7 @@ from tactile_bayes.size.draws import ShapeDraws, ShapePrior
 from tactile_bayes.size.eq6 import SizeCalibration
 from tactile_bayes.size.pooling import SizePriors, pooled_size
 from tactile_bayes.studies import tradeoffs
-from tactile_bayes.studies.estimate_tradeoff import SIZE, Ladder, Work
+from tactile_bayes.studies.estimate_tradeoff import SIZE, StudyRun, Tradeoff
 from tactile_bayes.studies.paper import Geometry, MapFit, StudyRow, StudySettings
 from tactile_bayes.studies.paper_solid import SolidSettings
 from tactile_bayes.studies.tradeoffs import (
@@ -38,16 +38,16 @@ from tactile_bayes.studies.tradeoffs import (
     LumpCase,
     SizeRule,
     calibrated_rule,
-    case_of,
     dimensions_note,
     learned_rule,
+    lump_case,
     measure_forward,
 )
 from tactile_bayes.studies.tradeoffs import forward_settings as settings_of
 
 Run = Callable[..., "CompletedProcess[str]"]
 BALL = SolidLump(seat=0.0)
-CASE = case_of(Scene(body=SceneBody(), solid_lumps=(BALL,)))
+CASE = lump_case(Scene(body=SceneBody(), solid_lumps=(BALL,)))
 RULE = SizeRule(lambda _, x, y: max(3 * x, 3 * (y or 0.0)), 0.12, "a rule")
 
 
@@ -59,7 +59,7 @@ def off_of(settings: StudySettings | SolidSettings) -> float:
     return {1: 0.05, 2: 0.002, 3: 0.001, finest: 0.0}[settings.fineness]
 
 
-def ladders(case: LumpCase = CASE, rule: SizeRule = RULE, share: float = 0.005) -> dict[str, Ladder]:
+def ladders(case: LumpCase = CASE, rule: SizeRule = RULE, share: float = 0.005) -> dict[str, Tradeoff]:
     """Made-up measurements: the finer, the dearer and the nearer to a = 0.3, sigma = 5 mm."""
     spent = [0.0]
 
@@ -80,23 +80,23 @@ def ladders(case: LumpCase = CASE, rule: SizeRule = RULE, share: float = 0.005) 
             patch.setattr(kind, "maps", maps)
             patch.setattr(kind, "fitted", fitted)
         patch.setattr(tradeoffs, "_empirical", lambda case: lambda _: replace(case.plane, fineness=1))
-        work = Work(lambda: spent[0], 1.0, 1)
+        work = StudyRun(lambda: spent[0], 1.0, 1)
         return {model: measure_forward(case, model, rule, share=share, work=work) for model in (PLANE, SOLID)}
 
 
 def test_each_model_has_one_default_and_a_finer_reference() -> None:
     for model in (PLANE, SOLID):
         settings, finest = settings_of(CASE, model)
-        (default,) = (one.how.settings for one in settings if one.default)
+        (default,) = (one.options.settings for one in settings if one.default)
         assert default == (CASE.plane if model == PLANE else CASE.solid)
-        assert finest.how.settings.fineness > max(one.how.settings.fineness for one in settings if one.usable)
-    assert [one.label for one in settings_of(CASE, PLANE)[0] if one.how.empirical] == ["Eqs 1 to 4"]
+        assert finest.options.settings.fineness > max(one.options.settings.fineness for one in settings if one.usable)
+    assert [one.label for one in settings_of(CASE, PLANE)[0] if one.options.empirical] == ["Eqs 1 to 4"]
 
 
 def test_the_default_plane_setting_is_the_study(monkeypatch: pytest.MonkeyPatch) -> None:
     ticks = count()
     monkeypatch.setattr(tradeoffs, "_PLANE", ((2, 0.25), (1, 0.5)))
-    found = measure_forward(CASE, PLANE, RULE, share=0.005, work=Work(lambda: float(next(ticks)), 1.0, 2))
+    found = measure_forward(CASE, PLANE, RULE, share=0.005, work=StudyRun(lambda: float(next(ticks)), 1.0, 2))
     (row,) = StudySettings().rows(Geometry(0.0, 15.0, 1.0, (100.0,)))
     told = {name: one.median for name, one in found.default.answer.quantities.items()}
     assert (told["amplitude"], told["sigma_x_mm"]) == pytest.approx((row.amplitude, row.sigma_x_mm), rel=1e-9)
@@ -108,7 +108,7 @@ def test_the_default_plane_setting_is_the_study(monkeypatch: pytest.MonkeyPatch)
 def test_a_scene_gives_its_body_and_head_to_both_models() -> None:
     body = SceneBody(fat_kpa=4.0, gland_ratio=6.0, thickness_mm=50.0, nu=0.49, fat_mm=16.0)
     scene = Scene(body=body, solid_lumps=(SolidLump(d_mm=12.0, depth_ratio=0.9),), head=Head(radius_mm=40.0))
-    case = case_of(scene)
+    case = lump_case(scene)
     assert case.seat == pytest.approx((16.0 - 10.8) / 6.0)
     for settings in (case.plane, case.solid):
         assert (settings.fat_kpa, settings.gland_ratio, settings.thickness_mm, settings.poisson) == (
@@ -122,10 +122,10 @@ def test_a_scene_gives_its_body_and_head_to_both_models() -> None:
 
 def test_the_head_is_that_of_both_models_and_moves_their_numbers() -> None:
     scene = Scene(body=SceneBody(), solid_lumps=(SolidLump(depth_ratio=1.5, seat=0.0),))
-    cases = {head: case_of(scene, head=head) for head in (None, *HEADS)}
+    cases = {head: lump_case(scene, head=head) for head in (None, *HEADS)}
     plain, inside, outside = cases.values()
     assert (plain.plane, plain.solid) == (inside.plane, outside.solid)  # each model's default, by name
-    heads = {name: [case.of(model).head.shoulders for model in (PLANE, SOLID)] for name, case in cases.items()}
+    heads = {name: [case.settings(model).head.shoulders for model in (PLANE, SOLID)] for name, case in cases.items()}
     assert heads == {None: [SHOULDERS_INSIDE, SHOULDERS_OUTSIDE]} | {head: [head, head] for head in HEADS}
     assert inside.solid.head.surface_mm()[0, 0, 2] < outside.solid.head.surface_mm()[0, 0, 2]
     seen = [case.plane.fitted(case.plane.maps(case.body)(100.0)).amplitude for case in (inside, outside)]
@@ -134,11 +134,11 @@ def test_the_head_is_that_of_both_models_and_moves_their_numbers() -> None:
 
 @pytest.mark.parametrize(("head", "edge"), [(None, "rim"), (SHOULDERS_INSIDE, "shoulders")])
 def test_the_head_without_its_edge_is_another_head(head: str | None, edge: str) -> None:
-    case = case_of(Scene(body=SceneBody(), solid_lumps=(BALL,)), head=head)
+    case = lump_case(Scene(body=SceneBody(), solid_lumps=(BALL,)), head=head)
     (bare,) = (one for one in settings_of(case, SOLID)[0] if one.axis == "head")
     assert bare.label == f"head without {edge}"
-    assert (bare.how.settings.head.shoulder_mm, bare.how.settings.head.rim_mm) == (0.0, 0.0)
-    assert bare.how.settings != case.solid
+    assert (bare.options.settings.head.shoulder_mm, bare.options.settings.head.rim_mm) == (0.0, 0.0)
+    assert bare.options.settings != case.solid
 
 
 @pytest.mark.parametrize("head", [None, *HEADS])
@@ -148,12 +148,12 @@ def test_the_command_hands_its_head_on_and_names_it(head: str | None, monkeypatc
     words = [] if head is None else ["--head", head]
     found = {form: CliRunner().invoke(tradeoff_forward_command, [*words, *form]) for form in ((), ("--json",))}
     case, documents = (
-        case_of(Scene(body=SceneBody(), solid_lumps=(BALL,)), head=head),
+        lump_case(Scene(body=SceneBody(), solid_lumps=(BALL,)), head=head),
         json.loads(found[("--json",)].stdout),
     )
     for model, document in zip((PLANE, SOLID), documents, strict=True):
         check_document(document, "tradeoff.schema.json")
-        kept, shoulders = document["provenance"]["settings"], case.of(model).head.shoulders
+        kept, shoulders = document["provenance"]["settings"], case.settings(model).head.shoulders
         assert (kept["model"], kept["d_mm"], kept["head"]) == (model, 15.0, shoulders)
         title = f"{model}: lump of 15 mm, h/d 1, 100 times as stiff as fat, centred; head: {shoulders}"
         assert title in found[()].stdout
@@ -239,7 +239,7 @@ def test_the_advice_names_the_cheapest_that_is_enough() -> None:
     assert "Sizes by a rule, which itself leaves 12 % (SD of ln d)" in text
     assert text.count("the interval is what the calibration leaves") == 2
     strict = ladders(share=1e-9)
-    assert strict[SOLID].enough() is None
+    assert strict[SOLID].cheapest_sufficient() is None
     assert "no setting has its interval ends within" in tradeoff_text(strict)
     none = ladders(rule=replace(RULE, largest=lambda *_: float("nan")))[SOLID]
     assert SIZE not in none.default.answer.quantities
@@ -284,7 +284,7 @@ REFUSED = {
 def test_what_is_not_one_ball_is_refused(name: str) -> None:
     scene, words = REFUSED[name]
     with pytest.raises(BadDataError, match=words):
-        case_of(scene)
+        lump_case(scene)
 
 
 def test_a_scene_that_cannot_be_is_told_with_its_file(run_cli: Run, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from tactile_bayes.report.tradeoff import ladder_file, ladder_text
 from tactile_bayes.scans import Scan
 from tactile_bayes.studies import estimate_tradeoff
 from tactile_bayes.studies import tradeoffs as study
-from tactile_bayes.studies.estimate_tradeoff import SIZE, WIDTHS, Ladder, Priced, Work
+from tactile_bayes.studies.estimate_tradeoff import SIZE, WIDTHS, MeasuredSetting, StudyRun, Tradeoff
 from tactile_bayes.studies.tradeoffs import measure_map
 
 DEMO = Path(tactile_bayes.__file__).parent / "demo" / "scan.mcap"
@@ -33,18 +33,18 @@ def demo() -> Scan:
 
 
 @cache
-def ladder() -> Ladder:
+def ladder() -> Tradeoff:
     ticks = itertools.count()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study, "CELLS_MM", (0.5, 8.0))
         patch.setattr(study, "EVERY", (2, 1000))
         patch.setattr(study, "SHARES_OF_TIME", (0.01,))
         patch.setattr(estimate_tradeoff, "LONG_RUNS", (("importance", 0.01),))
-        work = Work(lambda: float(next(ticks)), 0.2, 1)
+        work = StudyRun(lambda: float(next(ticks)), 0.2, 1)
         return measure_map(demo(), inputs=partial(estimate_inputs, Settings()), work=work)
 
 
-def row(label: str) -> Priced:
+def row(label: str) -> MeasuredSetting:
     (found,) = (one for one in ladder().rows if one.label == label)
     return found
 
@@ -69,7 +69,7 @@ def test_cells_too_large_come_out_as_wrong():
     """The negative control: the lump's sigma is 5 mm, cells of 8 mm do not resolve it."""
     wrong = row("--cell-mm 8")
     assert wrong.answer.reported is None or wrong.median_off_mm > 5 * row("--cell-mm 1").median_off_mm
-    assert ladder().enough() is not wrong
+    assert ladder().cheapest_sufficient() is not wrong
 
 
 @pytest.mark.long
@@ -91,4 +91,4 @@ def test_what_cannot_be_built_or_sized_is_a_row_too():
 def test_a_scan_without_a_map_is_refused():
     short, inputs = first_seconds(demo(), 0.001), partial(estimate_inputs, Settings())
     with pytest.raises(BadDataError):
-        measure_map(short, inputs=inputs, work=Work(lambda: 0.0, 0.2, 1))
+        measure_map(short, inputs=inputs, work=StudyRun(lambda: 0.0, 0.2, 1))

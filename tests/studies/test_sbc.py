@@ -23,12 +23,12 @@ from tactile_bayes.studies.sbc import (
     RankTest,
     Truth,
     chi2_p,
+    count_other_rises,
     coverage,
     ecdf_band,
     ecdf_counts,
-    other_rises,
     rank_test,
-    uniform_strays,
+    uniform_least_tails,
 )
 
 TRUTH = Truth(1.2, 6.0, 4.5, 1.3, -0.8, 6.0, 3.0, 0.02)
@@ -93,8 +93,8 @@ def test_the_band_holds_a_whole_path_as_often_as_it_says() -> None:
 
 def test_ranks_of_uniform_samples_are_judged_alike_by_band_and_p_value() -> None:
     rng = np.random.default_rng(9)
-    strays = uniform_strays(60, DRAWS)
-    found = [rank_test("x", rng.integers(0, DRAWS + 1, size=60), draws=DRAWS, strays=strays).inside for _ in range(200)]
+    tails = uniform_least_tails(60, DRAWS)
+    found = [rank_test("x", rng.integers(0, DRAWS + 1, size=60), draws=DRAWS, tails=tails).inside for _ in range(200)]
     assert 0.9 <= np.mean(found) <= 0.99
 
 
@@ -153,14 +153,14 @@ def test_truths_follow_the_prior_and_fit_the_window() -> None:
     assert np.mean([one.amplitude for one in drawn]) == pytest.approx(prior.amplitude_sd * np.sqrt(2 / np.pi), rel=0.06)
 
 
-def maps_with(probability: float, elsewhere: int, *, of: int) -> list[MapRanks]:
+def maps_with(probability: float, measured_other_rise: int, *, of: int) -> list[MapRanks]:
     ranks = (50,) * len(sbc.RANKED)
-    made = [MapRanks(i, TRUTH, None, ELSEWHERE, probability) for i in range(elsewhere)]
-    return made + [MapRanks(i, TRUTH, ranks, "importance", probability) for i in range(elsewhere, of)]
+    made = [MapRanks(i, TRUTH, None, ELSEWHERE, probability) for i in range(measured_other_rise)]
+    return made + [MapRanks(i, TRUTH, ranks, "importance", probability) for i in range(measured_other_rise, of)]
 
 
 def test_other_rises_are_held_against_what_the_probabilities_announce() -> None:
-    honest, sure = other_rises(maps_with(0.98, 5, of=200)), other_rises(maps_with(0.999, 5, of=200))
+    honest, sure = count_other_rises(maps_with(0.98, 5, of=200)), count_other_rises(maps_with(0.999, 5, of=200))
     assert (honest.number, sure.number) == (5, 5)
     assert honest.announced == pytest.approx(4.0)
     assert honest.chance == pytest.approx(1 - np.exp(-4) * (1 + 4 + 8 + 64 / 6 + 256 / 24))  # five or more, mean 4
@@ -173,7 +173,7 @@ def test_another_rise_is_one_that_neither_reaches() -> None:
     rest = {"angle_rad": np.zeros(1), "background": np.ones(1), "noise_sd": np.ones(1)}
     near = MapPosterior(**(at | rest | {"x_mm": np.array([TRUTH.x_mm + 5.9])}))
     far = MapPosterior(**(at | rest | {"x_mm": np.array([TRUTH.x_mm + 6.1])}))
-    assert (sbc.elsewhere(near, TRUTH), sbc.elsewhere(far, TRUTH)) == (False, True)
+    assert (sbc.measured_other_rise(near, TRUTH), sbc.measured_other_rise(far, TRUTH)) == (False, True)
 
 
 def size_ranks(n: int, *, wider: float = 1.0) -> np.ndarray:

@@ -19,8 +19,8 @@ from tactile_bayes.hardware.emulated import (
     Emulator,
     Faults,
     Link,
+    Playback,
     PtyLink,
-    Stage,
     TcpLink,
 )
 from tactile_bayes.scans import Scan
@@ -35,11 +35,11 @@ def short_scan(duration_s: float = 1.0, *, seed: int = 3) -> Scan:
 
 @contextmanager
 def serving(
-    device: Device, link: Link, faults: Faults | None = None, *, stage: Stage | None = None, leads: bool = True
+    device: Device, link: Link, faults: Faults | None = None, *, stage: Playback | None = None, leads: bool = True
 ) -> Iterator[Emulator]:
     """Serve a device until the block ends; the emulator's link says where."""
     rng = np.random.default_rng(1)
-    emulator = Emulator(device, link, faults=faults or Faults(), rng=rng, stage=stage or Stage(), leads=leads)
+    emulator = Emulator(device, link, faults=faults or Faults(), rng=rng, stage=stage or Playback(), leads=leads)
     thread = threading.Thread(target=emulator.run, daemon=True)
     thread.start()
     try:
@@ -64,7 +64,7 @@ def head_and_tracker(
 ) -> Iterator[list[str]]:
     """Both devices of a scan; the words that tell `record` about them."""
     links: list[Link] = [TcpLink("127.0.0.1", 0), TcpLink("127.0.0.1", 0)] if tcp else [PtyLink(), PtyLink()]
-    stage = Stage(speed=speed)
+    stage = Playback(speed=speed)
     tracker = EmulatedTracker(scan.poses, protocol=protocol, faults=tracker_faults)
     with (
         serving(EmulatedHead(scan), links[0], head_faults, stage=stage),
