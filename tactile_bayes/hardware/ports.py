@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 import re
@@ -167,6 +168,8 @@ def _reason(error: Exception) -> str:
     if not isinstance(number, int):
         wrapped = _ERROR_NUMBER.search(str(error))
         number = int(wrapped[1]) if wrapped else 0
+    if number in (errno.EAGAIN, errno.EBUSY):  # of the lock on a port
+        return "another program has it open"
     # a resolver's numbers are below 0, and its words stand behind them
     return os.strerror(number) if number > 0 else str(error).split("] ")[-1].split(": ")[-1].strip("[]()'\" ")
 

@@ -424,17 +424,15 @@ class Recorder:
         self.report.fault = f"{line.port.name}: more data was expected, {event}{saved}; {remedy}"
 
     def _check_silence(self, now_ns: int) -> None:
+        """End the recording when a device has sent nothing for too long; of several the one that fell silent first."""
         if not self.recording or self.report.ended_by:
             return
-        for line in self._lines:
-            silent_s = (now_ns - line.heard_ns) / 1e9
-            if (
-                silent_s > line.silent_s / min(1.0, self.speed)
-                and not line.finished
-                and not select.select([line.stream], [], [], 0)[0]
-            ):
+        for line in sorted(self._lines, key=lambda line: line.heard_ns):
+            silent_s, limit_s = (now_ns - line.heard_ns) / 1e9, line.silent_s / min(1.0, self.speed)
+            if silent_s > limit_s and not line.finished and not select.select([line.stream], [], [], 0)[0]:
                 self._fail(line, f"nothing has come for {silent_s:.1f} s", "check that the device runs")
                 self.stop(f"the {line.role} fell silent")
+                return
 
     def _check_host_time(self, now_ns: int) -> None:
         """End a recording of limited duration by the host's clock when the head's is behind."""

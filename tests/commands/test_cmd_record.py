@@ -343,6 +343,13 @@ def test_no_trace_is_left_when_the_devices_are_not_there(record, tmp_path):
     assert not (tmp_path / "a.mcap").exists()
 
 
+def test_one_port_for_both_devices_is_refused(record):
+    """It was opened twice: "Resource temporarily unavailable", from the devices' own error code."""
+    done = record("--head", "/dev/nothing", "--tracker", "/dev/nothing")
+    assert done.returncode == 2
+    assert done.stderr == "error: --head and --tracker are both /dev/nothing; give two ports\n"
+
+
 @pytest.mark.parametrize(
     ("url", "words"),
     [

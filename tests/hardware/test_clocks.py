@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import select
+
 import numpy as np
 import pytest
 from emulated_devices import short_scan
@@ -338,6 +340,17 @@ def test_gaps_a_promise_not_kept_and_a_stuck_tracker_are_told():
     assert "no frame for 0.52 s from 2.48 s on (longest gap)" in cautions
     assert any(text.startswith("the head promised 200 frames per second and measured 43") for text in cautions)
     assert "every pose is the same: the tracker does not follow the head" in cautions
+
+
+def test_of_two_silent_devices_one_is_named(monkeypatch):
+    """The recording said that the head fell silent, its error named the tracker."""
+    monkeypatch.setattr(select, "select", lambda *_: ([], [], []))
+    session = Session()
+    head, tracker = session.lines
+    head.port.name, head.heard_ns, tracker.heard_ns = "head fake", 100, 200
+    session.recorder._check_silence(4 * S)
+    assert session.recorder.report.ended_by == "the head fell silent"
+    assert session.recorder.report.fault.startswith("head fake: ")
 
 
 @pytest.mark.parametrize("speed", [0.05, 20.0])

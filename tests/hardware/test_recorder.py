@@ -22,7 +22,7 @@ from tactile_bayes.files import scan_mcap
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid
 from tactile_bayes.hardware import reading
-from tactile_bayes.hardware.emulated import EmulatedTracker, Faults, is_during
+from tactile_bayes.hardware.emulated import EmulatedTracker, Faults, PtyLink, is_during
 from tactile_bayes.hardware.ports import Port, Stream, preview, read_in_process
 from tactile_bayes.hardware.readings import ArrivalClock, PoseClock, PoseReading
 from tactile_bayes.hardware.recorder import LandmarkTouch
@@ -152,6 +152,15 @@ def test_a_port_without_descriptor_is_read_all_the_same():
 )
 def test_what_came_is_shown(data, words):
     assert words in preview(data)
+
+
+def test_a_port_that_another_program_has_open_says_so():
+    link = PtyLink()
+    port = Port(link.url, baud=9600, role="head")
+    with pytest.raises(DeviceError, match=r"cannot be opened \(another program has it open\)"):
+        Port(link.url, baud=9600, role="tracker")
+    port.close()
+    link.close()
 
 
 @pytest.mark.parametrize("name", TRACKERS)
