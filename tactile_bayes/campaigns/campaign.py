@@ -19,7 +19,7 @@ from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import refuse_same
 from tactile_bayes.files.manifest_csv import JOURNAL, Exam, read_manifest
-from tactile_bayes.files.reading import check_address, put
+from tactile_bayes.files.reading import check_address, upload
 from tactile_bayes.files.size_json import NONE, size_calibration_path
 from tactile_bayes.options import CampaignOptions
 from tactile_bayes.presets import RESEARCH_USE
@@ -153,7 +153,7 @@ def run_campaign(
         written = report.write_outputs(run, unlisted=left)
         for name in (*report.WRITTEN, JOURNAL):  # the journal last: with it the copy is whole
             if settings.copy_to and (place / name).exists():
-                put(place / name, f"{settings.copy_to}/{name}")
+                upload(place / name, f"{settings.copy_to}/{name}")
     return CampaignResult(run, output, written)
 
 

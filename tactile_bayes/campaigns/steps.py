@@ -32,7 +32,7 @@ from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.map_nc import read_map, read_map_and_scans, write_map
 from tactile_bayes.files.npz import read_shape, write_shape
 from tactile_bayes.files.provenance import Provenance, scan_facts
-from tactile_bayes.files.reading import NETCDF_BYTES, downloaded, kind_of, put, read_bytes
+from tactile_bayes.files.reading import NETCDF_BYTES, downloaded, kind_of, read_bytes, upload
 from tactile_bayes.files.reports import EstimateReport, json_text
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.findings import by_severity
@@ -371,7 +371,7 @@ def copy_files(folder: Path, files: Sequence[str], *, to: str) -> Made:
     """Copy files into an object store."""
     try:
         for name in files:
-            put(folder / name, f"{to}/{name}")
+            upload(folder / name, f"{to}/{name}")
     except UsageError as error:
         return {UNWRITTEN: str(error)}, {}
     return {}, {}

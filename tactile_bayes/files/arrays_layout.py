@@ -1,4 +1,4 @@
-"""Layout of a scan's arrays in other programs' files, and what can be stated of them and of a grid."""
+"""Layout of a scan's arrays in other programs' files, and the options that describe such arrays or a grid."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def layout_lines() -> list[str]:
     return [f"- {name} ({in_words(one.shape)}{left_out.get(name, '')}): {one.meaning}" for name, one in LAYOUT.items()]
 
 
-# --- What can be stated of the arrays, on the command line, in MAP.toml and in Python.
+# --- Options that describe the arrays, on the command line, in MAP.toml and in Python.
 
 Unit = Literal["counts", "kPa", "Pa", "psi", "mmHg", "N/cm2"]
 TimeUnit = Literal["s", "ms", "us", "ns", "min"]
@@ -64,7 +64,7 @@ Rate = Annotated[float, Meta(gt=0, le=100_000)]
 
 
 class Stated(Options, kw_only=True):
-    """What is stated of a scan's arrays; the rest is taken from their file, or guessed and printed."""
+    """Options that describe a scan's arrays; the rest is taken from their file, or guessed and printed."""
 
     unit: Annotated[
         Unit | None,
@@ -116,7 +116,7 @@ class Stated(Options, kw_only=True):
 
     @property
     def given(self) -> dict[str, Any]:
-        """What is stated, by its names."""
+        """Options that are set, by name."""
         return {name: value for name in names_of(self) if (value := getattr(self, name)) not in (None, {})}
 
 
@@ -129,13 +129,13 @@ class ArrayMap(Stated, kw_only=True):
     )
 
 
-# --- What can be stated of a grid.
+# --- Options that describe a grid.
 
 _LONGEST_UNITS: Final = 20
 
 
 class GridOptions(Options, kw_only=True):
-    """What is stated of a grid of values that becomes a map."""
+    """Options that describe a grid of values, which becomes a map."""
 
     spacing_mm: Annotated[float | None, cli_meta("H"), "Map: side of the square cells, in mm."] = None
     cell_mm: Annotated[

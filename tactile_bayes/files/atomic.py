@@ -1,4 +1,4 @@
-"""Files written whole or not at all, and names that are safe to use."""
+"""Atomic writing of files, and checks of output names."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def first_duplicate(paths: Iterable[Path]) -> Path | None:
 
 
 def _identity(path: Path) -> tuple[int, int] | str:
-    """Identity that all names of a file share; where it does not exist, the name that it would have."""
+    """Device and inode of a file, which all its names share; its real path where it does not exist."""
     try:
         status = path.stat()
     except OSError:  # opening it says what is wrong with it
@@ -122,12 +122,12 @@ def _target(path: Path) -> Path:
 
 @contextlib.contextmanager
 def atomic_path(path: Path, *, force: bool = False) -> Iterator[Path]:
-    """Give a temporary path beside `path`, which becomes `path` when the block ends without an error.
+    """Yield a temporary path beside `path`, which becomes `path` when the block ends without an error.
 
     The file is created with mode 0600, flushed to disk and renamed over the target, so that a kill at any moment leaves
     the old file or none. If the block raises, the temporary file goes; what a killed process of this computer left
     beside the same target goes with the next write. A symbolic link stays, and what it points to is replaced. Nothing
-    but the writing belongs inside the block: each `OSError` in it is told as a failed write.
+    but the writing belongs inside the block: each `OSError` in it is reported as a failed write.
     """
     refuse_existing(path, force=force)
     target = _target(path)
@@ -200,7 +200,7 @@ def write_bytes(path: Path, data: bytes, *, force: bool = False) -> None:
 
 
 def write_all(files: Mapping[Path, bytes], *, force: bool = False) -> None:
-    """Write several files atomically: none is there before the system has taken the bytes of all."""
+    """Write several files atomically: none appears before the bytes of all are written."""
     with contextlib.ExitStack() as stack:
         for path, data in files.items():
             stack.enter_context(atomic_path(path, force=force)).write_bytes(data)

@@ -1,4 +1,4 @@
-"""JSON and TOML from other hands: guarded parsing, schemas, settings, bodies, sessions."""
+"""JSON and TOML: safe parsing, schemas, protocols of trials and session facts."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def read_toml_record(path: Path, kind: type[T], *, way_out: str) -> T:
 
 
 def parse_record(document: object, kind: type[T], *, path: Path) -> T:
-    """A record from a document that was read; for the errors see `read_record`."""
+    """Make a record of plain data; for the errors see `read_record`."""
     schema = schema_name(kind)
     kind_expected = schema_kind(schema)
     kind_read = schema_kind(document.get("schema")) if isinstance(document, dict) else ""
@@ -94,7 +94,7 @@ def parse_json(text: str, *, name: str = "", way_out: str = "copy the file again
 
 
 def _object(pairs: list[tuple[str, Any]], *, way_out: str) -> dict[str, Any]:
-    """A JSON object, in which no key may stand twice: programs differ in which of the values they take."""
+    """A JSON object; a doubled key is refused, as programs differ in which of its values they take."""
     members = dict(pairs)
     if len(members) < len(pairs):
         (twice, _), *_ = Counter(name for name, _ in pairs).most_common(1)
@@ -131,7 +131,7 @@ def check_plain(document: object, *, way_out: str, name: str = "") -> None:
 
 
 def _parts(where: str, item: object, *, way_out: str) -> Iterator[tuple[str, object]]:
-    """Members of a container with their places in it; a single value is checked."""
+    """Members of a container, each with its place; any other value is checked."""
     if isinstance(item, dict):
         for key, value in item.items():
             yield "", key
@@ -150,7 +150,7 @@ def _parts(where: str, item: object, *, way_out: str) -> Iterator[tuple[str, obj
 
 
 def check_text(where: str, text: str, *, way_out: str) -> None:
-    """Refuse a text with surrogates, control characters or marks that turn what follows."""
+    """Refuse a text with surrogates, control characters or marks of the writing direction."""
     if not text.isascii() and any("\ud800" <= letter <= "\udfff" for letter in text):
         raise BadDataError(f"{where or 'a key'} holds a broken character: {text[:40]!a}", way_out=way_out)
     if not text.isprintable() and (match := _CONTROL.search(text)):
@@ -167,10 +167,10 @@ class Protocol(Record, forbid_unknown_fields=False):
 
 
 def read_protocol(path: Path) -> tuple[str | None, dict[str, Any]]:
-    """The title, and what ``[analysis]`` fixes of `TrialSettings`; the rest counts only through the file's hash."""
+    """Title, and the `TrialSettings` that ``[analysis]`` fixes; other keys enter only the file's hash."""
     document = load_toml(path, way_out="give the analysis as TOML")
-    read = parse_record(document, Protocol, path=path)
-    return read.title, {name: getattr(read.analysis, name) for name in document.get("analysis", {})}
+    protocol = parse_record(document, Protocol, path=path)
+    return protocol.title, {name: getattr(protocol.analysis, name) for name in document.get("analysis", {})}
 
 
 # --- Session facts of a recording as TOML: side, posture, lubricant, examiner, subject and other text.
@@ -214,7 +214,7 @@ class Session(Record, forbid_unknown_fields=False):
 
 
 def check_session(session: Mapping[str, object], *, path: Path) -> None:
-    """Hold the facts of a scan against `Session`; others are text by names in small letters."""
+    """Check the facts of a scan: those of `Session`, and others, which are texts with names in small letters."""
     for name in session:
         if name in OF_A_PERSON:
             way_out = "leave it out: nothing here may identify a person"
@@ -228,7 +228,7 @@ def check_session(session: Mapping[str, object], *, path: Path) -> None:
 
 
 def with_session(scan: Scan, path: Path | None) -> Scan:
-    """The scan with the facts of a session file over its own; for the errors see `read_session`."""
+    """The scan with a session file's facts in place of its own; for the errors see `read_session`."""
     return scan if path is None else replace(scan, session={**scan.session, **read_session(path)})
 
 

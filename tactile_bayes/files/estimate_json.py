@@ -1,4 +1,4 @@
-"""Estimates as they are kept: JSON, with the posterior of the size."""
+"""Sizes that are read back from `estimate`'s JSON or posterior file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,10 @@ StatedSize = Quantity | Interval
 
 
 def read_stated_size(path: Path, number: int | None = None) -> StatedSize | None:
-    """The largest size that an estimate states, mm; `number`: which of a list, from 1; a list of one needs none."""
+    """Largest size in a file of `estimate`, mm; None without one.
+
+    `number` is the estimate's place in a list, from 1; a list of one needs none.
+    """
     head = first_bytes(path, 8)
     if is_json(head):
         return _from_json(path, number)
@@ -42,7 +45,7 @@ def read_stated_size(path: Path, number: int | None = None) -> StatedSize | None
 
 
 def fill_from_posteriors(table: Table) -> tuple[dict[str, list[Any]], list[Path]]:
-    """Columns of a trial table with sizes and intervals from the files in its ``posterior`` column, and these files.
+    """Columns of a trial table, with sizes and intervals from the files of its ``posterior`` column, and these files.
 
     Relative paths start at the table's folder; ``batch.json#3`` is the third of a list.
     """
@@ -118,7 +121,7 @@ Holder = EstimateReport | PooledReport | MassReport | AnotherExam
 
 
 def checked_report(document: object, kind: type[R], *, path: Path) -> R:
-    """What ``estimate --json`` printed for one map, or for several: its fields, and its sizes against each other."""
+    """Report of `estimate --json`, for one map or pooled; its fields and the order of its sizes are checked."""
     report = parse_record(document, kind, path=path)
     if (fault := next(_report_faults(report), None)) is not None:
         what, rule = fault
@@ -127,7 +130,7 @@ def checked_report(document: object, kind: type[R], *, path: Path) -> R:
 
 
 def _report_faults(report: EstimateReport | PooledReport) -> Iterator[tuple[str, str]]:
-    """What cannot be so, each with the rule that it breaks where its own words do not say it."""
+    """Contradictions in a report, each with the rule that it breaks; empty where the fault says it."""
     if report.status != "estimate" and report.max_size_mm is not None:
         yield f"status is {report.status!r}, and there is a max_size_mm", ""
     masses = report.masses if isinstance(report, EstimateReport) else ()
@@ -151,7 +154,7 @@ def _report_faults(report: EstimateReport | PooledReport) -> Iterator[tuple[str,
 
 
 def _size_faults(where: str, holder: Holder) -> Iterator[tuple[str, str]]:
-    """Faults of whatever holds sizes, by its place in the document."""
+    """Faults in the sizes of a report, a mass or another exam; `where` is its place in the document."""
     for name in _SIZES:
         size: Quantity | None = getattr(holder, name, None)
         if size is None:

@@ -1,4 +1,4 @@
-"""Grids that other programs wrote, tables, arrays and images, and maps made of them."""
+"""Maps from the grids of other programs: tables, arrays and images."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from tactile_bayes.progress import Progress, no_progress
 
 # --- A grid of numbers in a text table, as programs and spreadsheets write it.
 #
-# Lines of text before and after the numbers are left out, and said to be. Tekscan's ASCII export (``.asf``,
+# Lines of text before and after the numbers are left out with a note. Tekscan's ASCII export (``.asf``,
 # ``.csv``) is such a table: ``KEY value`` lines, ``ASCII_DATA @@``, ``Frame 1``, rows, ``@@``; ``B`` is no sensel.
 
 _WAY_OUT: Final = "give a table of numbers, such as .csv"
 _NUMBER: Final = re.compile(r"[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)(e[+-]?[0-9]+)?|nan|inf(inity)?)", re.IGNORECASE)
 _TIME: Final = re.compile(r"(t|time|times|timestamp|date|frame|sample|index|s|ms|sec|seconds)\b.*", re.IGNORECASE)
-"""A first column of this name stands before frames, one a row."""
+"""Name of a first column before frames, one per row."""
 _SPACING_LINE: Final = re.compile(
     r"^(ROW|COL)_SPACING[\s,;:=]+([0-9.]+)[\s,;]*(mm|cm|m|in|inch)?[\s,;]*$", re.MULTILINE
 )
@@ -40,12 +40,12 @@ _UNITS_LINE: Final = re.compile(r"^UNITS[\s,;:=]+([^\s,;]+)[\s,;]*$", re.MULTILI
 
 def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
     """Read a table of text, NaN where a field is empty or one of the texts of `no_value`."""
-    words = [one for one in no_value if not is_number(one)]  # numbers are looked for among the values
+    words = [text for text in no_value if not is_number(text)]  # numbers are matched as values, later
     texts = tables.read_lines(path)
     separator = tables.detect_separator(texts, words) or ","
-    rows = [tables.split_fields(one, separator) for one in texts]
+    rows = [tables.split_fields(text, separator) for text in texts]
     commas = tables.comma_numbers(rows, words, way_out="write numbers without commas")
-    decimal = {one for one in commas if one.count(",") == 1}
+    decimal = {field for field in commas if field.count(",") == 1}
     rows = [[field.replace(",", ".") if field in decimal else field for field in row] for row in rows]
     first, last = _numbers_within(rows, no_value)
     names = rows[first - 1] if first else []
@@ -85,7 +85,7 @@ def is_number(field: str) -> bool:
 
 
 def _numbers_within(rows: Sequence[list[str]], no_value: Sequence[str]) -> tuple[int, int]:
-    """Where lines of numbers begin and end: there every field is one, or empty, or a mark for no value."""
+    """First row of numbers, and one past the last: every field is a number, empty or a mark for no value."""
     marks = {"", tables.NO_SENSEL, *no_value}
     plain = [
         i
@@ -101,7 +101,7 @@ def _numbers_within(rows: Sequence[list[str]], no_value: Sequence[str]) -> tuple
             )
         return rows.index(faulty), len(rows)
     first, last = plain[0], plain[-1] + 1
-    while last < len(rows) and any(map(is_number, rows[last])):  # a faulty row is told, not left out
+    while last < len(rows) and any(map(is_number, rows[last])):  # a faulty row is an error, not left out
         last += 1
     while first > 0 and len(rows[first - 1]) == len(rows[first]) and any(map(is_number, rows[first - 1])):
         if _is_title(rows[first - 1]):
@@ -120,7 +120,7 @@ def _is_title(row: Sequence[str]) -> bool:
 
 
 def _values(rows: Sequence[list[str]], marks: Sequence[str], before: int) -> FloatArray:
-    """The numbers of rows of one length, NaN for marks; the way out of anything else is by what it is."""
+    """Array of rows of one length, NaN for marks; any other field is an error."""
     for number, fields_of_row in enumerate(rows, start=before + 1):
         if len(fields_of_row) != len(rows[0]):
             what = f"row {number} has {len(fields_of_row)} fields, row {before + 1} has {len(rows[0])}"
@@ -144,7 +144,7 @@ def _values(rows: Sequence[list[str]], marks: Sequence[str], before: int) -> Flo
 
 
 def _refuse_labels(table: FloatArray) -> None:
-    """Refuse numbers or places of rows and columns in the first of these, and a list of x, y and value: no readings."""
+    """Refuse row and column numbers or places in the first row or column, and lists of x, y and value."""
     row, column = table[0], table[:, 0]
     both = np.isnan(table[0, 0]) and _in_equal_steps(row[1:]) and _in_equal_steps(column[1:])
     for is_labels, line, where in (
@@ -171,7 +171,7 @@ def _first_three(line: FloatArray) -> str:
 
 
 def _in_equal_steps(line: FloatArray) -> bool:
-    """True when three numbers or more run in equal steps."""
+    """True for three or more numbers in equal steps."""
     steps = np.diff(line)
     return len(line) > 2 and bool(steps[0] != 0.0) and bool(np.allclose(steps, steps[0], rtol=1e-6, atol=0.0))
 
@@ -183,7 +183,7 @@ _ARRAY_SUFFIXES: Final = (*ARRAY_SUFFIXES, ".nc", ".cdf")
 _BESIDE: Final = ("mean", "count", "variance", "spacing_mm")
 TABLE_SUFFIXES: Final = (".csv", ".txt", ".tsv", ".asf", ".asc", ".dat")
 GRID_SUFFIXES: Final = (*TABLE_SUFFIXES, *IMAGE_SUFFIXES, *ARRAY_SUFFIXES)
-"""Of files that hold no map of this program, whatever else."""
+"""Suffixes of files that `open_grid` reads."""
 
 
 def open_grid(path: Path, *, no_value: Sequence[str] = (), array: str = "") -> Grid:
@@ -205,7 +205,7 @@ def open_grid(path: Path, *, no_value: Sequence[str] = (), array: str = "") -> G
 
 
 def _read_arrays(path: Path, array: str) -> Grid:
-    """The array that is named, else ``mean``, else the only one of rows and columns."""
+    """Grid of the array that is named, else of ``mean``, else of the only one with two axes."""
 
     def choose(names: Sequence[str]) -> Sequence[str]:
         return [name for name in (*_BESIDE, *AXES) if name in names] if "mean" in names and not array else names
@@ -236,22 +236,22 @@ def _read_arrays(path: Path, array: str) -> Grid:
     raise BadDataError(f"holds no array of rows and columns{called} (it has {has})", way_out=way_out)
 
 
-# --- Cells without a value: what stands for "no value" is declared by the file or by the caller, or stands apart.
+# --- Cells without a value: the file or the caller declares the number for it; an undeclared outlying one is refused.
 
-ALL_ARE_VALUES: Final = "none"  #: Given as ``--no-value`` where every number is a value.
+ALL_ARE_VALUES: Final = "none"  #: ``--no-value none``: every number is a value.
 _BEYOND: Final = 1e12  #: No value of a map is larger.
 _FEWEST_STEPS: Final = 20
 _TIMES: Final = 3.0
 _TIMES_OF_ONE: Final = 6.0
-"""What stands apart differs from its neighbours by so many times the largest other step; a single cell by more."""
+"""An outlying number differs from its neighbours by so many times the largest other step; a single cell by more."""
 _MOST_CONSTANT: Final = 8
 _FEWEST_LINES: Final = 8
 _TIMES_OF_LINES: Final = 10.0
-"""A line stands apart where its median step to both sides is so many times the largest of the other lines."""
+"""Factor of an outlying line's median step, to both sides, over the largest of the other lines."""
 
 
 def _refuse_outlying(values: FloatArray) -> None:
-    """Refuse undeclared numbers that stand apart from all others, as fill values and dead lines do."""
+    """Refuse undeclared numbers far from all others, such as fill values and dead lines."""
     values = np.where(np.isfinite(values), values, np.nan)
     if outlier := _outlying_number(values):
         number, where, rest = outlier
@@ -268,9 +268,10 @@ def _refuse_outlying(values: FloatArray) -> None:
 
 
 def _outlying_number(values: FloatArray) -> tuple[float, str, FloatArray] | None:
-    """A number that no smooth map holds: the lowest, the highest, or that of a line that is constant.
+    """Outlying number, its cells in words and the other values; None without one.
 
-    Its cells differ from their neighbours by several times the largest step between any other neighbours.
+    Candidates are the lowest, the highest and those of constant lines. The cells of an outlying one differ from their
+    neighbours by several times the largest step between other neighbours.
     """
     known = np.isfinite(values)
     if not known.any():
@@ -295,7 +296,7 @@ def _outlying_number(values: FloatArray) -> tuple[float, str, FloatArray] | None
 
 
 def _outlying_line(values: FloatArray, axis: int) -> tuple[int, float, float] | None:
-    """A row or column that is dead or stuck and noisy: its number, its step to both sides, and the largest other."""
+    """A dead or stuck row or column: its number, its step to both sides and the largest other; None without one."""
     steps = np.abs(np.diff(values, axis=axis))
     steps = steps if axis else steps.T
     lines = [line[np.isfinite(line)] for line in steps.T]
@@ -311,7 +312,7 @@ def _outlying_line(values: FloatArray, axis: int) -> tuple[int, float, float] | 
 
 
 def _steps(values: FloatArray, cells: BoolArray, which: np.ufunc) -> FloatArray:
-    """Absolute differences of neighbours: inside cells (`np.logical_and`) or across their border (`logical_xor`)."""
+    """Absolute differences of neighbours inside the cells (`np.logical_and`) or across their border (`logical_xor`)."""
     across = np.abs(np.diff(values, axis=1))[which(cells[:, 1:], cells[:, :-1])]
     along = np.abs(np.diff(values, axis=0))[which(cells[1:], cells[:-1])]
     steps: FloatArray = np.concatenate([across, along])
@@ -319,7 +320,7 @@ def _steps(values: FloatArray, cells: BoolArray, which: np.ufunc) -> FloatArray:
 
 
 def _where(cells: BoolArray) -> str:
-    """Where cells are, in a few words: whole rows or columns, or how many and the first."""
+    """Cells in words: whole rows or columns, or their number and the first."""
     number = int(cells.sum())
     for axis, name in ((0, "column"), (1, "row")):
         whole = np.flatnonzero(cells.all(axis=axis)) + 1
@@ -345,9 +346,9 @@ _LONGEST_MM: Final = 500.0
 
 
 def import_grid(path: Path, options: GridOptions, *, progress: Progress = no_progress) -> tuple[TactileMap, list[str]]:
-    """The map of a file, and what was found on reading it; see `open_grid` and `grid_map`.
+    """Map of a file, and notes on how it was read; see `open_grid` and `grid_map`.
 
-    Of three steps, reading, the map and what is done with it, `progress` is told the first two.
+    `progress` counts reading and the map as two of three steps; the caller's work is the third.
     """
     with in_file(path):
         grid = open_grid(path, no_value=options.no_value, array=options.array or "")
@@ -358,7 +359,7 @@ def import_grid(path: Path, options: GridOptions, *, progress: Progress = no_pro
 
 
 def grid_map(grid: Grid, options: GridOptions) -> tuple[TactileMap, list[str]]:
-    """The map of a grid, and what was found on the way.
+    """Map of a grid, and notes on how it was read.
 
     The spacing may be left out where the grid has it. With ``normalise="none"`` values are divided only where a `level`
     is given, which makes it ``"gain"``.
@@ -400,11 +401,11 @@ def grid_map(grid: Grid, options: GridOptions) -> tuple[TactileMap, list[str]]:
 # --- Cells much finer than any lump, as pixels are: they are averaged before anything is fitted to them.
 
 _FINEST_MM: Final = 0.5
-"""From finer cells with correlated errors the fit took the errors' own grain for lumps, and minutes for it."""
+"""In finer cells with correlated errors the fit took noise for lumps, and minutes."""
 
 
 def _average_cells(tactile_map: TactileMap, times: int) -> TactileMap:
-    """The map in cells of `times` by `times`, where half of them hold data or more; readings weigh by their number."""
+    """The map in blocks of `times` by `times` cells, weighted by their readings; a block needs data in half of them."""
     weight = np.where(tactile_map.covered, tactile_map.count, 0).astype(np.float64)
     total = block_sums(weight, times)
     known = block_sums(tactile_map.covered.astype(np.float64), times) >= times**2 / 2
@@ -421,7 +422,7 @@ def _average_cells(tactile_map: TactileMap, times: int) -> TactileMap:
 
 
 def _divide_by_level(tactile_map: TactileMap, level: float | str) -> TactileMap:
-    """The map divided by its level, which makes it one by gains; a level that was fitted is a finding."""
+    """The map divided by its level, as maps normalised by gains are; a fitted level is a finding."""
     if isinstance(level, str):  # of a fit about the highest bump; the median where nothing rises
         options = SamplerSettings(method="optimise", background="free")
         fit = estimate_map(tactile_map, calibration=None, options=options, rng=np.random.default_rng(1)).fit
@@ -450,7 +451,7 @@ def _divide_by_level(tactile_map: TactileMap, level: float | str) -> TactileMap:
 
 
 def _spacing(grid: Grid, *, stated_mm: float | None) -> tuple[float, list[str]]:
-    """Side of the cells, and what an image's resolution says otherwise."""
+    """Side of the cells in mm, and a note where an image's resolution differs."""
     for sides in (grid.spacing_mm, grid.resolution_mm):
         if sides is not None and not np.isclose(*sides, rtol=1e-3, atol=0.0):
             what = f"its cells are {sides[0]:g} by {sides[1]:g} mm"
@@ -476,9 +477,9 @@ def _spacing(grid: Grid, *, stated_mm: float | None) -> tuple[float, list[str]]:
 
 
 def _map(arrays: dict[str, np.ndarray[Any, Any]], *, spacing_mm: float, normalise: str, units: str) -> TactileMap:
-    """The map of a grid that is in kPa or divided by its level as the caller declares.
+    """Map of arrays in kPa, or divided by their level, as `normalise` declares.
 
-    Where the file has no more than the mean, a value is of 1 reading, and its variance 0. A variance may be NaN where a
+    Without ``count`` and ``variance`` a value is one reading of variance 0. A variance may be NaN where a
     cell has a single reading: a sample variance, numpy's with ddof=1, does not exist there.
     """
     mean = _numbers(arrays, "mean")
@@ -532,5 +533,5 @@ def _numbers(arrays: Mapping[str, np.ndarray[Any, Any]], name: str) -> FloatArra
 
 
 def _first(wrong: BoolArray) -> tuple[int, ...]:
-    """Index of the first cell that is; empty without one."""
+    """Index of the first True; empty without one."""
     return tuple(int(i) for i in np.argwhere(wrong)[0]) if wrong.any() else ()

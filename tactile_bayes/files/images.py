@@ -1,4 +1,4 @@
-"""Grey images as their files say they are: tags and headers decide what a pixel means, not what a viewer shows."""
+"""Grey images: a pixel means what the file's tags and header say, not what a viewer shows."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def read_image(path: Path) -> Grid:
 
 
 def _decode_graymap(data: bytes) -> Grid:
-    """PGM by netpbm's description, ``P2`` or ``P5``: values lie between 0 and a maximum that scales nothing here."""
+    """Grid of a PGM (netpbm's ``P2`` or ``P5``): values from 0 to its maximum, unscaled."""
     header = _GREY_HEADER.match(data)
     if header is None:
         raise BadDataError(f"is not an image of grey values (it starts with {data[:2]!r})", way_out=_WAY_OUT)
@@ -68,7 +68,7 @@ def _decode_graymap(data: bytes) -> Grid:
 
 
 def _decode_tiff_or_png(data: bytes) -> Grid:
-    """TIFF or PNG by Pillow, which scales, inverts and cuts samples here and there: see the branches."""
+    """Grid of a TIFF or PNG by Pillow; `_values_of_file` undoes its scaling and inverting."""
     from PIL import Image, ImageOps, TiffImagePlugin, UnidentifiedImageError
 
     with (
@@ -104,7 +104,7 @@ def _decode_tiff_or_png(data: bytes) -> Grid:
 
 
 def _choose_page(image: Any) -> None:
-    """Go to the image of a file that holds one, and smaller copies of it."""
+    """Seek the only image of full size; the others are smaller copies of it."""
     pages = getattr(image, "n_frames", 1)
     if pages == 1:
         return
@@ -119,7 +119,7 @@ def _choose_page(image: Any) -> None:
 
 
 def _grey_channel(pixels: np.ndarray[Any, Any], mode: str) -> tuple[np.ndarray[Any, Any], BoolArray]:
-    """The grey channel of an image, and where its alpha says that nothing is there."""
+    """Grey channel of an image, and a mask of the pixels that its alpha makes transparent."""
     if mode == "1":
         raise BadDataError("has 1 bit a pixel: black or white", way_out=_WAY_OUT)
     without = np.zeros(pixels.shape[:2], dtype=bool)
@@ -140,17 +140,17 @@ def _grey_channel(pixels: np.ndarray[Any, Any], mode: str) -> tuple[np.ndarray[A
 
 
 class _SampleFacts(Record):
-    """What a file says of its samples."""
+    """Description of a file's samples."""
 
     bits: int = 8
-    kind: int = 1  #: Of `_KINDS`.
+    kind: int = 1  #: A key of `_KINDS`.
     white_is_zero: bool = False
-    no_value: float | None = None  #: As the file numbers it.
+    no_value: float | None = None  #: Number of pixels without a value, in the file's own scale.
     spacing_mm: tuple[float, float] | None = None
 
 
 def _values_of_file(values: np.ndarray[Any, Any], without: BoolArray, facts: _SampleFacts, notes: list[str]) -> Grid:
-    """The numbers in the file from what Pillow makes of them, NaN where there are none."""
+    """Grid of the file's own numbers, from those that Pillow scales and inverts; NaN where a pixel has no value."""
     top = 2.0**facts.bits - 1
     if facts.kind == 2 and facts.bits == 8:
         values = values.astype(np.uint8).view(np.int8)
@@ -204,13 +204,13 @@ def _tiff_facts(tags: Mapping[int, Any]) -> _SampleFacts:
 
 
 def _sample(tags: Mapping[int, Any]) -> tuple[int, int, int]:
-    """Bits and kind of the samples, and how many a pixel has; bits are 0 where they differ."""
+    """Bits and kind of the samples, and samples per pixel; bits and kind are 0 where they differ."""
     bits, kinds = ({int(v) for v in np.atleast_1d(tags.get(tag, 1))} for tag in (_BITS, _FORMAT))
     return (bits.pop() if len(bits) == 1 else 0), (kinds.pop() if len(kinds) == 1 else 0), int(tags.get(_SAMPLES, 1))
 
 
 def _describe_samples(tags: Mapping[int, Any]) -> str:
-    """What a TIFF holds, in words."""
+    """Samples of a TIFF in words."""
     bits, kind, samples = _sample(tags)
     words = f"{_KINDS.get(kind, 'other')} samples of {bits} bits" if bits else "samples of several lengths"
     words += f", {samples} a pixel" if samples > 1 else ""

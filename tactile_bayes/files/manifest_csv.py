@@ -23,7 +23,7 @@ from tactile_bayes.trial.readings import Reading, at_excision
 
 JOURNAL: Final = "campaign.journal"
 EXAMS, MASSES, GROWTH = "exams", "masses", "growth"
-"""Folders that hold one of each exam, of each mass pooled at a visit, and of each mass compared between visits."""
+"""Folders of the exams, of the masses pooled at a visit, and of the masses compared between visits."""
 DONE, FAILURES, TRIAL, GROWN = "exams_done.csv", "failures.csv", "trial.csv", "growth.csv"  #: Tables beside them.
 
 SCAN, MAP, ESTIMATE, POSTERIOR = "scan.mcap", "map.nc", "estimate.json", "posterior.nc"
@@ -50,9 +50,9 @@ def exam_name(of_mass: str, replicate: int | str) -> str:
 
 SCHEMA: Final = "exams.table.json"
 KNOWN: Final = ("seat", "depth_mm", "stiffness_ratio", "fat_kpa", "gland_ratio", "thickness_mm")
-"""Properties of a body that columns ``known_...`` give, by the names of `Settings.known`."""
+"""Properties of the body in columns ``known_...``, by the names of `Settings.known`."""
 SAME_IN_SCANS: Final = {"patient": "subject", "side": "side", "reader": "examiner", "visit": "visit", "mass": "mass"}
-"""Columns, and what a scan calls the same."""
+"""Columns, and the facts of a scan's session that they repeat."""
 _WRITTEN: Final = ("file", "patient", "visit", "mass", "replicate", "side", "reader")
 
 
@@ -61,7 +61,7 @@ class Exam(Record):
 
     file: str
     path: Path
-    """`file`, `path`: As the table has it, and where it is, absolute; only a name for a file in an object store."""
+    """`file`, `path`: As the table has it, and its absolute path; for a file in an object store only a name."""
     patient: str
     visit: str
     mass: str
@@ -94,7 +94,7 @@ class Exam(Record):
 
     @property
     def as_reading(self) -> Reading:
-        """The exam as a reading that is yet to be done, for the order of visits."""
+        """The exam as a reading without a size, for the order of visits."""
         key = (self.patient, self.mass)
         return Reading(key, "tactile", self.replicate, "not_done", visit=self.visit, day=self.day)
 
@@ -163,7 +163,7 @@ def _exam_path(table: Table, row: int, name: str) -> Path:
 
 
 def _path_inside(table: Table, row: int, column: str, name: str) -> Path:
-    """Path of a file that the table names; it must lie in the table's folder, links followed."""
+    """Path of a file that the table names; it must lie in the table's folder after following links."""
     folder = Path(os.path.realpath(table.path.parent))
     path = table.path.parent / name
     if Path(name).is_absolute() or not Path(os.path.realpath(path)).is_relative_to(folder):

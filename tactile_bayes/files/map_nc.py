@@ -52,7 +52,7 @@ _TRANSFORMS = {
 
 
 class MapHeader(Record, kw_only=True):
-    """What the attributes of a map's file say of it: the schema as a text, the others as JSON."""
+    """Attributes of a map's file: the schema as a text, the others as JSON."""
 
     schema: Literal["tactile-bayes/map/2"]
     recipe: MapRecipe
@@ -66,7 +66,7 @@ class MapHeader(Record, kw_only=True):
     provenance: dict[str, Any]
 
 
-_ALIKE: Final = ("recipe", "background", "frame_count", "masked_taxels")  #: Of a header and of its map.
+_SHARED: Final = ("recipe", "background", "frame_count", "masked_taxels")  #: Fields of a header and of its map.
 
 
 def write_map(path: Path, tactile_map: TactileMap, *, provenance: Provenance, force: bool = False) -> None:
@@ -100,13 +100,13 @@ def read_map(path: Path) -> TactileMap:
 
 
 def read_map_and_scans(path: Path) -> tuple[TactileMap, tuple[dict[str, str], ...]]:
-    """Read a map, and the scans it was made from, as `Provenance.scans` has them; for the errors see `read_map`."""
+    """Read a map, and the `Provenance.scans` it was made from; for the errors see `read_map`."""
     tactile_map, header = read_map_and_header(path)
     return tactile_map, scans_of(header.provenance)
 
 
 def read_map_and_header(path: Path) -> tuple[TactileMap, MapHeader]:
-    """Read a map, and what its file says of it; for the errors see `read_map`."""
+    """Read a map and its file's header; for the errors see `read_map`."""
     with open_netcdf(path, way_out=_WAY_OUT) as file:
         header = _header(file)
         cells = 1
@@ -131,7 +131,7 @@ def read_map_and_header(path: Path) -> tuple[TactileMap, MapHeader]:
         tactile_map = TactileMap(
             **arrays,
             **transforms,
-            **{name: getattr(header, name) for name in _ALIKE},
+            **{name: getattr(header, name) for name in _SHARED},
             quality={name: math.nan if value is None else value for name, value in header.quality.items()},
             head=None if isinstance(header.head, UnsetType) else header.head,
             nipple_mm=None if isinstance(header.nipple_mm, UnsetType) else np.array(header.nipple_mm),
@@ -147,7 +147,7 @@ def _attributes(tactile_map: TactileMap, provenance: Provenance) -> dict[str, st
     """
     header = MapHeader(
         schema=SCHEMA,
-        **{name: getattr(tactile_map, name) for name in _ALIKE},
+        **{name: getattr(tactile_map, name) for name in _SHARED},
         quality={name: float(v) if np.isfinite(v) else None for name, v in tactile_map.quality.items()},
         head=UNSET if tactile_map.head is None else tactile_map.head,
         nipple_mm=UNSET if tactile_map.nipple_mm is None else tuple(tactile_map.nipple_mm.tolist()),

@@ -1,4 +1,4 @@
-"""MCAP, record by record and chunk by chunk."""
+"""Reading of MCAP files, record by record; damaged and unfinished ones too."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from tactile_bayes.files.reading import MCAP_MAGIC, check_limit, open_input, rea
 _MOST_WINDOW: Final = 2**27
 
 
-def unpacked(chunk: Any, *, count: Callable[[int], None]) -> bytes:
-    """The records of a chunk, never more than it declares and one byte, which are counted before.
+def decompress_chunk(chunk: Any, *, count: Callable[[int], None]) -> bytes:
+    """Decompressed records of a chunk; `count` gets their size first, and no more than one byte beyond it is made.
 
-    A damaged one raises exceptions of many kinds, which `describe_damage` says in words.
+    A damaged chunk raises exceptions of many kinds, which `describe_damage` puts into words.
     """
     packing, data, most = chunk.compression, bytes(chunk.data), chunk.uncompressed_size
     if packing == "zstd":
@@ -54,7 +54,7 @@ def unpacked(chunk: Any, *, count: Callable[[int], None]) -> bytes:
 
 
 def describe_damage(error: Exception) -> str:
-    """Describe what is wrong with a chunk or a record, in a few words."""
+    """Fault of a chunk or a record, in a few words."""
     if type(error) is ValueError:
         return str(error)
     if type(error).__module__.startswith(("zstandard", "zstd", "lz4")):
@@ -74,7 +74,7 @@ _KINDS: Final = {Opcode.CHUNK: Chunk, Opcode.METADATA: Metadata, Opcode.ATTACHME
 
 
 class Messages:
-    """Times of messages, and bodies if `keep`, without a Python object per message.
+    """Times of messages, and their bodies with `keep`, in a few buffers: no Python object per message.
 
     Where a file has them in another order than that of time, which the MCAP specification allows, they are given by
     their log times.
@@ -126,7 +126,7 @@ class Messages:
 
 @dataclass(slots=True)
 class McapRecords:
-    """Content of a file, as far as it could be read."""
+    """Content of an MCAP file, as far as it could be read."""
 
     keep: Collection[str]  #: Topics whose messages are kept; of others only the times are.
     most_bytes: int  #: Limit of what its chunks unpack to.
@@ -144,7 +144,7 @@ class McapRecords:
     lost: list[str] = field(default_factory=list)  #: One line a loss.
 
     def messages(self, topic: str, *, schema: str, name: str | None = None) -> Messages:
-        """Messages of a topic, and of channels with that `name` in their metadata; another type is an error."""
+        """Messages of a topic, or of its channels with this `name` in their metadata; another type is an error."""
         messages = Messages()
         for number, channel in self.channels.items():
             if channel.topic != topic or (name is not None and channel.metadata.get("name") != name):
@@ -164,16 +164,17 @@ class McapRecords:
         return messages
 
     def count(self, unpacked_bytes: int) -> None:
-        """Refuse what unpacks to more than the limit in all."""
+        """Add to the unpacked bytes; more than the limit in all is refused."""
         self.unpacked_bytes += unpacked_bytes
         check_limit(self.unpacked_bytes, self.most_bytes, what="it unpacks to {} bytes or more")
 
-    def lose(self, what: str, *, damaged: bool = True) -> None:
+    def add_loss(self, what: str, *, damaged: bool = True) -> None:
+        """Note a loss."""
         self.lost.append(what)
         self.damaged |= damaged
 
-    def take(self, record: Any, data: memoryview) -> None:
-        """Keep a description, or a message whose place in the data `_parse_record` gave."""
+    def add(self, record: Any, data: memoryview) -> None:
+        """Add a record of `_parse_record`; of a message it has the place in `data`."""
         match record:
             case number, published_ns, logged_ns, start, end:
                 if number not in self.by_channel:  # bodies of an unknown channel are kept until it is defined
@@ -222,9 +223,9 @@ def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:
         opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (1, 0)
         if opcode == 0 or length > size:
             if records.all_data:
-                records.lose("the end of the file is damaged; all messages are there", damaged=False)
+                records.add_loss("the end of the file is damaged; all messages are there", damaged=False)
             else:
-                records.lose(f"unreadable from byte {start} of {size} on (no record begins there)")
+                records.add_loss(f"unreadable from byte {start} of {size} on (no record begins there)")
             return
         body = stream.read(length)
         complete = len(head) == _RECORD.size and len(body) == length
@@ -237,34 +238,34 @@ def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:
         if not complete:
             loss = f"cut off at byte {size}: everything after {records.last_ns / 1e9:.3f} s is lost"
             loss_of_end = "the end of the file is missing; all messages are there"
-            records.lose(loss_of_end if records.all_data else loss, damaged=False)
+            records.add_loss(loss_of_end if records.all_data else loss, damaged=False)
             return
         if not records.all_data:
             checksum = zlib.crc32(body, zlib.crc32(head, checksum))
         try:
             record = _parse_record(opcode, body)
         except Exception as error:  # struct.error, EndOfFile, UnicodeDecodeError...
-            records.lose(f"the record at byte {start} makes no sense ({describe_damage(error)})")
+            records.add_loss(f"the record at byte {start} makes no sense ({describe_damage(error)})")
             continue
         if isinstance(record, Chunk):
             records.chunks += 1
-            _take_chunk(records, record)
+            _add_chunk(records, record)
         elif record is not None:
             if opcode == Opcode.MESSAGE:  # in no chunk, as writers leave it that do not index their files
                 records.last_ns = max(records.last_ns, record[2])
-            records.take(record, memoryview(body))
+            records.add(record, memoryview(body))
 
 
 def _end_data(records: McapRecords, body: bytes, checksum: int) -> None:
     """Compare the checksum over the whole data section, where there is one."""
     declared = _CHECKSUM.unpack_from(body)[0] if len(body) >= _CHECKSUM.size else 0
     if declared not in (0, checksum) and not records.damaged:  # a damaged chunk was told already: it is a description
-        records.lose("a record outside the chunks changed (the checksum of the whole does not match)")
+        records.add_loss("a record outside the chunks changed (the checksum of the whole does not match)")
     records.all_data = True
 
 
 def _parse_record(opcode: int, data: bytes, start: int = 0, end: int | None = None) -> Any:
-    """A record; of a message channel, publish and log time, and where its body starts and ends; None for others."""
+    """A record; of a message channel, publish time, log time, and start and end of its body; None for other records."""
     end = len(data) if end is None else end
     if opcode == Opcode.MESSAGE:
         if end - start < _MESSAGE.size:
@@ -274,24 +275,24 @@ def _parse_record(opcode: int, data: bytes, start: int = 0, end: int | None = No
     return _KINDS[Opcode(opcode)].read(ReadDataStream(io.BytesIO(data[start:end]))) if opcode in _KINDS else None
 
 
-def _take_chunk(records: McapRecords, chunk: Any) -> None:
-    """Keep all messages of a chunk; none when it is damaged."""
+def _add_chunk(records: McapRecords, chunk: Any) -> None:
+    """Add the records of a chunk; of a damaged one none, which is a loss."""
     try:
-        data = unpacked(chunk, count=records.count)
-        contents = list(_split(data, records))
+        data = decompress_chunk(chunk, count=records.count)
+        contents = list(_records_of_chunk(data, records))
     except BadDataError:  # over a limit
         raise
     except Exception as error:  # each decompressor has an error class of its own, and so have records
         start, end = chunk.message_start_time / 1e9, chunk.message_end_time / 1e9
-        records.lose(f"chunk {records.chunks}, {start:.3f} to {end:.3f} s: {describe_damage(error)}")
+        records.add_loss(f"chunk {records.chunks}, {start:.3f} to {end:.3f} s: {describe_damage(error)}")
         return
     records.last_ns = max(records.last_ns, chunk.message_end_time)
     for record in contents:
-        records.take(record, memoryview(data))
+        records.add(record, memoryview(data))
 
 
-def _split(data: bytes, records: McapRecords) -> Iterator[Any]:
-    """Schemas, channels and messages of a chunk, see `_parse_record`."""
+def _records_of_chunk(data: bytes, records: McapRecords) -> Iterator[Any]:
+    """Schemas, channels and messages of a chunk, as `_parse_record` gives them."""
     offset = 0
     while offset < len(data):
         opcode, size = _RECORD.unpack_from(data, offset)

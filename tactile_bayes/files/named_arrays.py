@@ -1,4 +1,4 @@
-"""Arrays by their names from the files of other programs (.npz, .npy, .mat, HDF5, netCDF), and what these names are."""
+"""Named arrays of other programs' files (.npz, .npy, .mat, HDF5, netCDF), and the layout's names for them."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ from tactile_bayes.files.npz import Arrays, choose_npz, load_npy
 
 
 class Source(Record, eq=False):
-    """Arrays of a scan by names of the layout, with what their file says of them and what was guessed."""
+    """Arrays of a scan by the layout's names, with the options that their file states, and notes on guesses."""
 
     arrays: Arrays
     stated: Stated = Stated()
     notes: tuple[str, ...] = ()
-    others: tuple[str, ...] = ()  #: Names in its file that are none of a scan.
+    others: tuple[str, ...] = ()  #: Names in its file that were not read.
     path: str = ""  #: Of a file beside the frames', for errors.
     checked_on: str = ""  #: Day on which its head was found right on a scan, as `HeadGeometry` has it.
 
 
 class Grid(Record, eq=False):
-    """A grid or an image, and what its file says of it."""
+    """Grid of values, with the spacing and unit that its file states."""
 
     arrays: Arrays  #: ``mean (ny, nx)`` and, where known, ``count`` and ``variance``.
     spacing_mm: tuple[float, float] | None = None  #: Width and height of a cell, where the file states it.
     resolution_mm: tuple[float, float] | None = None  #: The same by an image's resolution, often of its printing.
     units: str = ""  #: Where the file states it.
-    notes: tuple[str, ...] = ()  #: What was done on reading it.
+    notes: tuple[str, ...] = ()  #: How it was read.
 
 
 Choose = Callable[[Sequence[str]], Iterable[str]]  #: Takes the names in a file and returns those to read.
@@ -90,7 +90,7 @@ def read_named(path: Path, choose: Choose) -> Arrays:
 
 
 def is_text(path: Path) -> bool:
-    """True for a file that is none of arrays by its first bytes and its suffix, and may be a text."""
+    """True if neither suffix nor first bytes are those of a file of arrays: it may be a text."""
     return path.suffix.lower() not in ARRAY_SUFFIXES and not reading.first_bytes(path, _LOOKED_AT).startswith(_KNOWN)
 
 
@@ -98,7 +98,7 @@ AXES: Final = ("x", "y")  #: Places of the columns and rows of a grid, or of eac
 
 
 def orient_by_axes(arrays: Arrays) -> tuple[str, ...]:
-    """Turn grids in place so that x rises along their rows and y from row to row, by `AXES`, which are taken out."""
+    """Orient grids in place by the arrays `AXES`, which are removed: x rises along a row, y from row to row."""
     x, y = (arrays.get(name, np.empty(0)) for name in AXES)
     if x.ndim == y.ndim == 2 and x.size and x.shape == y.shape and len(arrays) > len(AXES):
         x, y = (x[0], y[:, 0]) if x[0, 0] != x[0, -1] else (x[:, 0], y[0])
@@ -139,7 +139,7 @@ def _netcdf_3(path: Path) -> Arrays:
 
 
 def _hdf5(path: Path, choose: Choose, *, begins_at: int = 0) -> Arrays:
-    """Arrays of an HDF5 file, which MATLAB's of version 7.3 is, too."""
+    """Arrays of an HDF5 file; MATLAB's of version 7.3 is one."""
     with open_netcdf(path, way_out=_COPY_AGAIN, begins_at=begins_at) as root:
         members = dict(_members(root, "", levels=_MOST_LEVELS))
         return {name: np.asarray(members[name].numbers(name.rpartition(".")[2])) for name in choose(list(members))}
@@ -193,7 +193,7 @@ def _mat_5(path: Path) -> Arrays:
 
 
 def _elements(data: bytes, order: str) -> Iterator[Element]:
-    """Type and content of each element; one of up to four bytes stands within its tag."""
+    """Type and content of each element; one of up to four bytes is stored in its tag."""
     at = 0
     while at + 8 <= len(data):
         kind, length = struct.unpack_from(f"{order}II", data, at)
@@ -209,7 +209,7 @@ def _elements(data: bytes, order: str) -> Iterator[Element]:
 
 
 def _matrix_arrays(matrix: bytes, order: str, name: str, levels: int) -> Iterator[tuple[str, np.ndarray]]:
-    """The arrays of a matrix by their names; `name` is a field's, whose own is empty."""
+    """Arrays of a matrix by their names; the matrix of a field is nameless, and gets the field's `name`."""
     elements = _elements(matrix, order)
     flags = int(_numbers(next(elements), order)[0])
     kind = flags & 0xFF
@@ -239,7 +239,7 @@ def _numbers(element: Element, order: str) -> np.ndarray:
     return np.frombuffer(content, dtype=f"{order}{_TYPES[kind]}")
 
 
-# --- What a file calls the arrays of a scan, as TOML, and a template of it for a file.
+# --- MAP.toml, a file's names for the arrays of a scan, and a template of it.
 
 _HEADING: Final = """\
 # Names of a scan's arrays in {path}, for
@@ -251,7 +251,7 @@ _HEADING: Final = """\
 # time_unit = "ms"    # of the frames' times, where it is not s (or us, min)
 # length_unit = "cm"  # of the places, where it is not mm (or m, inch)
 """
-_COLUMNS: Final = 79  #: Of a line: one that breaks on a terminal is no comment any more when it is copied.
+_LINE_LENGTH: Final = 79  #: A comment that a terminal breaks is none any more when it is copied.
 _VALUES: Final = """
 [values]
 # pitch_mm = 1.5  # numbers that no file has
@@ -259,12 +259,12 @@ _VALUES: Final = """
 
 
 def read_array_map(path: Path) -> ArrayMap:
-    """Read what a file calls its arrays; for the errors see `files.documents.read_record`."""
+    """Read a MAP.toml; for the errors see `files.documents.read_record`."""
     return read_toml_record(path, ArrayMap, way_out="`tactile-bayes import SRC --template` prints one")
 
 
 def array_template(path: Path | None) -> str:
-    """TOML for `read_array_map` to fill in: of a file, with its arrays and those that their shapes tell."""
+    """Template of a MAP.toml; with a file it lists the file's arrays and guesses which is which."""
     shapes = {} if path is None else {name: one.shape for name, one in read_named(path, list).items()}
     shape_lines = [f"#   {name}: {' x '.join(map(str, shape)) or 'one value'}" for name, shape in shapes.items()]
     lines = [
@@ -284,7 +284,7 @@ def array_template(path: Path | None) -> str:
         else:
             entry = f"{name} = {dump_json(guesses[name]).strip()}  # guessed" if name in guesses else f'# {name} = ""'
             lines.append(entry)
-        lines += textwrap.wrap(meaning, _COLUMNS, initial_indent="#   ", subsequent_indent="#   ")
+        lines += textwrap.wrap(meaning, _LINE_LENGTH, initial_indent="#   ", subsequent_indent="#   ")
     return "\n".join([*lines, _VALUES])
 
 

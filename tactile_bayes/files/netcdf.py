@@ -1,4 +1,4 @@
-"""Files of netCDF-4 through HDF5: limits, attributes, variables."""
+"""Reading and writing of netCDF-4 by h5py, within limits."""
 
 from __future__ import annotations
 
@@ -65,14 +65,14 @@ class Variable(Record):
     dimensions: tuple[str, ...]  #: The name of each axis.
     attributes: Mapping[str, str]  #: Text by name: units, a long name.
     fill: float | None = None
-    """Stands for "no value" in a variable that may have none: its ``_FillValue``. Not for coordinates."""
+    """The ``_FillValue`` of a variable whose cells may have no value; not for coordinates."""
 
 
 class Contents(Record):
     """Contents of one group of a netCDF file."""
 
     variables: Mapping[str, Variable]
-    """By name; one that is called as its only dimension becomes that dimension's coordinate."""
+    """By name; one with the name of its only dimension is that dimension's coordinate."""
     attributes: Mapping[str, str]  #: Text by name.
 
 
@@ -131,7 +131,7 @@ MOST: Final = 1e12  #: Largest finite number in an array.
 
 
 class Group:
-    """One group of an open netCDF file; all that is read is checked first, and may unpack to `most_bytes` in all."""
+    """One group of an open netCDF file; each array is checked before it is read, and may unpack to `most_bytes`."""
 
     def __init__(self, place: Any, *, most_bytes: int, way_out: str) -> None:
         self._place = place
@@ -181,10 +181,7 @@ class Group:
         return values
 
     def numbers(self, name: str) -> Any:
-        """The values of an array of real numbers, of whatever type and dimensions; None for one of anything else.
-
-        See `as_declared`.
-        """
+        """Values of an array of real numbers of any type and dimensions, see `as_declared`; None for another array."""
         dataset = self._dataset(name)
         return as_declared(self._values(name, dataset), dataset.attrs) if dataset.dtype.kind in "iuf" else None
 
@@ -235,7 +232,7 @@ class Group:
         return member
 
     def _array(self, name: str) -> Any:
-        """Dataset that does not merely stand for a dimension without values; None where there is none."""
+        """Dataset with values of its own, which that of a bare dimension has not; None where there is none."""
         dataset = self._dataset(name)
         scale = b"" if dataset is None else dataset.attrs.get("NAME", b"")
         text = scale.decode("utf-8", "replace") if isinstance(scale, bytes) else str(scale)
@@ -283,7 +280,7 @@ def _dimensions(dataset: Any) -> tuple[str, ...]:
 
 
 def _has_scales(dataset: Any) -> bool:
-    """True when a list of scales is attached as it must be: HDF5 ends the process over one of another type."""
+    """True if the list of scales is of the right type: HDF5 ends the process over another."""
     if "DIMENSION_LIST" not in dataset.attrs:
         return False
     listed = dataset.attrs.get_id("DIMENSION_LIST")

@@ -1,4 +1,4 @@
-"""NPZ files of our own: checked shapes, checkpoints, outlines."""
+"""Arrays in .npz and .npy files, checkpoints of chains and draws for pooling."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def _array(stream: IO[bytes], length: int, name: str) -> np.ndarray[Any, np.dtyp
         return flat.reshape(shape, order="F" if in_columns else "C")
 
 
-# --- Checkpoints of `estimate --method ensemble`: plain arrays in an .npz, bound by a hash to what they belong to.
+# --- Checkpoints of `estimate --method ensemble`: plain arrays in an .npz, with a hash of the map and settings.
 
 SCHEMA = "tactile-bayes/checkpoint/2"
 SHAPES = {"chain": 4, "log_density": 2, "accepted": 1, "twister": 2, "cursor": 2}
@@ -103,7 +103,7 @@ SHAPES = {"chain": 4, "log_density": 2, "accepted": 1, "twister": 2, "cursor": 2
 class CheckpointFile:
     """A checkpoint file, made when it does not exist and rewritten after each block of steps.
 
-    `context` is what else the chain depends on, for example the calibration's hash; another's checkpoint is refused.
+    `context` is a text that the chain depends on, such as the calibration's hash; with another it is refused.
     """
 
     def __init__(self, path: Path, *, context: str = "") -> None:
@@ -138,7 +138,7 @@ class CheckpointFile:
 
 
 def _digest(arrays: Mapping[str, np.ndarray[Any, Any]]) -> str:
-    """Checksum of the state and of what it belongs to, so that no changed number is read as valid."""
+    """Checksum of the key and the state, so that no changed number is read as valid."""
     digest = hashlib.sha256()
     for name in ("key", *SHAPES):
         array = np.ascontiguousarray(arrays[name])
@@ -147,7 +147,7 @@ def _digest(arrays: Mapping[str, np.ndarray[Any, Any]]) -> str:
     return digest.hexdigest()
 
 
-# --- Draws that pooling needs of a map, as plain arrays in an .npz; equal draws give equal bytes.
+# --- Draws of a map for pooling, as plain arrays in an .npz; equal draws give equal bytes.
 
 _DRAWS: Final = ("log_amplitude", "log_width", "q", "r")
 

@@ -1,4 +1,4 @@
-"""Posteriors as netCDF that arviz opens: every draw of a map's parameters and of the sizes, and what goes with them."""
+"""Posteriors as netCDF that arviz opens: the draws of a map's parameters and sizes, with the estimate's report."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def write_posterior(
 
 
 def _draws_of(result: Estimate | SizePosterior) -> tuple[str, dict[str, FloatArray], Mapping[str, Any]]:
-    """The method, the (chain, draw) arrays by name, and the figures of the method."""
+    """Name of the method, its (chain, draw) arrays by name, and its diagnostics."""
     if isinstance(result, SizePosterior):
         return "pooled", {name: np.atleast_2d(getattr(result, name)) for name in _OF_A_SIZE}, result.figures
     if result.map_posterior is None or result.draws is None:
@@ -74,7 +74,7 @@ def _draws_of(result: Estimate | SizePosterior) -> tuple[str, dict[str, FloatArr
 
 
 def _with_coordinates(arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]) -> dict[str, Variable]:
-    """The variables after a coordinate of whole numbers for each of their axes."""
+    """The variables, after a coordinate 0, 1, 2... for each of their axes."""
     lengths: dict[str, int] = {}
     for axes, values in arrays.values():
         lengths |= dict(zip(axes, np.shape(values), strict=True))
@@ -85,11 +85,11 @@ def _with_coordinates(arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]) 
 class PosteriorDraws(Record, eq=False):
     """Contents of a posterior file."""
 
-    method: str  #: That gave the draws.
+    method: str  #: Name of the sampler.
     draws: dict[str, FloatArray]  #: (chain, draw) arrays by name.
     diagnostics: dict[str, Any]  #: As the estimate's JSON has them.
-    scans: tuple[dict[str, str], ...] = ()  #: The scans at the beginning, as `Provenance.scans` has them.
-    findings: tuple[Finding, ...] = ()  #: They speak against the estimate.
+    scans: tuple[dict[str, str], ...] = ()  #: `Provenance.scans` of the map.
+    findings: tuple[Finding, ...] = ()  #: Cautions and checks of the estimate.
 
 
 def read_posterior(path: Path) -> PosteriorDraws:

@@ -12,16 +12,16 @@ from tactile_bayes.files.atomic import sha256
 from tactile_bayes.scans import Scan
 
 EXAM_FACTS: Final = ("subject", "side", "posture", "examiner", "visit", "mass", "array_calibration_days")
-"""Facts of a scan's session on its exam and array calibration; codes only, see ``scan_session.schema.json``."""
+"""Facts of a scan's session about its exam and array calibration; codes only, see ``scan_session.schema.json``."""
 _DIGESTS: Final = ("sha256", "frames_sha256")
-"""Of a scan's file, and of its frames alone, which stays when the scan is written again with another session."""
+"""Digests of a scan's file, and of its frames, which stays when the scan is written with another session."""
 
 
 class Provenance(Record):
     """The origin of one output; equal inputs and settings give equal bytes.
 
     Inputs are named by their role, not by their file name: file names may hold patients' names. `scans` are the scans
-    at the beginning, through whatever files they came: the digests of each and the `EXAM_FACTS` that it carries.
+    that the output comes from, through any number of files: the digests and `EXAM_FACTS` of each.
     """
 
     command: str
@@ -50,13 +50,13 @@ def hash_inputs(**paths: Path | None) -> dict[str, str]:
 
 
 def scan_facts(scan: Scan, file_sha256: str = "") -> dict[str, str]:
-    """Digests of a scan and what it says of the exam, for `Provenance.scans`; the first is empty without a file."""
+    """Digests and `EXAM_FACTS` of a scan, for `Provenance.scans`; `file_sha256` is empty without a file."""
     facts = {name: scan.session[name] for name in EXAM_FACTS if scan.session.get(name)}
     return {**({"sha256": file_sha256} if file_sha256 else {}), **facts, "frames_sha256": scan.frames.sha256}
 
 
 def scans_of(document: object) -> tuple[dict[str, str], ...]:
-    """The scans that a file's provenance names, as `Provenance.as_dict` wrote it; what is not text is left out."""
+    """`Provenance.scans` of a file's provenance; values that are not text are left out."""
     scans = document.get("scans") if isinstance(document, dict) else None
     if not isinstance(scans, list):
         return ()
@@ -73,7 +73,7 @@ def recordings(scans: Sequence[Mapping[str, str]]) -> Iterator[str]:
 
 
 def repeated_scans(exams: Sequence[Sequence[Mapping[str, str]]]) -> dict[int, int]:
-    """Which exams share a recording with an earlier one: index of the exam, and of the earlier one."""
+    """Exams that share a recording with an earlier one: index of the exam -> index of the earlier one."""
     first_exam: dict[str, int] = {}
     repeats: dict[int, int] = {}
     for index, scans in enumerate(exams):

@@ -1,4 +1,4 @@
-"""The kind of a file, reading it within limits, and files in object stores."""
+"""Reading of files within limits, the kind of a file, and files in object stores."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def open_input(path: Path) -> io.BufferedReader:
 
 
 def first_bytes(path: Path, number: int) -> bytes:
-    """How a regular file begins."""
+    """First bytes of a regular file, up to `number`."""
     with open_input(path) as file:
         return file.read(number)
 
@@ -137,7 +137,7 @@ def limit_factor() -> float:
 
 @contextlib.contextmanager
 def decoding(what: str, *, way_out: str) -> Iterator[None]:
-    """Turn any error of a decoder on damaged bytes into one `BadDataError`; `what` it says: ``"cannot be decoded"``.
+    """Turn any error of a decoder on damaged bytes into a `BadDataError` with the text `what`: ``"cannot be decoded"``.
 
     Only calls into decoders of other packages belong inside: each of them has error classes of its own, and damaged
     bytes bring out others as well.
@@ -160,7 +160,7 @@ _WAYS_OUT: Final = {
 
 @contextlib.contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """Turn what the system says of a file that it cannot read into a `BadDataError`."""
+    """Turn an `OSError` on reading a file into a `BadDataError`."""
     try:
         yield
     except OSError as error:
@@ -221,16 +221,16 @@ def kind_of(path: Path) -> str:
 
 def schema_kind(schema: object) -> str:
     """Kind of a document in words by its ``schema``, such as ``tactile-bayes/estimate/1``; empty for others."""
-    parts = schema.split("/") if isinstance(schema, str) else []
-    if len(parts) < 2 or parts[0] != "tactile-bayes":
-        return ""
-    return _DOCUMENTS.get(parts[1], f"a {parts[1].replace('-', ' ')} (JSON)")
+    match str(schema).split("/"):
+        case "tactile-bayes", name, *_:
+            return _DOCUMENTS.get(name, f"a {name.replace('-', ' ')} (JSON)")
+    return ""
 
 
 def wrong_kind(path: Path, expected: str, *, what: str, way_out: str) -> BadDataError:
-    """Error for a file of another kind than `wanted` (in the words of `kind_of`); names the kind where it is known.
+    """Error for a file of another kind than `expected` (in the words of `kind_of`); names the kind where it is known.
 
-    `what` and `way_out` are the fault and the remedy where it is not, or where the file is of the wanted kind and
+    `what` and `way_out` are the fault and the remedy where it is not, or where the file is of the expected kind and
     damaged.
     """
     kind = kind_of(path)
@@ -265,7 +265,7 @@ def check_address(address: str) -> str:
 
 
 def version_of(address: str) -> str:
-    """Size, time and tag that the store gives of a file's content without reading it."""
+    """Size, tag and time of a stored file, without reading it."""
     with _reading_store(address) as store:
         known = store.info(address)
     named = {key.lower(): known[key] for key in known}
@@ -281,7 +281,7 @@ def sha256_of(address: str) -> str:
 
 @contextlib.contextmanager
 def downloaded(address: str) -> Iterator[Path]:
-    """Copy of a file of a store on this computer, for as long as the block lasts; see `version_of` for the errors."""
+    """Temporary local copy of a stored file, for the length of the block; see `version_of` for the errors."""
     with tempfile.TemporaryDirectory(prefix="tactile-bayes-") as folder:
         path = Path(folder) / PurePosixPath(address).name
         with _reading_store(address) as store:
@@ -289,7 +289,7 @@ def downloaded(address: str) -> Iterator[Path]:
         yield path
 
 
-def put(path: Path, address: str) -> None:
+def upload(path: Path, address: str) -> None:
     """Copy a local file into a store; it appears there whole or not at all."""
     try:
         _store(address).put_file(str(path), address)
@@ -298,7 +298,7 @@ def put(path: Path, address: str) -> None:
 
 
 def files_below(address: str, *endings: str) -> Iterator[str]:
-    """Addresses of all files below a folder that end in one of some ways, sorted; see `version_of` for the errors."""
+    """Addresses of all files below a folder with one of the `endings`, sorted; see `version_of` for the errors."""
     scheme = address.split("://", 1)[0]
     with _reading_store(address) as store:
         names = sorted(store.find(address))
@@ -308,7 +308,7 @@ def files_below(address: str, *endings: str) -> Iterator[str]:
 
 
 def _store(address: str) -> Any:
-    """File system that an address belongs to."""
+    """fsspec's file system of an address."""
     scheme = address.split("://", 1)[0]
     try:
         import fsspec
@@ -324,8 +324,11 @@ def _store(address: str) -> Any:
 
 @contextlib.contextmanager
 def _reading_store(address: str) -> Iterator[Any]:
-    """The store of an address, and faults of reading: a file's own where it is missing or closed; otherwise the
-    store's, which spares the exam."""
+    """The store of an address.
+
+    In the block a missing or closed file is a `BadDataError`, which fails its exam alone; a fault of the store is a
+    `UsageError`.
+    """
     try:
         yield _store(address)
     except UsageError:
@@ -339,7 +342,7 @@ def _reading_store(address: str) -> Iterator[Any]:
 
 
 def _reason(error: Exception) -> str:
-    """First line of an error of a store's library, without what may be a signed address."""
+    """Text of a store's error in one line, without the query of a signed address."""
     if isinstance(error, FileNotFoundError):
         return "there is no such file"
     if isinstance(error, PermissionError):

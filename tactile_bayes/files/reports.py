@@ -43,11 +43,11 @@ Judgement = Annotated[Verdict, described("no_answer: there is no size; doubtful:
 
 
 class Sized(Record):
-    """What has sizes, and may have others for exams as far apart as those of patients."""
+    """Base of records with sizes; `another_exam` may hold others, for exams as far apart as those of patients."""
 
     @property
     def leading(self) -> Self | AnotherExam:
-        """What holds the sizes that lead (record 0130).
+        """The record of the sizes to give first (record 0130): this one or `another_exam`.
 
         Until a site's repeatability is known these are the sizes for exams as far apart as patients' (`another_exam`);
         with it, or a stated spread, there is one interval.
@@ -57,7 +57,7 @@ class Sized(Record):
 
 
 class Report(Sized, kw_only=True):
-    """What all reports have in common."""
+    """Base of all reports."""
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}, {getattr(self, 'verdict', '')}>"
@@ -70,7 +70,7 @@ class Report(Sized, kw_only=True):
 
     @property
     def origin(self) -> Origin:
-        """Settings and inputs that it was made with."""
+        """Settings and inputs of the estimate."""
         return from_plain(Origin, getattr(self, "provenance", {}))
 
     @property
@@ -81,20 +81,20 @@ class Report(Sized, kw_only=True):
 
     @property
     def rounded(self) -> Self:
-        """The same with nine significant digits, but for what it was made with and what the method says of itself."""
+        """The report in nine significant digits, but for diagnostics, prior and provenance."""
         unrounded = {
             name: getattr(self, name) for name in ("diagnostics", "prior", "provenance") if hasattr(self, name)
         }
         return replace(rounded(self), **unrounded)
 
     def checked(self) -> Self:
-        """Itself, held against its declaration as a file would be."""
+        """The report, checked by its declaration as a file is."""
         from_plain(type(self), self.document, where="the report")
         return self
 
 
 def json_text(report: Report) -> str:
-    """What a command prints with ``--json``, and what a file holds."""
+    """JSON text of a report, for ``--json`` and files."""
     return dump_json(report.document)
 
 
@@ -106,7 +106,7 @@ class Place(Record):
 
     @property
     def median(self) -> tuple[float, float]:
-        """x and y, as of a `Point`."""
+        """x and y, as a `Point` has them."""
         return self.x, self.y
 
 
@@ -123,7 +123,7 @@ class Point(Record):
 
 
 def centre_of(point: Point | Place | None) -> tuple[float, float] | None:
-    """x and y in mm, of quantities the medians; None without."""
+    """x and y in mm, medians where these are quantities; None without a place."""
     return None if point is None else point.median
 
 

@@ -1,4 +1,4 @@
-"""A scan as an MCAP file, also while it is recorded."""
+"""Scans as MCAP files, also while they are recorded."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SCAN_SCHEMA: Final = "tactile-bayes/scan/1"
 CHUNK_BYTES: Final = 64 * 1024
 LANDMARK_NAMES: Final = ("sternal_notch", "xiphoid")
 NIPPLE: Final = "nipple"
-"""A landmark that a scan may do without; a file has a channel for it only where it was touched."""
+"""An optional landmark; a file has a channel for it only where it was touched."""
 TOPICS: Final = ("/pressure", "/pose", "/landmark")
 _NS: Final = 1_000_000_000
 _CALIBRATION: Final = "element_calibration.json"
@@ -52,8 +52,8 @@ T = TypeVar("T")
 class ScanWriter:
     """Writer of one scan to a binary stream, which stays open: its description, then messages as they arrive.
 
-    `truth` is what a simulated scan was made from, which `read_scan_report` returns beside the scan. `findings` speak
-    against a scan that is a copy of another file's.
+    `truth` is the scene of a simulated scan, which `read_scan_report` returns beside the scan. `findings` are those of
+    the file that the scan is a copy of.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class ScanWriter:
         truth: Mapping[str, Any] | None = None,
         findings: Sequence[Finding] = (),
     ) -> None:
-        from mcap.writer import CompressionType, Writer  # what only reads a scan need not load it
+        from mcap.writer import CompressionType, Writer  # reading a scan need not load it
 
         self._shape = head.shape
         self._sequence: dict[int, int] = {}
@@ -159,7 +159,7 @@ def _stamp(message: Any, device_ns: int) -> None:
 
 
 def _grid_of(head: scans.HeadGeometry) -> Any:
-    """Grid message without time and counts: the constant part of this head's frames."""
+    """Grid message without time and counts, which all frames of the head share."""
     rows, columns = head.shape
     pitch = head.pitch_mm
     grid = Grid(frame_id="scanhead", column_count=rows, row_stride=2 * rows, cell_stride=2)
@@ -241,13 +241,13 @@ class ScanFile(Record, eq=False):
     scan: scans.Scan
     complete: bool  #: The file was closed properly and nothing was lost.
     damaged: bool  #: A checksum failed: bytes changed after they were written. An unfinished file is not damaged.
-    lost: tuple[str, ...]  #: One line a loss, for people.
+    lost: tuple[str, ...]  #: One line per loss, for people.
     provenance: Mapping[str, Any]  #: As `Provenance.as_dict` wrote it.
-    truth: Mapping[str, Any] | None  #: What a simulated scan was made from; None for any other.
+    truth: Mapping[str, Any] | None  #: Scene of a simulated scan; None for any other.
 
 
 def read_scan_report(path: Path) -> ScanFile:
-    """Read a scan, and what its file holds and lost; one cut off before its first complete chunk is an error."""
+    """Read a scan with the report on its file; one cut off before its first complete chunk is an error."""
     records = scan_records(path, keep=TOPICS)
     with in_file(path):
         head = read_attachment(records, scans.HeadGeometry, "head.json")
@@ -287,7 +287,7 @@ def scan_records(path: Path, *, keep: Collection[str]) -> McapRecords:
 
 
 def file_findings(records: McapRecords) -> tuple[Finding, ...]:
-    """Losses of a scan's file, notes of its recorder, and findings of the file that it is a copy of."""
+    """Findings of a scan's file: of the file that it is a copy of, of losses, and notes of its recorder."""
     copied = parse_json(records.metadata.get("findings", {}).get("json", "[]"), name="findings")
     noted = records.metadata.get("recording", {}).get("cautions", "").splitlines()
     lost = [finding("data_lost", text) for text in records.lost]
@@ -353,7 +353,8 @@ def _pose_table(messages: Messages) -> FloatArray:
 
 
 def _landmarks(records: McapRecords) -> scans.Landmarks | None:
-    """Last touch of each landmark, and the distance of earlier ones from it; None unless `LANDMARK_NAMES` were."""
+    """Last touch of each landmark, and the largest distance of an earlier one; None unless all `LANDMARK_NAMES` were
+    touched."""
     points, apart = {}, []
     for name in (*LANDMARK_NAMES, NIPPLE):
         touches = records.messages("/landmark", schema="foxglove.PoseInFrame", name=name)
@@ -379,7 +380,7 @@ def _decode(kind: Any, body: bytes) -> Any:
 
 LOG_TOPIC: Final = "/log"
 ACCOUNT: Final = "recording"
-SYNC_S: Final = 0.5  #: So often what was handed to the system is seen onto the disk: power may fail.
+SYNC_S: Final = 0.5  #: Interval at which written bytes are synced to the disk: power may fail.
 
 
 def create_exclusive(path: Path, *, force: bool) -> IO[bytes]:

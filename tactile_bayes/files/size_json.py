@@ -1,4 +1,4 @@
-"""Calibrations, sites' repeatability and those that come with the program, as JSON."""
+"""Size calibrations, those that come with the program too, and sites' repeatability, as JSON."""
 
 from __future__ import annotations
 
@@ -188,7 +188,7 @@ def parse_size_calibration(document: Any, *, path: Path) -> Calibration:
 # --- A site's repeatability as JSON.
 
 SPREAD: Final = ("log_sd", "median", "low", "high", "masses", "maps", "outlying")
-"""What the file and `Repeatability` call alike."""
+"""Fields that the file and `Repeatability` share."""
 Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$", extra={"words": "a SHA-256, 64 digits from 0 to f"})]
 
 
@@ -246,7 +246,7 @@ class RepeatabilityFile(Record, kw_only=True, omit_defaults=True):
     """inputs: the size calibration, and the draws of each exam (shape.npz), in the order of repeats"""
 
     def __post_init__(self) -> None:
-        _ = self.spread()  # refuses what is none
+        _ = self.spread()  # checks the values
 
     def spread(self, digest: str = "") -> Repeatability:
         """The spread that a size uses, with the hash of the file it is from."""
