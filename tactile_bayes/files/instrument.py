@@ -36,7 +36,7 @@ def calibration_document(calibration: ElementCalibration) -> dict[str, Any]:
     return {"saturation_count": int(calibration.saturation_count), **to_plain(calibration, digits=EXACT)}
 
 
-# --- Heads as JSON: places of the taxels, or their grid and arc, for `record` and for simulated bodies.
+# --- Heads as JSON: positions of the taxels, or their grid and arc, for `record` and for simulated bodies.
 
 _DEFAULT_RIM_MM: Final = scenes.Head().rim_mm
 # Taxels further than this from a regular grid on an arc make a head that the models do not have.
@@ -86,7 +86,7 @@ def read_head_geometry(path: Path) -> HeadGeometry:
 
 
 def head_geometry(document: object, *, path: Path) -> HeadGeometry:
-    """The same of a document that was read from `path`."""
+    """Head of the JSON document of `path`; for the rest see `read_head_geometry`."""
     file = _head_file(document, path)
     with in_file(path):
         if file.scanhead_from_tracker is None:
@@ -105,17 +105,19 @@ def read_simulated_head(path: Path) -> scenes.Head:
 
 def _head_file(document: object, path: Path) -> HeadFile:
     file = parse_record(document, HeadFile, path=path)
-    keys_given = [name for name in ("rows", "columns", "radius_mm") if isinstance(document, dict) and name in document]
-    if file.surface_mm is not None and keys_given:
-        what = f"gives both surface_mm and {keys_given[0]}"
+    grid = [name for name in ("rows", "columns", "radius_mm") if getattr(file, name) is not None]
+    if file.surface_mm is not None and grid:
+        what = f"gives both surface_mm and {grid[0]}"
         raise BadDataError(what, way_out="leave out one of the two descriptions", path=str(path))
-    if file.surface_mm is None and (missing := {"rows", "columns", "radius_mm"} - set(keys_given)):
+    if isinstance(document, dict) and "radius_mm" in document:  # null is a flat head
+        grid.append("radius_mm")
+    if file.surface_mm is None and (missing := {"rows", "columns", "radius_mm"} - set(grid)):
         raise BadDataError(f"lacks {min(missing)}", way_out=_WAY_OUT, path=str(path))
     return file
 
 
 def _head_of(file: HeadFile) -> scenes.Head:
-    """The head as a grid on an arc, checked as a scene's; its taxels must be where the file has them."""
+    """The head as a grid on an arc, checked as a scene's; it must have its taxels where the file has them."""
     surface_mm = None if file.surface_mm is None else np.array(file.surface_mm)
     grid = file if surface_mm is None else HeadShape.of(surface_mm, file.pitch_mm)
     assert grid.rows is not None
@@ -189,7 +191,7 @@ def read_landmarks(path: Path) -> Landmarks:
 
 # --- Scenes of simulated scans, as TOML.
 
-# A lump with one of the first is tissue; only a Gaussian one may have the others.
+# A lump with one of the first keys is tissue; only a Gaussian one may have the others.
 _OF_TISSUE: Final = ("depth_ratio", "stiffness_ratio", "seat", "height_mm")
 _OF_BUMPS: Final = ("amplitude", "sigma_x_mm", "sigma_y_mm", "angle_deg")
 
@@ -252,7 +254,7 @@ def scene_of(document: Mapping[str, Any]) -> scenes.Scene:
 def _lumps(
     tables: Sequence[LumpTable], keys_of_lumps: Sequence[Mapping[str, Any]]
 ) -> tuple[tuple[scenes.Lump, ...], tuple[SolidLump, ...]]:
-    """Lumps that are bumps, and lumps that are tissue, by the keys that the file gives."""
+    """Gaussian lumps and lumps of tissue, told apart by the keys of the file."""
     bumps, tissue = [], []
     for i, (table, keys) in enumerate(zip(tables, keys_of_lumps, strict=True)):
         values = {key: getattr(table, key) for key in keys}

@@ -34,7 +34,9 @@ def of_surface(radius_mm: float | None, *, rows: int = 10, columns: int = 12) ->
 def test_both_descriptions_give_the_same_head(tmp_path: Path) -> None:
     wanted = Head(10, 12, 1.5, 20.0)
     assert read_simulated_head(written(tmp_path, ARC)) == wanted
-    assert read_simulated_head(written(tmp_path, of_surface(20.0))) == wanted
+    blank = {"rows": None, "columns": None, "radius_mm": None}
+    for surface in (of_surface(20.0), {**of_surface(20.0), **blank}):
+        assert read_simulated_head(written(tmp_path, surface)) == wanted
 
 
 @pytest.mark.parametrize("document", [{**ARC, "radius_mm": None}, of_surface(None)])
@@ -77,6 +79,7 @@ def sphere() -> dict[str, Any]:
         ({**ARC, "rim_mm": 30}, "rim_mm is 30"),
         ({**ARC, "shoulder_mm": 2, "rim_mm": 3}, "shoulder_mm is 2 and rim_mm 3"),
         ({name: ARC[name] for name in ARC if name != "columns"}, "lacks columns"),
+        ({**ARC, "rows": None}, "lacks rows"),
         ({**of_surface(20.0), "rows": 10}, "gives both surface_mm and rows"),
         (sphere(), "from a regular grid of 1.5 mm on an arc"),
         ({**of_surface(20.0), "pitch_mm": 2.0}, "from a regular grid of 2 mm"),
