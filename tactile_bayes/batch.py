@@ -434,8 +434,8 @@ class BatchInterrupted(KeyboardInterrupt):
 
     def __init__(self, outcomes: Sequence[Outcome[Any]], *, total: int, store: Path | None, before: int = 0) -> None:
         self.outcomes = list(outcomes)
-        kept = "" if store is None else f"; {store} keeps them, run again to go on"
-        super().__init__(f"{before + len(self.outcomes)} of {total} done{kept}")
+        resume = "" if store is None else f"; {store} keeps them, run again to go on"
+        super().__init__(f"{before + len(self.outcomes)} of {total} done{resume}")
 
 
 def fault_lines(outcomes: Iterable[Outcome[Any]]) -> list[str]:

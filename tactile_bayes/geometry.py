@@ -28,7 +28,7 @@ NOT_RIGID = 1e-6  #: A rotation's R R^T departs from the identity by no more.
 def rotation_from_quaternion(quaternion_wxyz: FloatArray) -> FloatArray:
     """(..., 3, 3) rotations of (..., 4) quaternions, scalar first; ``p_outer = R @ p_inner``.
 
-    They are normalised here, so that rounding in a device does not stretch a head.
+    Quaternions are normalised first: rounding in a device would otherwise scale positions on the head.
     """
     unit = quaternion_wxyz / np.linalg.norm(quaternion_wxyz, axis=-1, keepdims=True)
     w, x, y, z = np.moveaxis(unit, -1, 0)
@@ -108,9 +108,9 @@ class Plane(Record, eq=False):
 
 
 def principal_axes(points_mm: FloatArray) -> FloatArray:
-    """(3, 3) principal axes of (n, 3) points in columns, the direction in which they spread least first."""
-    around = points_mm - points_mm.mean(axis=0)
-    return np.asarray(np.linalg.eigh(around.T @ around)[1])
+    """(3, 3) principal axes of (n, 3) points as columns, that of the least spread first."""
+    deviations = points_mm - points_mm.mean(axis=0)
+    return np.asarray(np.linalg.eigh(deviations.T @ deviations)[1])
 
 
 def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: FloatArray, head_z: FloatArray) -> Plane:
@@ -138,10 +138,10 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
         )
     normal = normal if agreement > 0 else -normal
     x_axis = head_x - (head_x @ normal) * normal
-    length, of = math.sqrt(x_axis @ x_axis), float(np.linalg.norm(head_x))
-    if not length > 0.1 * of:
+    length, full = math.sqrt(x_axis @ x_axis), float(np.linalg.norm(head_x))
+    if not length > 0.1 * full:
         raise BadDataError(
-            f"the head's x axis is perpendicular to the plane of motion (projected length {length:.2g} of {of:.2g})",
+            f"the head's x axis is perpendicular to the plane of motion (projected length {length:.2g} of {full:.2g})",
             way_out="check scanhead_from_tracker, and keep the head's direction while scanning",
         )
     x_axis = x_axis / length

@@ -15,10 +15,10 @@ from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.presets import HEAD_COLUMNS, HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS, PRESSURE_RANGE_KPA
 
-# --- Shape of a head's sensing face in a few numbers, by which a size calibration knows the maps it was made for.
+# --- Shape of a head's sensing face in a few numbers, by which a size calibration is matched to maps.
 
 FLAT_RADIUS_MM: Final = 10_000.0  #: An arc of this radius or more counts as flat: over 40 mm it rises by 0.02 mm.
-# How far a head may depart from a calibration's; see docs/decisions/0101 for what such departures do to sizes.
+# Largest departures of a head from a calibration's; docs/decisions/0101 has their effect on sizes.
 PITCH_SHARE: Final = 0.03
 SIDE_SHARE: Final = 0.08
 RISE_MM: Final = 0.3
@@ -62,7 +62,7 @@ class HeadShape(Record):
         return cls(rows, columns, round(float(pitch_mm), 4), across, along, round(uneven, 3) + 0.0, rim_mm)
 
     def differences(self, other: HeadShape) -> list[str]:
-        """In what another head departs from this one by more than a calibration bears, in words; empty without any."""
+        """Departures of another head that are too large for a calibration of this one, in words; empty without any."""
         pairs = []
         if not _near(self.pitch_mm, other.pitch_mm, PITCH_SHARE):
             pairs.append(("pitch", f"{self.pitch_mm:g} mm", f"{other.pitch_mm:g} mm"))
@@ -126,13 +126,13 @@ CountArray = NDArray[np.uint16]
 
 
 def _check_finite(array: FloatArray, *, name: str, shape: tuple[int | None, ...]) -> FloatArray:
-    """Return the array as float64 after checking shape (None is any length) and finiteness."""
+    """The array as read-only float64, after a check of its shape (None is any length) and finiteness."""
     values = np.asarray(array, dtype=np.float64)
     if values.ndim != len(shape) or any(
-        want not in (None, have) for want, have in zip(shape, values.shape, strict=True)
+        side not in (None, length) for side, length in zip(shape, values.shape, strict=True)
     ):
-        wanted = "(" + ", ".join("n" if want is None else str(want) for want in shape) + ")"
-        raise BadDataError(f"{name} has shape {values.shape}", way_out=f"it must be {wanted}")
+        sides = ", ".join("n" if side is None else str(side) for side in shape)
+        raise BadDataError(f"{name} has shape {values.shape}", way_out=f"it must be ({sides})")
     bad = np.argwhere(~np.isfinite(values))
     if len(bad):
         index = tuple(int(i) for i in bad[0])
@@ -227,7 +227,7 @@ class PressureFrames(Record, eq=False):
 
     @property
     def sha256(self) -> str:
-        """Digest of the readings alone, which a recording keeps whatever session or calibration it is written with."""
+        """Digest of the readings alone: a recording has the same one with any session or calibration."""
         digest = hashlib.sha256(np.array(self.counts.shape, dtype="<i8").tobytes())
         digest.update(np.ascontiguousarray(self.counts, dtype="<u2").data)
         return digest.hexdigest()

@@ -98,7 +98,7 @@ class LiveAnswer(NamedTuple):
     lump_base_mm: FloatArray | None = None  #: Centre of the lump in `base`.
 
 
-class Estimator:
+class LiveEstimator:
     """Estimates the newest map's size again and again, in a process that starts before there is a map."""
 
     def __init__(self, calibration: str | None) -> None:
@@ -213,7 +213,7 @@ def run(pipe: int, setup: dict[str, Any]) -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # the signal ends the recording, and that ends the view
     live = LiveMap(from_plain(HeadGeometry, setup["head"]), from_plain(ElementCalibration, setup["calibration"]))
-    estimator = Estimator(setup["size_calibration"])
+    estimator = LiveEstimator(setup["size_calibration"])
     with contextlib.ExitStack() as stack:
         stack.callback(estimator.close)
         displays: list[Callable[[LiveState], None]] = []

@@ -105,7 +105,7 @@ def population_action(
         masses = range(sample.masses + sample.centred)
         outcomes = run_batch(population.rows, masses, key=str, executor=executor, store=store, progress=progress)
     rows = [row for outcome in outcomes for row in outcome.value or []]
-    write_text(output, table_text(rows), force=force)
+    write_text(output, population_csv(rows), force=force)
     failed = [outcome for outcome in outcomes if not outcome.ok]
     for line in fault_lines(failed):
         click.echo(f"could not be simulated: mass {line}", err=True)
@@ -120,6 +120,6 @@ def population_action(
         raise TactileBayesError(f"{missing}; {store_path(output)} keeps the others: run again")
 
 
-def table_text(rows: list[ExamRow]) -> str:
+def population_csv(rows: list[ExamRow]) -> str:
     """CSV of the rows, with the header of `data_schema/population.table.json`."""
     return csv_text(names_of(ExamRow), (as_dict(row).values() for row in rows), digits=8)

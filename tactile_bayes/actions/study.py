@@ -61,7 +61,7 @@ from tactile_bayes.studies.model_comparison import (
 from tactile_bayes.studies.paper_solid import SolidSettings
 
 
-def read_frames(path: Path) -> list[MeasuredFrame]:
+def read_measured_frames(path: Path) -> list[MeasuredFrame]:
     """Frames of a table, one for each position of the head, in the order in which they first appear."""
     columns = read_table(path, "measured_frames.table.json").columns
     x_c = np.array([0.0 if x is None else x for x in columns["x_c_mm"]])
@@ -105,15 +105,15 @@ def study_action(
     if (measured_frames or phantom) and (figures is None or model != "plane-strain"):
         option = "--measured-frames" if measured_frames else "--phantom"
         raise UsageError(f"{option} is for --figures of the plane-strain model; give --figures DIR")
-    frames = [] if measured_frames is None else read_frames(measured_frames)
+    frames = [] if measured_frames is None else read_measured_frames(measured_frames)
     geometries = paper.paper_grid(seat) if study.grid == "paper" else read_grid(Path(study.grid), seat=seat)
     paths = [] if figures is None else prepare_figures(figures, model=model, force=force)
     with open_executor(workers=workers, cluster=scheduler) as executor:
         rows = run_study(geometries, settings=settings, executor=executor, output=output)
     if output is None:
-        click.echo(study_table(rows) if sys.stdout.isatty() else table_text(rows), nl=False)
+        click.echo(study_table(rows) if sys.stdout.isatty() else study_csv(rows), nl=False)
     else:
-        write_text(output, table_text(rows), force=force)
+        write_text(output, study_csv(rows), force=force)
         store_path(output).unlink(missing_ok=True)
     click.echo(study_text(rows), err=output is None)
     lines = [RESEARCH_USE]
@@ -179,12 +179,12 @@ def run_study(
             )
         except BatchInterrupted as interrupt:
             if output is None:  # no later run can resume
-                click.echo(table_text(_rows(interrupt.outcomes)), nl=False)
+                click.echo(study_csv(_rows(interrupt.outcomes)), nl=False)
             raise
     failed = [outcome for outcome in outcomes if not outcome.ok]
     if failed:
         if output is None:
-            click.echo(table_text(_rows(outcomes)), nl=False)
+            click.echo(study_csv(_rows(outcomes)), nl=False)
         raise TactileBayesError(
             f"{len(failed)} of {len(outcomes)} geometries failed, the first ({failed[0].key}): {failed[0].error}"
         )
@@ -195,7 +195,7 @@ def _rows(outcomes: Iterable[Outcome[list[paper.StudyRow]]]) -> list[paper.Study
     return [row for outcome in outcomes for row in outcome.value or []]
 
 
-def table_text(rows: list[paper.StudyRow]) -> str:
+def study_csv(rows: list[paper.StudyRow]) -> str:
     """CSV of the study for `calibrate size`; columns of the solid model only where a row has them."""
     names = ["seat", "d_mm", "depth_ratio", "stiffness_ratio", "amplitude", "sigma_x_mm"]
     if any(row.sigma_y_mm is not None for row in rows):
@@ -331,7 +331,7 @@ def sbc_action(
             progress_bar("maps") as progress,
         ):
             made = max(run.maps - (0 if store is None else len(store)), 0)  # by this run
-            work = partial(ranks_of_map, **settings)
+            work = partial(shipped_ranks, **settings)
             outcomes = run_batch(work, range(run.maps), key=str, executor=executor, store=store, progress=progress)
     except BatchInterrupted as interrupt:
         if output is None:  # no later run can resume
@@ -355,13 +355,13 @@ def sbc_action(
         raise TactileBayesError(f"{len(failed)} of {len(outcomes)} maps are missing from this report")
 
 
-def ranks_of_map(index: int, *, method: Method, seed: int, cosines: FieldCosines) -> sbc.MapRanks:
+def shipped_ranks(index: int, *, method: Method, seed: int, cosines: FieldCosines) -> sbc.MapRanks:
     """Ranks of one map by the shipped calibration, which each process reads once."""
-    return sbc.ranks_of_map(index, method=method, seed=seed, calibration=_shipped(), cosines=cosines)
+    return sbc.ranks_of_map(index, method=method, seed=seed, calibration=_shipped_calibration(), cosines=cosines)
 
 
 @cache
-def _shipped() -> BodyCalibration:
+def _shipped_calibration() -> BodyCalibration:
     path = size_calibration_path(DEFAULT)
     calibration = None if path is None else read_size_calibration(path)
     assert isinstance(calibration, BodyCalibration)

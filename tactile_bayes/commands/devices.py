@@ -13,8 +13,8 @@ from tactile_bayes.commands.options import (
     FiniteRange,
     WholeRange,
     command,
-    number,
-    output,
+    number_option,
+    output_option,
     record_options,
 )
 from tactile_bayes.declarations import names_of
@@ -26,7 +26,7 @@ PROTOCOLS = get_args(TrackerProtocol)
 
 
 @command("record", "record.record_action")
-@output("SCAN.mcap", "MCAP", "Scan file to write.", required=True)
+@output_option("SCAN.mcap", "MCAP", "Scan file to write.", required=True)
 @click.option("--head", "head_url", required=True, metavar="URL", help="Port of the scan head.")
 @record_options(RecordOptions, *_RECORDING)
 @FORCE
@@ -92,7 +92,7 @@ def emulate_command() -> None:
     help=f"Protocol of the tracker to rotate: {', '.join(PROTOCOLS)}.",
 )
 @record_options(RecordOptions, "tool")
-@number("--duration", FiniteRange(min=0.2), 10.0, "How long to rotate it, s.", metavar="S")
+@number_option("--duration", FiniteRange(min=0.2), 10.0, "How long to rotate it, s.", metavar="S")
 def devices_command() -> None:
     """List the serial ports and the devices that are probably on them.
 
@@ -105,7 +105,7 @@ def devices_command() -> None:
 
 @command("replay", "devices.replay_action")
 @click.argument("scan", metavar="SCAN.mcap", type=FilePath())
-@output("OUT.mcap", "MCAP", "Save what is recorded.")
+@output_option("OUT.mcap", "MCAP", "Save what is recorded.")
 @record_options(RecordOptions, "live", "serve", "size_calibration")
 @SPEED
 @FORCE
@@ -118,7 +118,7 @@ def replay_command() -> None:
 
 @command("repair", "devices.repair_action")
 @click.argument("scan", metavar="SCAN.mcap", type=FilePath())
-@output("OUT.mcap", "MCAP", "Write to this file instead of replacing SCAN.mcap.")
+@output_option("OUT.mcap", "MCAP", "Write to this file instead of replacing SCAN.mcap.")
 @FORCE
 def repair_command() -> None:
     """Repair a scan that was cut off or damaged: keep what is intact, report what is lost.

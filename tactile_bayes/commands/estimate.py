@@ -17,13 +17,13 @@ _FILE = options.FilePath()
 
 @options.command("map", "mapping.map_action")
 @click.argument("scans", metavar="SCAN.mcap...", nargs=-1, required=True, type=_FILE)
-@options.output(
+@options.output_option(
     "MAP.nc",
     "netCDF",
     "Where to write the map. Default: beside the first scan; map.nc for scan.mcap, s01.nc for s01.mcap.",
 )
 @options.record_options(MapOptions)
-@options.figure("Draw the map and its coverage.")
+@options.figure_option("Draw the map and its coverage.")
 @options.FORCE
 @click.option("-v", "--verbose", is_flag=True, help="Print all figures of the map; times on stderr.")
 def map_command() -> None:
@@ -41,14 +41,16 @@ def map_command() -> None:
 @options.command("estimate", "estimate.estimate_action")
 @click.argument("maps", metavar="MAP.nc...", nargs=-1, required=True, type=_FILE)
 @options.record_options(Settings, "size_calibration", "method", "seed", "interval")
-@options.output("POST.nc", "netCDF", "Write all draws (netCDF that arviz opens).")
+@options.output_option("POST.nc", "netCDF", "Write all draws (netCDF that arviz opens).")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON: one object, or a list for several maps.")
-@options.figure("Draw the size posterior, or the map where there is no size.")
-@options.figure("Draw the map with the lump's size, or with the places looked at.", "--map-figure")
-@options.figure("Draw data, fit and residual of the fit window, or the map where there is no estimate.", "--fit-figure")
+@options.figure_option("Draw the size posterior, or the map where there is no size.")
+@options.figure_option("Draw the map with the lump's size, or with the places looked at.", "--map-figure")
+@options.figure_option(
+    "Draw data, fit and residual of the fit window, or the map where there is no estimate.", "--fit-figure"
+)
 @options.record_options(Settings, "centre_mm", "scene", "settings_file", "accuracy_sd", "known", "repeatability")
 @click.option("--pool", is_flag=True, help="Pool the maps, all of one mass, into one size.")
-@options.number("--workers", options.WholeRange(min=1), 1, "Number of worker processes, for several maps.")
+@options.number_option("--workers", options.WholeRange(min=1), 1, "Number of worker processes, for several maps.")
 @options.scheduler_option("several maps")
 @options.FORCE
 @click.option(
@@ -81,11 +83,11 @@ class VisitsCommand(click.Command):
     def make_parser(self, ctx: click.Context) -> Any:
         parser = super().make_parser(ctx)
         parse = parser.parse_args
-        parser.parse_args = lambda args: parse(numbered(args, strict=not ctx.resilient_parsing))  # type: ignore[method-assign]
+        parser.parse_args = lambda args: parse(number_groups(args, strict=not ctx.resilient_parsing))  # type: ignore[method-assign]
         return parser
 
 
-def numbered(args: Sequence[str], *, strict: bool = True) -> list[str]:
+def number_groups(args: Sequence[str], *, strict: bool = True) -> list[str]:
     """The words with each file after ``--with`` as ``--with GROUP FILE``, groups numbered from 1.
 
     With `strict` a ``--with`` without a file is refused; a shell that completes words drops it.
@@ -151,11 +153,11 @@ _PERCENT = tuple(100 * share for share in GROWTH_SHARES)
 )  # fmt: skip
 @options.record_options(Settings, "seed", "interval")
 @options.JSON
-@options.output(
+@options.output_option(
     "GROWTH.html", "HTML", "Write one page: the maps on common axes, the size at each visit, and the change."
 )
 @options.page_options("GROWTH.pdf", "Tactile exams over time")
-@options.figure("Draw the maps, their difference and the change.")
+@options.figure_option("Draw the maps, their difference and the change.")
 @options.FORCE
 @click.option("-v", "--verbose", is_flag=True, help="Print the full report instead of 12 lines.")
 def compare_command() -> None:
@@ -173,7 +175,7 @@ def compare_command() -> None:
 
 @options.command("report", "pages.report_action")
 @click.argument("files", metavar="MAP.nc... [POST.nc|ESTIMATE.json]", nargs=-1, required=True, type=_FILE)
-@options.output("EXAM.html", None, "Page to write.", required=True)
+@options.output_option("EXAM.html", None, "Page to write.", required=True)
 @options.page_options("EXAM.pdf", "Tactile exam")
 @click.option("--date", "day", default="", metavar="YYYY-MM-DD", help="Date to print on the page. Default: none.")
 @options.record_options(

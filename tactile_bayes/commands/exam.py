@@ -15,8 +15,8 @@ from tactile_bayes.commands.options import (
     SESSION,
     FilePath,
     command,
-    figure,
-    output,
+    figure_option,
+    output_option,
     path_option,
     record_options,
 )
@@ -26,7 +26,7 @@ from tactile_bayes.presets import CORRECTIONS, METHODS
 
 
 @command("demo", "exam.demo_action")
-@output("DIR", None, "Folder for the files.", default=Path("tactile-bayes-demo"), show_default=True)
+@output_option("DIR", None, "Folder for the files.", default=Path("tactile-bayes-demo"), show_default=True)
 @record_options(
     Settings, "method", type=click.Choice(METHODS[:3]), help="Method of the first estimate; see `estimate --help`."
 )
@@ -96,7 +96,7 @@ import_command.help = f"{cleandoc(import_command.help or '')}\n\n{_ARRAYS}"
 @command("check", "exam.check_action")
 @click.argument("scans", nargs=-1, required=True, metavar="SCAN...", type=FilePath())
 @record_options(MapOptions, "pressure_window_kpa")
-@output(
+@output_option(
     "HEAD.json",
     None,
     "Head of the scan with the day of this check, where the scan shows that it is right; for --head-geometry.",
@@ -132,7 +132,7 @@ _FORMATS: Final = ("dicom", "fhir", "nrrd", "csv")
 @command("export", "pages.export_action")
 @click.argument("files", metavar="FILE...", nargs=-1, type=FilePath())
 @click.option("--to", required=True, type=click.Choice(_FORMATS), help="Format to write.")
-@output("OUT", None, "File to write; for dicom the folder of the files.")
+@output_option("OUT", None, "File to write; for dicom the folder of the files.")
 @path_option(
     "--worklist",
     "ITEM",
@@ -155,9 +155,9 @@ def export_command() -> None:
 
 @command("diagnose", "exam.diagnose_action")
 @click.argument("posterior", metavar="POST.nc", type=FilePath())
-@figure("Draw densities and traces.", "--trace")
-@figure("Draw the ranks of each chain's draws among all.", "--rank")
-@figure("Draw the pairs of sizes, amplitude and widths.", "--corner")
+@figure_option("Draw densities and traces.", "--trace")
+@figure_option("Draw the ranks of each chain's draws among all.", "--rank")
+@figure_option("Draw the pairs of sizes, amplitude and widths.", "--corner")
 @JSON
 @FORCE
 def diagnose_command() -> None:

@@ -20,7 +20,7 @@ def calibrate_command() -> None:
 
 @options.command("size", "calibrate.calibrate_size_action", within=calibrate_command)
 @click.argument("table", metavar="TABLE.csv", type=_FILE)
-@options.output("SIZE.json", "JSON", "Where to write the calibration.", required=True)
+@options.output_option("SIZE.json", "JSON", "Where to write the calibration.", required=True)
 @options.record_options(declared.LearnOptions, "form")
 @click.option(
     "--correct",
@@ -35,7 +35,7 @@ def calibrate_command() -> None:
 )
 @options.record_options(declared.LearnOptions, "fit", "normalise", "background", "fit_radius_mm", "noise")
 @options.record_options(declared.LearnOptions, "least_stiffness_ratio")
-@options.figure("Draw Fig 8 of the paper from the table's lumps (eq6 only).")
+@options.figure_option("Draw Fig 8 of the paper from the table's lumps (eq6 only).")
 @options.record_options(declared.LearnOptions, "seed")
 @options.FORCE
 def size() -> None:
@@ -73,7 +73,7 @@ def size() -> None:
 
 @options.command("repeatability", "calibrate.calibrate_repeatability_action", within=calibrate_command)
 @click.argument("folder", metavar="OUT", type=_FILE)
-@options.output("SITE.json", "JSON", "Where to write the spread.", required=True)
+@options.output_option("SITE.json", "JSON", "Where to write the spread.", required=True)
 @click.option(
     "--size-calibration",
     metavar="SIZE.json",
@@ -102,7 +102,7 @@ def repeatability() -> None:
     required=True,
     help="The bladder's pressure and what the head recorded under it.",
 )
-@options.output("ARRAY.json", "JSON", "Where to write the calibration.", required=True)
+@options.output_option("ARRAY.json", "JSON", "Where to write the calibration.", required=True)
 @click.option("--head-id", metavar="ID", help="Identifier of the head. Default: what the scans state.")
 @click.option(
     "--date", "day", type=click.DateTime(["%Y-%m-%d"]), metavar="DAY", help="Day of the measurement. Default: today."
@@ -148,7 +148,7 @@ def simulate_command() -> None:
 
 
 @options.command("population", "simulation.population_action")
-@options.output("TABLE.csv", "CSV", "Where to write the table.", required=True)
+@options.output_option("TABLE.csv", "CSV", "Where to write the table.", required=True)
 @options.record_options(declared.PopulationOptions, "masses", "centred", "scans", "normalise")
 @options.path_option(
     "--head",
@@ -184,8 +184,8 @@ def population_command() -> None:
 @options.record_options(declared.SbcOptions)
 @options.WORKERS
 @options.scheduler_option("the maps")
-@options.output("TABLE.csv", "CSV", "Write truths and ranks; an interrupted run resumes from it.")
-@options.figure("Draw the ECDFs of the ranks with their bands.")
+@options.output_option("TABLE.csv", "CSV", "Write truths and ranks; an interrupted run resumes from it.")
+@options.figure_option("Draw the ECDFs of the ranks with their bands.")
 @options.JSON
 @options.FORCE
 def sbc_command() -> None:
@@ -204,7 +204,7 @@ def sbc_command() -> None:
 
 @options.command("study", "study.study_action")
 @options.record_options(declared.StudyOptions, "model", "grid", "seat")
-@options.output("TABLE.csv", "CSV", "Write the table. Default: print it.")
+@options.output_option("TABLE.csv", "CSV", "Write the table. Default: print it.")
 @options.path_option(
     "--figures",
     "DIR",
@@ -288,7 +288,7 @@ def head_uniformity_command() -> None:
 @options.command("design", "study.head_design_action", within=head_command)
 @options.head_option("Default: both are searched.")
 @options.record_options(declared.TissueOptions)
-@options.figure("Draw the non-uniformity over radius and shoulder.")
+@options.figure_option("Draw the non-uniformity over radius and shoulder.")
 @options.JSON
 @options.FORCE
 def head_design_command() -> None:
@@ -324,8 +324,8 @@ _FIDELITIES = ("solid", "plane-strain", "empirical", "empirical-gaussian")
 )
 @options.record_options(declared.MapOptions, "every", help="Compare one frame in so many.")
 @options.record_options(declared.MapOptions, "cell_mm", "pressure_window_kpa")
-@options.number("--latency-ms", click.FLOAT, 0.0, "Delay of the tracker's time stamps.")
-@options.figure("Draw frames, maps and what the model leaves.")
+@options.number_option("--latency-ms", click.FLOAT, 0.0, "Delay of the tracker's time stamps.")
+@options.figure_option("Draw frames, maps and what the model leaves.")
 @options.JSON
 @options.FORCE
 def compare_model_command() -> None:
@@ -344,13 +344,13 @@ def compare_model_command() -> None:
 # --- Options that the trade-off commands share.
 
 _RUN_COUNT = options.WholeRange(1, 1000)
-_TOLERANCE = options.number(
+_TOLERANCE = options.number_option(
     "--tolerance-mm",
     _ABOVE_0,
     0.2,
     "Error of the size interval's ends below which more accuracy is not worth its cost.",
 )
-_RUNS = options.number(
+_RUNS = options.number_option(
     "--runs", _RUN_COUNT, 3, "Number of runs of each setting: the least time counts, errors are averaged."
 )
 
@@ -371,9 +371,11 @@ def tradeoff_command() -> None:
 @options.head_option(
     "Default: shoulders-inside for plane-strain and the empirical model, as the scene's [head] gives them for solid."
 )
-@options.figure("Draw error in size against time.")
-@options.number("--tolerance-percent", _ABOVE_0, 0.5, "Error in size below which more accuracy is not worth its cost.")
-@options.number("--runs", _RUN_COUNT, 1, "Number of runs; the shortest time counts.")
+@options.figure_option("Draw error in size against time.")
+@options.number_option(
+    "--tolerance-percent", _ABOVE_0, 0.5, "Error in size below which more accuracy is not worth its cost."
+)
+@options.number_option("--runs", _RUN_COUNT, 1, "Number of runs; the shortest time counts.")
 @options.JSON
 @options.FORCE
 def tradeoff_forward_command() -> None:
@@ -404,7 +406,7 @@ def tradeoff_forward_command() -> None:
 @options.record_options(Settings, "settings_file", help="Settings, as in `estimate`.")
 @_TOLERANCE
 @_RUNS
-@options.figure("Draw error against time.")
+@options.figure_option("Draw error against time.")
 @options.record_options(Settings, "seed")
 @options.JSON
 @options.FORCE
@@ -426,7 +428,7 @@ def tradeoff_estimate_command() -> None:
 @click.argument("scan", metavar="SCAN.mcap", type=_FILE)
 @_TOLERANCE
 @_RUNS
-@options.figure("Draw error against time.")
+@options.figure_option("Draw error against time.")
 @options.record_options(Settings, "seed")
 @options.JSON
 @options.FORCE

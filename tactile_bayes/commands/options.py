@@ -276,7 +276,7 @@ def _click_type(kind: Any) -> Any:
 FORCE = click.option("--force", is_flag=True, help="Overwrite existing outputs.")
 
 
-def output(
+def output_option(
     metavar: str, writes: Format | None, meaning: str, *, guarded: bool | None = None, **attributes: Any
 ) -> Decorator:
     """``-o``: a command's output, see `FilePath`; `writes` is None for a folder or a file of several formats."""
@@ -284,12 +284,12 @@ def output(
     return click.option("-o", "--output", metavar=metavar, type=path_type, help=meaning, **attributes)
 
 
-def figure(meaning: str, name: str = "--figure") -> Decorator:
+def figure_option(meaning: str, name: str = "--figure") -> Decorator:
     """``--figure``, or another option that names a figure to write."""
     return click.option(name, metavar="FIG.png|.pdf|.svg", type=FilePath(writes="figure"), help=meaning)
 
 
-def number(name: str, kind: _ParamType, default: float, meaning: str, **attributes: Any) -> Decorator:
+def number_option(name: str, kind: _ParamType, default: float, meaning: str, **attributes: Any) -> Decorator:
     """An option of a number with a default that its help shows."""
     return click.option(name, type=kind, default=default, show_default=True, help=meaning, **attributes)
 
@@ -317,8 +317,8 @@ SESSION = record_options(
     help="Facts of the exam for the scan: subject, side, posture, examiner, visit and more, in plain text.",
 )
 JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-SPEED = number("--speed", FiniteRange(0.01, 100.0), 1.0, "Playback speed; 1 is real time.")
-WORKERS = number("--workers", WholeRange(min=0), 1, "Number of worker processes.")
+SPEED = number_option("--speed", FiniteRange(0.01, 100.0), 1.0, "Playback speed; 1 is real time.")
+WORKERS = number_option("--workers", WholeRange(min=0), 1, "Number of worker processes.")
 
 
 def scheduler_option(items: str) -> Decorator:

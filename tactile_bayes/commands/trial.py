@@ -25,7 +25,7 @@ _FILE = options.FilePath()
     help="Also print lines, limits of agreement, repeatability, pairs and r squared.",
 )
 @options.JSON
-@options.output("REPORT.json", "JSON", "Write the report as JSON to this file.")
+@options.output_option("REPORT.json", "JSON", "Write the report as JSON to this file.")
 @options.path_option("--html", "REPORT.html", "Write tables and figures as one self-contained page.", writes="HTML")
 @options.path_option("--pdf", "REPORT.pdf", options.PRINTED)
 @options.path_option("--protocol", "FILE.toml", "Pre-specified analysis; the report records its hash.")
@@ -48,8 +48,8 @@ def validate_command() -> None:
 @options.path_option("--excision", "EX.csv", "Sizes measured after excision in the pilot.")
 @options.record_options(PlanOptions, "against", "trials", "seed", "workers")
 @options.JSON
-@options.output("PLAN.json", "JSON", "Write the plan as JSON to this file.")
-@options.figure("Draw power against the number of patients.")
+@options.output_option("PLAN.json", "JSON", "Write the plan as JSON to this file.")
+@options.figure_option("Draw power against the number of patients.")
 @options.FORCE
 def plan_command() -> None:
     """Plan a trial: how many patients, how many maps of a mass, by simulation.
@@ -69,7 +69,7 @@ def campaign_command() -> None:
 
 @options.command("init", "campaign.campaign_init_action", within=campaign_command)
 @click.argument("folder", metavar="FOLDER", type=options.FilePath(addresses=True))
-@options.output("EXAMS.csv", "CSV", "Where to write the table.", guarded=False, required=True)
+@options.output_option("EXAMS.csv", "CSV", "Where to write the table.", guarded=False, required=True)
 @click.option(
     "--names",
     metavar="PATTERN",
@@ -94,7 +94,7 @@ def campaign_init_command() -> None:
 
 @options.command("run", "campaign.campaign_run_action", within=campaign_command)
 @click.argument("exams", metavar="EXAMS.csv", type=_FILE)
-@options.output("DIR", None, "Folder for all files.", required=True)
+@options.output_option("DIR", None, "Folder for all files.", required=True)
 @options.record_options(CampaignOptions, "excision", "columns", "protocol")
 @options.record_options(Settings, "method", help="As `estimate`.")
 @options.record_options(

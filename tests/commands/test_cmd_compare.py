@@ -16,7 +16,7 @@ from scipy.special import ndtri
 from settings_files import settings
 
 import tactile_bayes as tb
-from tactile_bayes.commands.estimate import numbered
+from tactile_bayes.commands.estimate import number_groups
 from tactile_bayes.declarations import from_plain, replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.map_nc import read_map, write_map
@@ -253,13 +253,13 @@ def test_the_figure_is_written_once_and_not_over_another(folder: Path, later: st
 
 
 def test_files_after_with_are_one_visit() -> None:
-    assert numbered(["a", "--with", "b", "c", "--json", "--with", "d"]) == [
+    assert number_groups(["a", "--with", "b", "c", "--json", "--with", "d"]) == [
         "a", "--with", "1", "b", "--with", "1", "c", "--json", "--with", "2", "d"
     ]  # fmt: skip
     for words in (["a", "--with"], ["--with", "--json"], ["a", "--with", "--with", "b"]):
         with pytest.raises(UsageError):
-            numbered(words)
-    assert numbered(["a", "--with"], strict=False) == ["a"]
+            number_groups(words)
+    assert number_groups(["a", "--with"], strict=False) == ["a"]
 
 
 def test_the_order_of_a_visits_maps_leaves_no_trace(folder: Path, grown: dict) -> None:

@@ -48,7 +48,9 @@ def row(body: int, exam: int, head: Head) -> ExamRow:
 
 
 def write_table(path: Path, heads: Callable[[int], Head]) -> None:
-    path.write_text(population.table_text([row(body, exam, heads(body)) for body in range(40) for exam in range(2)]))
+    path.write_text(
+        population.population_csv([row(body, exam, heads(body)) for body in range(40) for exam in range(2)])
+    )
 
 
 @pytest.fixture(scope="module")

@@ -36,7 +36,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("population") / "population.csv"
     rows = [row(body, exam) for body in range(40) for exam in range(2)]
     unseen = replace(rows[0], body=40, detected=False, amplitude=None, sigma_x_mm=None, sigma_y_mm=None)
-    path.write_text(population.table_text([*rows, unseen]))
+    path.write_text(population.population_csv([*rows, unseen]))
     return path
 
 
@@ -120,7 +120,7 @@ def test_a_residual_needs_bodies_with_a_head_profile(table: Path, tmp_path: Path
 @pytest.mark.parametrize("way", ["gain", "mean", ""])
 def test_a_calibration_keeps_how_its_maps_were_normalised(tmp_path: Path, way: str) -> None:
     rows = [replace(row(body, exam), normalise=way) for body in range(40) for exam in range(2)]
-    (tmp_path / "t.csv").write_text(population.table_text(rows))
+    (tmp_path / "t.csv").write_text(population.population_csv(rows))
     done = run_here("calibrate", "size", "t.csv", "--form", "eq6", "-o", "s.json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert read_size_calibration(tmp_path / "s.json").recipe.normalise == (way or "mean")
@@ -128,7 +128,7 @@ def test_a_calibration_keeps_how_its_maps_were_normalised(tmp_path: Path, way: s
 
 def test_maps_normalised_in_several_ways_teach_nothing(tmp_path: Path) -> None:
     rows = [replace(row(body, exam), normalise=("mean", "gain")[exam]) for body in range(40) for exam in range(2)]
-    (tmp_path / "t.csv").write_text(population.table_text(rows))
+    (tmp_path / "t.csv").write_text(population.population_csv(rows))
     done = run_here("calibrate", "size", "t.csv", "--form", "eq6", "-o", "s.json", cwd=tmp_path)
     assert done.returncode == 3
     assert "t.csv: its maps were normalised in several ways (gain, mean)" in done.stderr

@@ -51,7 +51,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_table(tmp_path: Path, mon
             raise KeyboardInterrupt
         return quick(index, method=method, seed=seed, cosines=cosines)
 
-    monkeypatch.setattr(command, "ranks_of_map", stopping)
+    monkeypatch.setattr(command, "shipped_ranks", stopping)
     words = ("sbc", "--maps", 12, "-o", "s.csv")
     assert run_here(*words, cwd=tmp_path).returncode == 130
     assert not (tmp_path / "s.csv").exists()
@@ -66,7 +66,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_table(tmp_path: Path, mon
 
 
 def test_findings_as_data(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(command, "ranks_of_map", quick)
+    monkeypatch.setattr(command, "shipped_ranks", quick)
     done = run_here("sbc", "--maps", 100, "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
@@ -84,7 +84,7 @@ def test_a_posterior_that_fails_is_said_to_fail_and_the_exit_code_stays(tmp_path
         end = (0, 99)[index % 2]
         return MapRanks(index, TRUTH, (index, end, index, index, index), method)
 
-    monkeypatch.setattr(command, "ranks_of_map", narrow)
+    monkeypatch.setattr(command, "shipped_ranks", narrow)
     done = run_here("sbc", "--maps", 100, "--figure", "s.png", cwd=tmp_path)
     assert done.returncode == 0
     assert "FAILS for sigma_x_mm:" in done.stdout
@@ -93,7 +93,7 @@ def test_a_posterior_that_fails_is_said_to_fail_and_the_exit_code_stays(tmp_path
 
 
 def test_maps_that_all_abstain_leave_nothing_to_rank(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(command, "ranks_of_map", lambda i, **_: MapRanks(i, TRUTH, None, "window"))
+    monkeypatch.setattr(command, "shipped_ranks", lambda i, **_: MapRanks(i, TRUTH, None, "window"))
     done = run_here("sbc", "--maps", 3, "--figure", "s.png", "-o", "s.csv", cwd=tmp_path)
     assert done.returncode == 0
     assert "no estimate on 3 (window 3)" in done.stdout
@@ -106,7 +106,7 @@ def test_ctrl_c_reports_the_maps_that_are_done_where_nothing_keeps_them(tmp_path
             raise KeyboardInterrupt
         return quick(index, method=method, seed=seed, cosines=cosines)
 
-    monkeypatch.setattr(command, "ranks_of_map", interrupted)
+    monkeypatch.setattr(command, "shipped_ranks", interrupted)
     done = run_here("sbc", "--maps", 5, "--json", cwd=tmp_path)
     assert done.returncode == 130
     assert json.loads(done.stdout)["maps"] == 2
@@ -122,7 +122,7 @@ def test_a_map_that_fails_is_named_and_the_others_count(tmp_path: Path, monkeypa
             raise ValueError("no such thing")
         return quick(index, method=method, seed=seed, cosines=cosines)
 
-    monkeypatch.setattr(command, "ranks_of_map", failing)
+    monkeypatch.setattr(command, "shipped_ranks", failing)
     done = run_here("sbc", "--maps", 3, "-o", "s.csv", cwd=tmp_path)
     assert "could not be estimated: map 1: ValueError: no such thing" in done.stderr
     assert "error: 1 of 3 maps are missing from this report" in done.stderr

@@ -26,10 +26,10 @@ from tactile_bayes.hardware.ports import Port
 
 WARM_ESTIMATOR = """
 import multiprocessing, sys, time
-from tactile_bayes.actions.live_view import Estimator
+from tactile_bayes.actions.live_view import LiveEstimator
 
 if __name__ == "__main__":
-    estimator = Estimator(None)
+    estimator = LiveEstimator(None)
     while estimator.done == 0:
         estimator.poll(None)
         time.sleep(0.01)

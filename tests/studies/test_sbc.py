@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from tactile_bayes.actions.study import _shipped
+from tactile_bayes.actions.study import _shipped_calibration
 from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import draw
@@ -187,7 +187,7 @@ def size_ranks(n: int, *, wider: float = 1.0) -> np.ndarray:
         true |= {name: wider * true[name] for name in ("sigma_x_mm", "sigma_y_mm")}
         rest = ("x_mm", "y_mm", "angle_rad", "background", "noise_sd")
         posterior = MapPosterior(**drawn, **dict.fromkeys(rest, np.zeros(1000)))
-        ranks.append(sbc._ranks_in(posterior, Truth(**as_dict(TRUTH) | true), rng, _shipped())[-1])
+        ranks.append(sbc._ranks_in(posterior, Truth(**as_dict(TRUTH) | true), rng, _shipped_calibration())[-1])
     return np.array(ranks)
 
 

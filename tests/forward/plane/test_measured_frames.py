@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from in_process import run_here
 
-from tactile_bayes.actions.study import read_frames
+from tactile_bayes.actions.study import read_measured_frames
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.presets import HEAD_PITCH_MM
 from tactile_bayes.studies.model_comparison import MeasuredFrame, compare_frames
@@ -44,12 +44,12 @@ def test_another_lump_is_not_the_measured_one(own: list[MeasuredFrame]) -> None:
 def test_a_table_becomes_frames_and_their_faults_are_named(tmp_path: Path) -> None:
     path = tmp_path / "f.csv"
     path.write_text("x_c_mm,s_mm,pressure_kpa\n" + "".join(f"{x},{s},{9 + s}\n" for x in (0, 6) for s in range(-2, 3)))
-    frames = read_frames(path)
+    frames = read_measured_frames(path)
     assert [frame.x_c_mm for frame in frames] == [0.0, 6.0]
     np.testing.assert_array_equal(frames[0].pressure_kpa, [7, 8, 9, 10, 11])
     path.write_text("s_mm,pressure_kpa\n0,9\n1,9\n")
     with pytest.raises(BadDataError, match=r"f\.csv: the frame at x_c_mm 0 has 2 taxels"):
-        read_frames(path)
+        read_measured_frames(path)
     with pytest.raises(BadDataError, match="s_mm must lie within 12 mm"):
         compare_frames([MeasuredFrame(0.0, np.arange(14.0), np.ones(14))], settings=COARSE, **LUMP)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from tactile_bayes.actions.study import table_text
+from tactile_bayes.actions.study import study_csv
 from tactile_bayes.cli import cli
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
@@ -136,7 +136,7 @@ def test_a_harder_lump_shows_higher(rows: list[StudyRow]) -> None:
 
 
 def test_the_table_says_what_was_found(rows: list[StudyRow]) -> None:
-    head, first, *_ = table_text(rows).splitlines()
+    head, first, *_ = study_csv(rows).splitlines()
     found = "seat,d_mm,depth_ratio,stiffness_ratio,amplitude,sigma_x_mm,fit_rms,detectable,thickness_mm,head_radius_mm"
     assert head == f"{found},head,normalise,background,fit_radius_mm,noise"
     cells = first.split(",")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from tactile_bayes.actions.study import table_text
+from tactile_bayes.actions.study import study_csv
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_BAD_DATA, EXIT_USAGE, BadDataError, UsageError
 from tactile_bayes.studies.paper import Geometry, StudyRow
@@ -124,7 +124,7 @@ def test_a_lump_of_fat_does_not_show_and_a_harder_one_shows_higher() -> None:
 
 @pytest.mark.long
 def test_the_table_has_a_width_for_each_axis_of_the_head() -> None:
-    head, *_, last = table_text(rows()).splitlines()
+    head, *_, last = study_csv(rows()).splitlines()
     names = "seat,d_mm,depth_ratio,stiffness_ratio,amplitude,sigma_x_mm,sigma_y_mm,fit_rms,detectable"
     names += ",thickness_mm,head_radius_mm,head,normalise,background,fit_radius_mm,noise,flat_field"
     assert head == names
