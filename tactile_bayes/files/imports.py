@@ -312,9 +312,13 @@ def _arrange_frames(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
         raise BadDataError(what, way_out="leave --frame-shape out")
     head = arrays["head_surface_mm"].shape[:2] if "head_surface_mm" in arrays else counts.shape[1:]
     if counts.ndim == 3 and counts.shape[1:] != head:
-        what = f"counts has frames of {_sides(counts.shape[1:])} taxels, and the head {_sides(head)}"
+        what = f"frames have {_sides(counts.shape[1:])} taxels, and the head {_sides(head)}"
         turned = counts.shape[1:] == head[::-1]
-        way_out = "swap their last two axes" if turned else "give the head of this array, or the frames of this head"
+        way_out = (
+            "swap their last two axes, or the head's"
+            if turned
+            else "give the head of this array, or the frames of this head"
+        )
         raise BadDataError(what, way_out=way_out)
     arrays["counts"] = counts
 

@@ -39,6 +39,7 @@ def calibration_document(calibration: ElementCalibration) -> dict[str, Any]:
 # --- Heads as JSON: positions of the taxels, or their grid and arc, for `record` and for simulated bodies.
 
 _DEFAULT_RIM_MM: Final = scenes.Head().rim_mm
+_METRES: Final = 0.02  #: No array has taxels so close, in mm; in metres many have.
 # Taxels further than this from a regular grid on an arc make a head that the models do not have.
 _REGULAR_MM: Final = 0.05
 _WAY_OUT: Final = (
@@ -73,6 +74,8 @@ class HeadFile(Record, kw_only=True):
     """(4, 4) transform from the tracker's sensor to the head; `record` needs it."""
 
     def __post_init__(self) -> None:
+        if self.pitch_mm < _METRES:
+            raise BadDataError(f"pitch_mm is {self.pitch_mm:g}", way_out="looks like metres, give all lengths in mm")
         if self.surface_mm is not None and len({len(row) for row in self.surface_mm}) > 1:
             raise BadDataError("surface_mm has rows of different lengths", way_out="give every row a taxel each")
         if self.shoulder_mm and self.rim_mm:

@@ -80,6 +80,7 @@ def sphere() -> dict[str, Any]:
         ({**ARC, "shoulder_mm": 2, "rim_mm": 3}, "shoulder_mm is 2 and rim_mm 3"),
         ({name: ARC[name] for name in ARC if name != "columns"}, "lacks columns"),
         ({**ARC, "rows": None}, "lacks rows"),
+        ({**ARC, "pitch_mm": 0.0015, "radius_mm": 0.02}, "pitch_mm is 0.0015"),
         ({**of_surface(20.0), "rows": 10}, "gives both surface_mm and rows"),
         (sphere(), "from a regular grid of 1.5 mm on an arc"),
         ({**of_surface(20.0), "pitch_mm": 2.0}, "from a regular grid of 2 mm"),

@@ -607,7 +607,7 @@ def test_python_takes_lists_frames_dates_and_half_floats_and_no_masked_reading(p
     masked = np.ma.masked_greater(kpa, 9.9)
     with pytest.raises(BadDataError, match=r"frames holds .* values that are not finite"):
         tb.scan(masked, time, scan.poses, head=head, unit="kPa")
-    with pytest.raises(BadDataError, match="frames of 26 x 16 taxels, and the head 16 x 26; swap their last two axes"):
+    with pytest.raises(BadDataError, match="frames have 26 x 16 taxels, and the head 16 x 26; swap their"):
         tb.scan(kpa.swapaxes(1, 2), time, scan.poses, head=head, unit="kPa")
 
 
