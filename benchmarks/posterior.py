@@ -64,20 +64,20 @@ def importance(fit: Any) -> Draw:
     """The program's default method, to the wanted accuracy."""
     from tactile_bayes.posterior.draw import importance_draws
 
-    return lambda rng: importance_draws(fit.sampled(), rng=rng, accuracy_sd=WANTED_SD).flat
+    return lambda rng: importance_draws(fit.sampling_target(), rng=rng, accuracy_sd=WANTED_SD).flat
 
 
 def laplace(fit: Any) -> Draw:
     """The program's Gaussians."""
 
-    return lambda rng: fit.at_mode("laplace", 4000, rng).flat
+    return lambda rng: fit.draw_at_mode("laplace", 4000, rng).flat
 
 
 def ensemble(fit: Any) -> Draw:
     """The program's MCMC with its own stopping rule."""
     from tactile_bayes.posterior.draw import SamplerSettings, ensemble_draws
 
-    return lambda rng: ensemble_draws(fit.sampled(), rng=rng, options=SamplerSettings(method="ensemble")).flat
+    return lambda rng: ensemble_draws(fit.sampling_target(), rng=rng, options=SamplerSettings(method="ensemble")).flat
 
 
 def emcee_plain(fit: Any) -> Draw:

@@ -24,7 +24,7 @@ from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.draw import Sampled, SamplerSettings, importance_draws
+from tactile_bayes.posterior.draw import SamplerSettings, SamplingTarget, importance_draws
 from tactile_bayes.posterior.estimate import search
 from tactile_bayes.posterior.fit import FieldFit, fit_scene
 from tactile_bayes.studies.population import ExamPrior, draw_exam
@@ -123,7 +123,7 @@ def under_other_prior(fit: FieldFit) -> FieldFit:
     return fit_scene(replace(fit.target.problem, prior=OTHER_PRIOR), fit.scene, fit.mode)
 
 
-def differences(density: Sampled, weighted: Sequence[Sampled], *, seed: int) -> list[FloatArray]:
+def differences(density: SamplingTarget, weighted: Sequence[SamplingTarget], *, seed: int) -> list[FloatArray]:
     """(p, 3) differences of quantiles from the chains', in joint errors, for each density drawn by weights."""
     rng = np.random.default_rng([22, seed])
     chains = ensemble(density.log_density, density.mean, density.covariance, rng=rng, options=CHAINS).theta
@@ -153,7 +153,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         fit = fit_of(MAPS[name]())
         try:
             own, other = differences(
-                fit.sampled(), [fit.sampled(), under_other_prior(fit).sampled()], seed=tuple(MAPS).index(name)
+                fit.sampling_target(),
+                [fit.sampling_target(), under_other_prior(fit).sampling_target()],
+                seed=tuple(MAPS).index(name),
             )
         except NotConvergedError as error:
             print(f"| {name} | {error} | | | | | {time.process_time() - begun:.0f} |", flush=True)

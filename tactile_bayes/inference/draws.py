@@ -1,4 +1,4 @@
-"""Draws of a posterior: their summary, a cache, and the evenly spread points that they are made of."""
+"""Draws of a posterior: their summary, a cache of solutions, Sobol points and stratified quantiles."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ END_ERROR = 2.67
 """Monte-Carlo error of an end of a 95 % interval, in SDs, times the root of the independent draws (normal tails)."""
 INDEPENDENT_DRAWS = 4000
 """Draws of the methods that draw independently: end-point Monte-Carlo error of a 95 % interval about 0.04 SD."""
-REPLICATES = 4  #: Independent parts of every set of draws; what differs between them is the Monte-Carlo error.
+REPLICATES = 4  #: Independent parts of every set of draws; their spread is the Monte-Carlo error.
 Labels = IndexArray
 
 
 def even_replicates(number: int) -> Labels:
-    """(number,) labels that divide independent draws into `REPLICATES` parts of equal size."""
+    """(number,) labels of `REPLICATES` equal parts of independent draws."""
     return np.arange(number) * REPLICATES // max(number, 1)
 
 
@@ -36,11 +36,10 @@ class ParameterDraws(Record, eq=False):
     diagnostics: Mapping[str, float] = field(default_factory=dict)
     """Figures of the method (R-hat, effective draws, evaluations...), for the report."""
     labels: Labels | None = None
-    """(chain * draw,) array or None: The independent replicate that each draw comes from, for draws in one chain; None
-    for independent draws."""
+    """(chain * draw,) array or None: Replicate of each draw, for draws in one chain; None for independent draws."""
     statistics: Mapping[str, FloatArray] = field(default_factory=dict)
-    """(chain, draw) arrays of the sampler by name: ``lp``, the log density at the draw; ``log_weight``, of the point
-    that importance sampling took it from; ``accepted``, 1 where the chain's walker moved there in that step."""
+    """(chain, draw) arrays of the sampler by name: ``lp``, the log density at the draw; ``log_weight``, that of its
+    point in importance sampling; ``accepted``, 1 where the chain's walker moved in that step."""
 
     @property
     def flat(self) -> FloatArray:
@@ -49,7 +48,7 @@ class ParameterDraws(Record, eq=False):
 
     @property
     def replicates(self) -> Labels:
-        """(chain * draw,) label of the independent replicate of each draw; chains are independent of each other."""
+        """(chain * draw,) replicate of each draw; chains are independent of each other."""
         chains, draws = self.theta.shape[:2]
         if self.labels is not None:
             return self.labels
@@ -64,10 +63,7 @@ class ParameterDraws(Record, eq=False):
 def student_draws(
     centre: FloatArray, scale: FloatArray, *, dof: float, number: int, rng: np.random.Generator
 ) -> FloatArray:
-    """(number, p) draws of a multivariate t: normal draws whose noise scale is itself uncertain.
-
-    The (p, p) scale matrix may be near-singular; `dof` are those of the noise estimate, and ``inf`` gives normal draws.
-    """
+    """(number, p) draws of a multivariate t; normal for `dof` of ``inf``. The (p, p) scale may be near-singular."""
     values, vectors = np.linalg.eigh(scale)
     root = vectors * np.sqrt(np.clip(values, 0.0, None))
     normal = rng.standard_normal((number, len(centre))) @ root.T
@@ -76,13 +72,13 @@ def student_draws(
     return np.asarray(centre + normal * np.sqrt(dof / rng.chisquare(dof, size=number))[:, None])
 
 
-def picked_rows(have: Labels, wanted: Labels, rng: np.random.Generator) -> Labels:
-    """Indices of draws with the wanted labels, using a replicate's draws equally often."""
-    index = np.empty(len(wanted), dtype=np.intp)
+def rows_by_label(labels: Labels, wanted_labels: Labels, rng: np.random.Generator) -> Labels:
+    """Indices of draws with `wanted_labels`, in random order; each draw of a replicate is used equally often."""
+    index = np.empty(len(wanted_labels), dtype=np.intp)
     for label in range(REPLICATES):
-        members, places = np.flatnonzero(have == label), np.flatnonzero(wanted == label)
-        members = members if len(members) else np.arange(len(have))
-        index[places] = rng.permutation(np.resize(rng.permutation(members), len(places)))
+        members, positions = np.flatnonzero(labels == label), np.flatnonzero(wanted_labels == label)
+        members = members if len(members) else np.arange(len(labels))
+        index[positions] = rng.permutation(np.resize(rng.permutation(members), len(positions)))
     return index
 
 
@@ -101,9 +97,7 @@ class Quantity(Record, kw_only=True):
     high: float
     """`low`, `high`: Ends of the equal-tailed interval of `probability`."""
     mc_error: Annotated[float, Meta(ge=0)] = 0.0
-    """Monte-Carlo standard error of the wider of low and high, in their unit: digits beyond it mean nothing, whatever
-    number of digits is written.
-    """
+    """Monte-Carlo standard error of the less certain of low and high, in their unit: further digits mean nothing."""
     probability: Annotated[float, Meta(gt=0, lt=1)]
     kind: Literal["eti", "hdi"]
 
@@ -116,14 +110,14 @@ class Quantity(Record, kw_only=True):
 def summarise(
     draws: FloatArray, *, probability: float, effective_draws: float | None = None, replicates: Labels | None = None
 ) -> Quantity:
-    """Summarise draws with their equal-tailed interval, leaving NaN out; `ValueError` when no draw is finite.
+    """Summary of draws with their equal-tailed interval, leaving NaN out; `ValueError` when no draw is finite.
 
-    The Monte-Carlo error comes from the spread between the `replicates` of ``draws.ravel()``, or without them from how
-    many independent draws they are worth for a tail (by default all).
+    The Monte-Carlo error is from the spread between the `replicates` of ``draws.ravel()``, or without them from the
+    number of effective draws in a tail (by default all).
     """
     flat = draws.ravel()
-    finite = np.isfinite(flat)
-    values = flat[finite]
+    is_finite = np.isfinite(flat)
+    values = flat[is_finite]
     if not values.size:
         raise ValueError("no finite draws")
     tail = (1.0 - probability) / 2.0
@@ -132,10 +126,10 @@ def summarise(
     if replicates is None:
         step = float(np.sqrt(tail * (1.0 - tail) / max(effective_draws or values.size, 1.0)))
     else:
-        step = _tail_error(values, replicates[finite], (low, high))
-    # an end's standard error is half the way between order statistics a standard error below and above
-    about = np.clip([tail - step, tail + step, 1 - tail - step, 1 - tail + step], 0.0, 1.0)
-    ends = quantiles_of(ordered, about)
+        step = _tail_error(values, replicates[is_finite], (low, high))
+    # standard error of an end: half the distance between the order statistics one standard error below and above
+    around = np.clip([tail - step, tail + step, 1 - tail - step, 1 - tail + step], 0.0, 1.0)
+    ends = quantiles_of(ordered, around)
     return Quantity(
         median=float(median),
         mean=float(values.mean()),
@@ -149,10 +143,10 @@ def summarise(
 
 
 def _tail_error(values: FloatArray, replicates: Labels, ends: tuple[float, float]) -> float:
-    """Standard error of the probability beyond an interval's end, from the replicates; one value for both ends.
+    """Standard error of the probability beyond an interval's end, from the spread of the replicates; at least one draw.
 
-    Of a ratio of sums over replicates (Cochran 1977, Sampling Techniques, ch. 6). Taking both ends together doubles the
-    few degrees of freedom. It is no less than what one draw moves.
+    That of a ratio of sums (Cochran 1977, Sampling Techniques, ch. 6). Pooling both ends doubles the few degrees of
+    freedom.
     """
     count, n = np.bincount(replicates), len(values)
     r = int(np.count_nonzero(count))
@@ -166,7 +160,7 @@ def _tail_error(values: FloatArray, replicates: Labels, ends: tuple[float, float
 
 
 def quantiles_of(ordered: FloatArray, probabilities: FloatArray) -> FloatArray:
-    """Quantiles of sorted values, linear between neighbours: ``np.quantile``, which does not use the fast sort."""
+    """Quantiles of sorted values, linear between neighbours: ``np.quantile`` without its slower sort."""
     return np.interp(probabilities * (len(ordered) - 1), np.arange(len(ordered)), ordered)
 
 
@@ -181,11 +175,11 @@ def weighted_quantiles_of(ordered: FloatArray, weights: FloatArray, probabilitie
 Solution = tuple[FloatArray, ...]  #: Arrays with a row a parameter vector; see `CollapsedTarget.conditional`.
 
 
-class Solved:
+class SolutionCache:
     """Cache of solutions by parameter vector; `solve` maps (m, p) vectors to arrays of m rows.
 
-    Importance sampling evaluates the density at points that its draws are then chosen from. Solving those a second time
-    for the amplitude, level and noise scale of the draws cost as much as the sampling.
+    Importance sampling chooses its draws among points that it has evaluated: to solve those again for amplitude, level
+    and noise scale would cost as much as the sampling.
     """
 
     def __init__(self, solve: Callable[[FloatArray], Solution]) -> None:
@@ -194,18 +188,18 @@ class Solved:
         self._solutions: list[Solution] = []
 
     def add(self, theta: FloatArray, solution: Solution) -> None:
-        """Keep the solution at (m, p) parameter vectors."""
+        """Store the solution at (m, p) parameter vectors."""
         self._theta.append(theta)
         self._solutions.append(solution)
 
     def __call__(self, theta: FloatArray) -> Solution:
-        """Solutions at (m, p) parameter vectors: cached where all are known, else computed."""
+        """Solutions at (m, p) parameter vectors: from the cache where it has all, else computed."""
         if not self._theta:
             return self._solve(theta)
         points = np.concatenate(self._theta)
         order = np.argsort(points[:, 0], kind="stable")  # random points never share their first coordinate
-        place = np.searchsorted(points[:, 0], theta[:, 0], sorter=order)
-        row = order[np.minimum(place, len(points) - 1)]
+        position = np.searchsorted(points[:, 0], theta[:, 0], sorter=order)
+        row = order[np.minimum(position, len(points) - 1)]
         if not np.array_equal(points[row], theta):
             return self._solve(theta)
         return tuple(np.concatenate(parts)[row] for parts in zip(*self._solutions, strict=True))
@@ -258,16 +252,16 @@ class Draws(Record, eq=False):
         UsageError
             When the probability is not between 0 and 1.
         """
-        wanted = self.probability if probability is None else probability
-        check_number("the probability of an interval", wanted, 0, 1, open_ends=True)
+        level = self.probability if probability is None else probability
+        check_number("the probability of an interval", level, 0, 1, open_ends=True)
         return summarise(
-            self.values, probability=wanted, effective_draws=self.effective_draws, replicates=self.replicates
+            self.values, probability=level, effective_draws=self.effective_draws, replicates=self.replicates
         )
 
     def interval(self, probability: float | None = None) -> tuple[float, float]:
         """Ends of the equal-tailed credible interval."""
-        found = self.summary(probability)
-        return found.low, found.high
+        summary = self.summary(probability)
+        return summary.low, summary.high
 
     @property
     def median(self) -> float:
@@ -295,9 +289,9 @@ class Draws(Record, eq=False):
         return np.asarray(self.values, dtype=dtype)  # type: ignore[call-overload, no-any-return]
 
     def __repr__(self) -> str:
-        found = self.summary()
-        unit = f" {self.unit}" if self.unit else ""
-        return f"{found.median:.3g}{unit} ({found.low:.3g} to {found.high:.3g}, {100 * found.probability:g} % interval)"
+        summary, unit = self.summary(), f" {self.unit}" if self.unit else ""
+        interval = f"{summary.low:.3g} to {summary.high:.3g}, {100 * summary.probability:g} % interval"
+        return f"{summary.median:.3g}{unit} ({interval})"
 
 
 # --- The normal distribution function.
@@ -371,46 +365,44 @@ def _directions(column: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint32]]
     return np.array(numbers, dtype=np.uint32)
 
 
-# --- Evenly spread points and smoothed quantiles, for small Monte-Carlo errors of quantities not read from the map.
+# --- Quasi-random points and stratified quantiles: small Monte-Carlo errors for quantities that the map does not show.
 
 MOST_PAIRED = MOST_DIMENSIONS - 1
-MERGED, LEAST_MERGED = 8, 512  #: Neighbouring normals of a mixture that are taken as one, where there are as many.
+MERGED, LEAST_MERGED = 8, 512  #: Neighbouring normals of a mixture taken as one; least number where this is done.
 _NODES = np.sinh(np.linspace(-3.0, 3.0, 81))
 """Where a mixture's distribution function is computed, in SDs from its mean; dense in the middle."""
 LEAST_SD = 1e-2  #: Least SD of a component, as a share of the mixture's: a narrower one is widened to this.
 
 
 def distinct_rows(theta: FloatArray) -> tuple[FloatArray, IndexArray]:
-    """Distinct rows, in order, and where each of the given (n, p) stands among them."""
+    """Distinct rows of an (n, p) array, in order, and the (n,) index of each row among them."""
     rows, index = np.unique(theta, axis=0, return_inverse=True)
-    return rows, index.reshape(-1)  # which not all versions of numpy do
+    return rows, index.reshape(-1)  # some versions of numpy return a column
 
 
 def paired_points(key: FloatArray, replicates: Labels, dimension: int, rng: np.random.Generator) -> FloatArray:
     """(n, dimension) uniform points in (0, 1) for drawing further quantities, one point per draw.
 
-    The (n,) `key` is what the result depends on most among the draws, such as their log size; `dimension` is at most
-    `MOST_PAIRED`. Within a replicate the rank of the key and the point together are a Sobol set under a random digital
-    shift, sorted by its first coordinate (L'Ecuyer, Lecot & Tuffin 2008, Operations Research 56:958, sort their chains
-    so). A sum over the draws then has the error of an integral of few dimensions.
+    Within a replicate the rank of the (n,) `key` (the quantity on which the result depends most) and the point together
+    are a Sobol set under a random digital shift, so that a sum over the draws has the error of an integral of few
+    dimensions, at most `MOST_PAIRED`: L'Ecuyer, Lecot & Tuffin (2008), Operations Research 56:958.
     """
     counts = np.bincount(replicates)
     shifts = rng.integers(2**BITS, size=(len(counts), dimension + 1), dtype=np.uint32)
     points = shifted_sobol(0, int(counts.max()), shifts=shifts)
     paired = np.empty((len(key), dimension))
-    for label, (count, one) in enumerate(zip(counts, points, strict=True)):
+    for label, (count, replicate_points) in enumerate(zip(counts, points, strict=True)):
         members = np.flatnonzero(replicates == label)
-        in_order = np.argsort(one[:count, 0])
-        paired[members[np.argsort(key[members], kind="stable")]] = one[in_order, 1:]
+        order = np.argsort(replicate_points[:count, 0])
+        paired[members[np.argsort(key[members], kind="stable")]] = replicate_points[order, 1:]
     return paired
 
 
 def stratified_quantiles(values: FloatArray, mean: FloatArray, sd: FloatArray, replicates: Labels) -> FloatArray:
     """Replace (n,) normal draws by evenly spaced quantiles of the mixture of the normals that they were drawn from.
 
-    Each replicate is done by itself, so that they stay independent, and keeps the order of its values: what goes with a
-    large draw still does. NaN stays. The mixture's distribution function is the mean of the normals', not of steps at
-    the draws (Rao-Blackwell). It is inverted on a grid, as normal scores, in which it is nearly straight.
+    Within each replicate, and in the order of its values; NaN stays. The mixture's distribution function is the mean of
+    the normals' (Rao-Blackwell), inverted on a grid as normal scores, in which it is nearly straight.
     """
     even = values.copy()
     for label in range(int(replicates.max(initial=-1)) + 1):
@@ -422,17 +414,17 @@ def stratified_quantiles(values: FloatArray, mean: FloatArray, sd: FloatArray, r
 
 
 def _mixture_quantiles(mean: FloatArray, sd: FloatArray) -> FloatArray:
-    """(n,) evenly spaced quantiles of a mixture of n normals, rising."""
+    """(n,) ascending, evenly spaced quantiles of a mixture of n normals."""
     spread, n = float(np.var(mean)), len(mean)
     total = float(np.sqrt(np.mean(sd**2) + spread))
     if not total > 0:
         return mean
-    by, merged = mean if spread > np.mean(sd**2) else sd, n // MERGED * MERGED
+    sort_key, n_merged = mean if spread > np.mean(sd**2) else sd, n // MERGED * MERGED
     sd = np.maximum(sd, LEAST_SD * total)
-    if merged >= LEAST_MERGED:  # the few left over are spread over the order, so that no end of it is lost
-        order = np.argsort(by)[np.linspace(0, n - 1, merged).round().astype(np.intp)].reshape(-1, MERGED)
+    if n_merged >= LEAST_MERGED:  # a subset spread evenly over the order, so that neither end is lost
+        order = np.argsort(sort_key)[np.linspace(0, n - 1, n_merged).round().astype(np.intp)].reshape(-1, MERGED)
         sd = np.sqrt(np.mean(sd[order] ** 2, axis=1) + np.var(mean[order], axis=1))
         mean = mean[order].mean(axis=1)
-    at = float(mean.mean()) + total * _NODES
-    score = ndtri(np.clip(normal_cdf((at[:, None] - mean) / sd).mean(axis=1), 1e-12, 1.0 - 1e-12))
-    return np.interp(ndtri((np.arange(n) + 0.5) / n), score, at)
+    grid = float(mean.mean()) + total * _NODES
+    score = ndtri(np.clip(normal_cdf((grid[:, None] - mean) / sd).mean(axis=1), 1e-12, 1.0 - 1e-12))
+    return np.interp(ndtri((np.arange(n) + 0.5) / n), score, grid)

@@ -1,4 +1,4 @@
-"""Chains of emcee with their state, and what arviz does: their diagnostics, and draws as InferenceData."""
+"""MCMC by emcee ensembles, their checkpoints, and all uses of arviz: chain diagnostics and InferenceData."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tactile_bayes.progress import Progress
 
 @cache
 def _arviz() -> Any:
-    """Arviz, which takes longer to import than an estimate to make: loaded where its figures are asked for."""
+    """Arviz, imported on first use: that takes longer than an estimate."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # its notice of the next major version, which is pinned away
         import arviz
@@ -38,22 +38,25 @@ def _agreement(draws: FloatArray) -> dict[str, float]:
 
 def convergence(draws: FloatArray) -> dict[str, float]:
     """R-hat, effective draws and Monte-Carlo errors (of the median and the ends of the central 95 %, in the quantity's
-    unit) from (chain, draw) draws; those without a value count as the smallest, as they do among ranks."""
-    known = np.where(np.isfinite(draws), draws, np.nanmin(draws))
+    unit) of (chain, draw) draws; NaN ranks as the smallest value."""
+    finite_draws = np.where(np.isfinite(draws), draws, np.nanmin(draws))
     errors = {"mcse_median": 0.5, "mcse_low": 0.025, "mcse_high": 0.975}
-    quantile = {name: float(_arviz().mcse(known, method="quantile", prob=at)) for name, at in errors.items()}
-    return _agreement(known) | quantile
+    quantile = {
+        name: float(_arviz().mcse(finite_draws, method="quantile", prob=probability))
+        for name, probability in errors.items()
+    }
+    return _agreement(finite_draws) | quantile
 
 
 class DrawGroup(Record, eq=False):
-    """Arrays of one group with the names of their axes, and what is to be said of it."""
+    """Arrays of one group with the names of their axes, and notes."""
 
     arrays: Mapping[str, tuple[tuple[str, ...], FloatArray]]  #: Names of the axes, and values.
     notes: Mapping[str, str] = field(default_factory=dict)  #: Text by name.
 
 
 def inference_data(draws: Mapping[str, FloatArray], groups: Mapping[str, DrawGroup]) -> Any:
-    """Convert (chain, draw) arrays to `arviz.InferenceData`: a group ``posterior``, and those given."""
+    """Convert (chain, draw) arrays to `arviz.InferenceData`: a group ``posterior``, and further `groups`."""
     import xarray
 
     posterior = DrawGroup({name: (("chain", "draw"), values) for name, values in draws.items()})
@@ -98,14 +101,14 @@ class EnsembleOptions(Record):
 
     ensembles: int = 4
     """Independent ensembles; walkers of one ensemble share their history, so R-hat compares ensembles."""
-    block: int = 150  #: Steps between two looks at the diagnostics.
-    max_steps: int = 6000  #: Give up after this many.
+    block: int = 150  #: Steps between two checks of the diagnostics.
+    max_steps: int = 6000  #: Largest number of steps.
     least_ess: float = 800.0  #: Bulk and tail effective draws that every parameter must reach.
-    most_rhat: float = 1.01  #: And R-hat.
+    most_rhat: float = 1.01  #: R-hat that no parameter may exceed.
     keep: int = 8000  #: Draws kept, thinned evenly over all ensembles.
 
     def identity(self) -> str:
-        """Settings that a checkpoint belongs to: all but the number of steps."""
+        """Text of the settings that a checkpoint depends on: all but the number of steps."""
         return str({"ensembles": self.ensembles, "walkers_per_parameter": WALKERS_PER_PARAMETER, "block": self.block})
 
 
@@ -121,34 +124,36 @@ def ensemble(
     store: ChainStore | None = None,
     key: str = "",
 ) -> ParameterDraws:
-    """Draw from a log density, (m, p) to (m,), starting from given draws or from overdispersed ones about its mode.
+    """Draw from a log density, (m, p) to (m,), by several emcee ensembles with differential-evolution moves.
 
-    Differential-evolution moves (ter Braak 2006) in emcee (Foreman-Mackey et al. 2013), from the (p,) mode and (p, p)
-    approximate covariance or from some of the (n, p) draws in `start`. The first third of each ensemble's steps is
-    dropped. Diagnostics are of the worst parameter; when they are not reached in ``max_steps`` a
-    `NotConvergedError` says about how many steps would do. Progress is effective draws so far and those wanted.
+    They start from some of the (n, p) draws in `start`, or overdispersed about the (p,) mode by the (p, p) covariance;
+    the first third of the steps is dropped. Diagnostics are of the worst parameter; `NotConvergedError` where they are
+    not reached in ``max_steps`` says about how many steps would do. Progress is effective draws and those required.
 
-    `store` keeps the state after each block, bound to `key`. A run goes on from a state that it finds, and on one
-    machine ends in the same draws as a run that was never stopped.
+    `store` saves the state after each block under `key`. A run continues from a stored state, on one machine with
+    the draws of an uninterrupted run. ter Braak (2006); Foreman-Mackey et al. (2013).
     """
     options = options or EnsembleOptions()
     samplers = [_Ensemble(log_density, centre, covariance, rng=rng, start=start) for _ in range(options.ensembles)]
-    kept = None if store is None else store.load(key)
-    if kept is not None:
+    stored = None if store is None else store.load(key)
+    if stored is not None:
         for index, sampler in enumerate(samplers):
-            sampler.restore(kept, index)
+            sampler.restore(stored, index)
     figures: dict[str, float] = {}
-    # a state that had converged is looked at again before it is run further
+    # a restored state is checked before it is run further: it may have converged
     for steps in range(max(options.block, samplers[0].steps), options.max_steps + 1, options.block):
         if steps > samplers[0].steps:
             for sampler in samplers:
                 sampler.advance(options.block)
             if store is not None:
-                kept_now = zip(*(one.kept() for one in samplers), strict=True)
-                store.save(key, ChainState(*map(np.stack, kept_now)))
+                state = zip(*(sampler.state() for sampler in samplers), strict=True)
+                store.save(key, ChainState(*map(np.stack, state)))
         chains = np.stack([sampler.chain() for sampler in samplers])
-        each = [_agreement(np.ascontiguousarray(chains[:, :, i])) for i in range(chains.shape[2])]
-        figures = {name: (max if name == "rhat" else min)(one[name] for one in each) for name in each[0]}
+        by_parameter = [_agreement(np.ascontiguousarray(chains[:, :, i])) for i in range(chains.shape[2])]
+        figures = {
+            name: (max if name == "rhat" else min)(sampler[name] for sampler in by_parameter)
+            for name in by_parameter[0]
+        }
         least = min(figures["ess_bulk"], figures["ess_tail"])
         if progress is not None:
             progress(int(min(least, options.least_ess)), int(options.least_ess))
@@ -156,14 +161,14 @@ def ensemble(
             walkers, accepted = samplers[0].walkers, [sampler.acceptance() for sampler in samplers]
             figures |= {"steps": float(steps), "walkers": float(walkers), "ensembles": len(samplers)}
             figures |= {"evaluations": float(steps * walkers * len(samplers)), "acceptance": float(np.mean(accepted))}
-            return _kept_draws(samplers, chains, figures, log_density=log_density, keep=options.keep)
+            return _thinned_draws(samplers, chains, figures, log_density=log_density, keep=options.keep)
     if not figures:
         raise NotConvergedError(f"the checkpoint has {samplers[0].steps} steps, more than max_steps allows")
     raise NotConvergedError(_advice(figures, options), diagnostics=figures)
 
 
 class _Ensemble:
-    """One emcee ensemble with a random stream of its own."""
+    """One emcee ensemble with its own random stream."""
 
     def __init__(
         self,
@@ -186,13 +191,13 @@ class _Ensemble:
         # emcee's wrapper prints parameters and a traceback at any exception, Ctrl-C among them
         self._sampler.log_prob_fn = self._standardised(log_density)
         if start is None or len(start) < self.walkers:
-            begin = _finite_start(log_density, centre, covariance, number=self.walkers, rng=rng)
+            first = _finite_start(log_density, centre, covariance, number=self.walkers, rng=rng)
         else:
             unique = np.unique(start, axis=0)
-            begin = unique[rng.choice(len(unique), size=self.walkers, replace=len(unique) < self.walkers)]
-        # emcee takes neither an integer nor a Generator: it must be handed the state of a RandomState
+            first = unique[rng.choice(len(unique), size=self.walkers, replace=len(unique) < self.walkers)]
+        # emcee takes neither a seed nor a Generator, but the state of a RandomState
         random_state = np.random.RandomState(int(rng.integers(2**32))).get_state()
-        self._state = self._emcee_state((begin - self._centre) / self._scale, random_state=random_state)
+        self._state = self._emcee_state((first - self._centre) / self._scale, random_state=random_state)
 
     def _standardised(self, log_density: LogDensity) -> LogDensity:
         """Density of ``(theta - centre) / scale``: emcee tests the walkers' independence by their condition number."""
@@ -209,11 +214,11 @@ class _Ensemble:
 
     def chain(self) -> FloatArray:
         """(draw, p) last two thirds, walker after walker, so that neighbours in the array are neighbours in time."""
-        kept = self._centre + self._scale * self._sampler.get_chain(discard=self.steps // 3)
-        return np.asarray(np.swapaxes(kept, 0, 1).reshape(-1, kept.shape[-1]))
+        chain = self._centre + self._scale * self._sampler.get_chain(discard=self.steps // 3)
+        return np.asarray(np.swapaxes(chain, 0, 1).reshape(-1, chain.shape[-1]))
 
     def statistics(self) -> dict[str, FloatArray]:
-        """(draw,) log densities and whether the walker moved, in the order of `chain`; NaN before a restored state."""
+        """(draw,) log densities, NaN before a restored state, and 1 where the walker moved, in the order of `chain`."""
         first, chain = self.steps // 3, self._sampler.get_chain()
         accepted = np.concatenate([np.ones((1, self.walkers)), np.any(chain[1:] != chain[:-1], axis=2)])
         return {"lp": self._sampler.get_log_prob()[first:].T.ravel(), "accepted": accepted[first:].T.ravel()}
@@ -222,8 +227,8 @@ class _Ensemble:
         """Share of accepted proposals."""
         return float(np.mean(self._sampler.backend.accepted)) / self.steps
 
-    def kept(self) -> tuple[FloatArray, FloatArray, float, FloatArray, FloatArray]:
-        """State: chain, last log densities, accepted proposals, generator's key and cursor."""
+    def state(self) -> tuple[FloatArray, FloatArray, float, FloatArray, FloatArray]:
+        """Fields of `ChainState`: chain, last log densities, accepted proposals, generator's key and cursor."""
         _, key, position, has_normal, normal = self._state.random_state
         cursor = np.array([position, has_normal, normal], dtype=np.float64)
         accepted = float(np.mean(self._sampler.backend.accepted))
@@ -243,7 +248,7 @@ class _Ensemble:
 def _finite_start(
     log_density: LogDensity, centre: FloatArray, covariance: FloatArray, *, number: int, rng: np.random.Generator
 ) -> FloatArray:
-    """Overdispersed draws with finite density; wild ones are pulled towards the centre."""
+    """Overdispersed draws with finite density; those without are pulled towards the centre."""
     draws = student_draws(centre, 1.5 * covariance, dof=np.inf, number=number, rng=rng)
     for _ in range(60):
         bad = ~np.isfinite(log_density(draws))
@@ -253,14 +258,17 @@ def _finite_start(
     raise NotConvergedError("the posterior is not finite near its mode; check the map")
 
 
-def _kept_draws(
+def _thinned_draws(
     samplers: list[_Ensemble], chains: FloatArray, figures: dict[str, float], *, log_density: LogDensity, keep: int
 ) -> ParameterDraws:
-    """Chains thinned evenly, with their statistics; log densities that a checkpoint does not hold are worked out."""
+    """Chains thinned evenly, with their statistics; log densities that a checkpoint lacks are computed anew."""
     stride = max(1, (chains.shape[0] * chains.shape[1]) // keep)
     theta = np.ascontiguousarray(chains[:, ::stride])
-    each = [sampler.statistics() for sampler in samplers]
-    statistics = {name: np.stack([one[name] for one in each])[:, ::stride] for name in each[0]}
+    by_ensemble = [sampler.statistics() for sampler in samplers]
+    statistics = {
+        name: np.stack([statistics_of_one[name] for statistics_of_one in by_ensemble])[:, ::stride]
+        for name in by_ensemble[0]
+    }
     unknown = np.isnan(statistics["lp"])
     if unknown.any():
         statistics["lp"][unknown] = log_density(theta[unknown])
@@ -268,6 +276,7 @@ def _kept_draws(
 
 
 def _advice(figures: dict[str, float], options: EnsembleOptions) -> str:
+    """Text of the diagnostics that were not reached, with the number of steps that may do."""
     least = max(min(figures["ess_bulk"], figures["ess_tail"]), 1.0)
     factor = max(options.least_ess / least, 2.0 if figures["rhat"] > options.most_rhat else 1.0)
     return (

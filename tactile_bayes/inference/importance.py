@@ -81,7 +81,7 @@ class Gaussians(Record, eq=False):
     covariance: FloatArray  #: (h, p, p) array.
 
     @classmethod
-    def one(cls, mean: FloatArray, covariance: FloatArray) -> Gaussians:
+    def single(cls, mean: FloatArray, covariance: FloatArray) -> Gaussians:
         """A single Gaussian."""
         return cls(np.ones(1), mean[None], covariance[None])
 
@@ -105,27 +105,27 @@ class Gaussians(Record, eq=False):
             np.einsum("h,hpq->pq", self.weight, self.covariance) + (self.weight[:, None] * off).T @ off
         )
 
-    def given(self, last: FloatArray) -> Gaussians:
-        """The mixture of the first parameters, the last ones known: (j,) values."""
+    def conditional(self, last: FloatArray) -> Gaussians:
+        """Conditional mixture of the first parameters given (j,) values of the last."""
         k = self.mean.shape[1] - len(last)
         across = np.linalg.solve(self.covariance[:, k:, k:], self.covariance[:, k:, :k])
         mean = self.mean[:, :k] + np.einsum("hj,hjk->hk", last - self.mean[:, k:], across)
         covariance = self.covariance[:, :k, :k] - self.covariance[:, :k, k:] @ across
-        at_last = [
-            Gaussians.one(mean[k:], covariance[k:, k:]).log_density(last[None])[0]
+        log_density_at_last = [
+            Gaussians.single(mean[k:], covariance[k:, k:]).log_density(last[None])[0]
             for mean, covariance in zip(self.mean, self.covariance, strict=True)
         ]
-        log_weight = np.log(self.weight) + at_last
+        log_weight = np.log(self.weight) + log_density_at_last
         return Gaussians(np.exp(log_weight - np.logaddexp.reduce(log_weight)), mean, covariance)
 
     def widest(self, covariance: FloatArray) -> float:
-        """Largest variance of any of them in any direction, over that of `covariance` in the same direction."""
+        """Largest variance of a Gaussian in any direction, over that of `covariance` in the same direction."""
         whiten = np.linalg.inv(np.linalg.cholesky(covariance))
         return float(np.linalg.eigvalsh(whiten @ self.covariance @ whiten.T).max())
 
 
 class Proposal:
-    """Bent Gaussians: normal coordinates z become sinh(b z) / b, normal in the middle and log-normal outside."""
+    """Gaussians with bent tails: coordinates z become sinh(b z) / b, normal in the middle, log-normal outside."""
 
     def __init__(self, gaussians: Gaussians, stretch: float) -> None:
         self._gaussians, self._stretch = gaussians, stretch
@@ -134,7 +134,7 @@ class Proposal:
 
     @property
     def dimension(self) -> int:
-        """Uniform coordinates that a point takes: one for each parameter, and the last one to choose a Gaussian."""
+        """Number of uniform coordinates per point: one for each parameter, and one to choose among Gaussians."""
         return int(self._gaussians.mean.shape[1]) + (len(self._gaussians) > 1)
 
     def points(self, uniform: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -165,12 +165,10 @@ class Proposal:
         return np.asarray(parts.sum(axis=-1))
 
 
-# --- A mixture of Gaussians fitted to weighted points: the second round of importance sampling where one was not
-# enough.
+# --- Incremental mixture importance sampling, where one Gaussian is not enough.
 #
-# Incremental mixture importance sampling: a Gaussian goes where the largest weight is, as wide as the points about
-# it, and its points join the others. It finds a second mode, a curved ridge or a skewed flank, where one Gaussian
-# has too little.
+# A Gaussian is added where the largest weight is, as wide as the points about it, and its points join the others. It
+# finds a second mode, a curved ridge or a skewed flank.
 #
 # References
 # ----------
@@ -187,35 +185,37 @@ LEAST_VARIANCE = 1e-6
 def fitted_gaussians(
     log_density: LogDensity, first: Proposal, theta: FloatArray, log_target: FloatArray, *, rng: np.random.Generator
 ) -> tuple[Gaussians, int]:
-    """Gaussians whose mixture resembles a density, from (n, p) points of another proposal and their (n,) log density.
-
-    The first of them is a defensive one: mean and covariance of all the weighted points. Also counts the evaluations.
-    """
-    # a point's share: over all the proposals, their number of points times their density there
+    """Mixture fitted to a density from (n, p) points of a first proposal with their (n,) log densities, and the number
+    of evaluations. The first Gaussian is defensive, with mean and covariance of all the weighted points."""
+    # log of the sum over all proposals of their number of points times their density at a point
     n, log_share = len(theta), first.log_density(theta) + np.log(len(theta))
     weight, _ = smooth_weights(log_target - log_share)
     mean = weight @ theta
-    whole = _covariance(theta, weight, mean)
-    means, covariances = [mean], [whole]
+    covariance = _covariance(theta, weight, mean)
+    means, covariances = [mean], [covariance]
     for number in range(1, MOST_ADDED + 1):
         weight, shape = smooth_weights(log_target - log_share)
         if 1.0 / np.sum(weight**2) > ENOUGH * len(theta) and shape <= LIGHT_TAIL:
             break
         centre = theta[np.argmax(log_target - log_share)]
         means.append(centre)
-        # of the nearest points, weighted half by their weights and half alike
-        z = np.linalg.solve(np.linalg.cholesky(whole), (theta - centre).T)
-        near = np.argsort(np.sum(z**2, axis=0), kind="stable")[:ADDED]
-        mixed = weight[near] + 1.0 / len(theta)
-        covariances.append(_covariance(theta[near], mixed / mixed.sum(), centre) + LEAST_VARIANCE * whole)
+        # covariance of the nearest points, weighted half by their weights and half equally
+        z = np.linalg.solve(np.linalg.cholesky(covariance), (theta - centre).T)
+        nearest = np.argsort(np.sum(z**2, axis=0), kind="stable")[:ADDED]
+        mixed_weight = weight[nearest] + 1.0 / len(theta)
+        covariances.append(
+            _covariance(theta[nearest], mixed_weight / mixed_weight.sum(), centre) + LEAST_VARIANCE * covariance
+        )
         points = centre + rng.standard_normal((ADDED, len(centre))) @ np.linalg.cholesky(covariances[-1]).T
-        log_share = np.logaddexp(log_share, np.log(ADDED) + Gaussians.one(centre, covariances[-1]).log_density(theta))
+        log_share = np.logaddexp(
+            log_share, np.log(ADDED) + Gaussians.single(centre, covariances[-1]).log_density(theta)
+        )
         earlier = Gaussians(np.full(number, 1.0 / number), np.array(means[1:]), np.array(covariances[1:]))
-        there = np.log(ADDED * number) + earlier.log_density(points)
-        log_share = np.concatenate([log_share, np.logaddexp(np.log(n) + first.log_density(points), there)])
+        log_share_of_added = np.log(ADDED * number) + earlier.log_density(points)
+        log_share = np.concatenate([log_share, np.logaddexp(np.log(n) + first.log_density(points), log_share_of_added)])
         theta, log_target = np.concatenate([theta, points]), np.concatenate([log_target, log_density(points)])
-    size = np.array([n, *[ADDED] * (len(means) - 1)], dtype=np.float64)
-    return Gaussians(size / size.sum(), np.array(means), np.array(covariances)), ADDED * (len(means) - 1)
+    n_points = np.array([n, *[ADDED] * (len(means) - 1)], dtype=np.float64)
+    return Gaussians(n_points / n_points.sum(), np.array(means), np.array(covariances)), ADDED * (len(means) - 1)
 
 
 def _covariance(theta: FloatArray, weight: FloatArray, centre: FloatArray) -> FloatArray:
@@ -226,33 +226,31 @@ def _covariance(theta: FloatArray, weight: FloatArray, centre: FloatArray) -> Fl
 # --- Importance sampling by randomised quasi-Monte Carlo about the mode, doubled until interval ends are accurate.
 
 STRETCH, WIDE_STRETCH = 0.45, 0.8
-"""Bend of the proposal's tails, see `Proposal`. The wide one is for densities with tails like a t: from a few thousand
-points it needs a quarter of the narrow one's."""
+"""Bend b of the proposal's tails, see `Proposal`. For densities with tails like a t the wide one needs a quarter of the
+points."""
 HEAVY_TAIL = 0.3  #: Pareto shape of the first points' weights above which the wide proposal is taken.
 TOO_WIDE = 2.0
-"""A part of the density with this many times the variance of one Gaussian gives weights of infinite variance under it:
-then the proposal has a Gaussian for each part."""
-ADAPTED_FROM = 1024  #: Points a replicate from which a tail heavier than trusted lets a mixture be fitted to them.
+"""Where a part of the density has this many times the variance of the single Gaussian, weights under that have infinite
+variance: the proposal has a Gaussian for each part."""
+ADAPTED_FROM = 1024  #: Points per replicate from which a mixture is fitted where the weights cannot be trusted.
 POOR = 0.5  #: Below this share of effective draws the proposal is moved to the weighted moments of the points so far.
 FITTED_AT = 4096
-"""Points a replicate at which a mixture is fitted where the error is not reached: with four times as many it is cheaper
-only now and then."""
+"""Points per replicate at which a mixture is fitted where the error is not reached: more points are seldom cheaper."""
 NEAR_ENOUGH = 3.0
-"""Points whose weights can be trusted stand at so many times the wanted error, where a fitted proposal is worse: chains
-are asked for five times it."""
+"""Times the requested error that is accepted of trusted weights where a fitted proposal is worse: of chains, which come
+next, five times is requested."""
 MOST_MOVES = 4
-LEAST_KEPT = 8192  #: Equal-weight draws returned, at least: twice the points where those are more.
+LEAST_KEPT = 8192  #: Least number of equal-weight draws returned; twice the points where that is more.
 HEAVY_POINTS, HEAVY = 2048, 0.1
-"""With as many points a replicate and a tail heavier than trusted by this, more points do not help."""
+"""Points per replicate from which a Pareto shape this much above `TRUSTED_SHAPE` ends the sampling."""
 
 
 class ImportanceOptions(Record):
     """Stopping rule of importance sampling."""
 
-    accuracy_sd: float = 0.02
-    """Wanted Monte-Carlo error of the ends of a 95 % interval, in posterior standard deviations."""
-    first: int = 256  #: Points of a replicate to begin with.
-    most: int = 16384  #: And at most.
+    accuracy_sd: float = 0.02  #: Monte-Carlo error of the ends of a 95 % interval to reach, in posterior SDs.
+    first: int = 256  #: Points per replicate to begin with.
+    most: int = 16384  #: Largest number of points per replicate.
 
 
 def importance(
@@ -266,22 +264,18 @@ def importance(
 ) -> draws.ParameterDraws:
     """Draw from a log density, (m, p) to (m,), by importance sampling; returns draws of equal weight.
 
-    The proposal has the (p,) mode and (p, p) covariance given, or is made of `parts`, Gaussians that the density is
-    about a mixture of, where one of them is `TOO_WIDE` for the one above. `NotConvergedError` when the weights' tail is
-    too heavy even for a mixture fitted to the points (`fitted_gaussians`), or the error is not reached.
-
-    The points are a Sobol set under random digital shifts. The proposal is smooth, close to a normal in its middle and
-    wider in its tails, so that the points stay even and the weights bounded where the density falls a little more
-    slowly than a normal. Put the parameters that matter first: a Sobol set fills its first coordinates most evenly, and
-    the proposal's root is triangular.
+    The proposal has the (p,) mode and (p, p) covariance, or is a mixture of `parts` where one of them is `TOO_WIDE` for
+    that; its points are a Sobol set under random digital shifts. Parameters that matter most come first: there a Sobol
+    set is most even. `NotConvergedError` when the weights cannot be trusted even for a mixture fitted to the points
+    (`fitted_gaussians`), or the error is not reached.
     """
     options = options or ImportanceOptions()
-    gaussians = Gaussians.one(mode, covariance)
+    gaussians = Gaussians.single(mode, covariance)
     if parts is not None and parts.widest(covariance) > TOO_WIDE:
         gaussians = parts
-    sampler = _sampled(_settled(log_density, gaussians, rng=rng, options=options), options)
-    keep = max(LEAST_KEPT, 2 * sampler.number)
-    chosen = systematic(sampler.weights, keep, rng)
+    sampler = _sample_until_accurate(_adapted_start(log_density, gaussians, rng=rng, options=options), options)
+    number = max(LEAST_KEPT, 2 * sampler.number)
+    index = systematic(sampler.weights, number, rng)
     log_evidence, log_evidence_error = sampler.log_evidence()
     figures = {
         "pareto_k": float(sampler.shape),
@@ -290,48 +284,49 @@ def importance(
         "effective_draws": float(1.0 / np.sum(sampler.weights**2)),
         "log_evidence": log_evidence,
         "log_evidence_error": log_evidence_error,
-        "draws": float(keep),
+        "draws": float(number),
     }
-    lp, log_weight = sampler.log_target.ravel()[chosen], sampler.log_weights.ravel()[chosen] - log_evidence
+    lp, log_weight = sampler.log_target.ravel()[index], sampler.log_weights.ravel()[index] - log_evidence
     statistics = {"lp": lp[None], "log_weight": log_weight[None]}
-    labels = chosen // sampler.points
-    return draws.ParameterDraws(sampler.theta[chosen][None], "importance", figures, labels, statistics)
+    labels = index // sampler.points
+    return draws.ParameterDraws(sampler.theta[index][None], "importance", figures, labels, statistics)
 
 
-def _sampled(sampler: _Sampler, options: ImportanceOptions) -> _Sampler:
-    """More points until the error is reached, if need be from a proposal fitted to them; where that is worse the first
-    one goes on if its points can be trusted."""
-    wanted = options.accuracy_sd
-    if sampler.extended(wanted, most=min(FITTED_AT, options.most), patience=ADAPTED_FROM).reached(wanted):
+def _sample_until_accurate(sampler: _Sampler, options: ImportanceOptions) -> _Sampler:
+    """Extend until the error is reached, or else replace the proposal by a mixture fitted to the points; where that is
+    worse, extend the first one if its weights can be trusted."""
+    accuracy_sd = options.accuracy_sd
+    if sampler.extended(accuracy_sd, most=min(FITTED_AT, options.most), patience=ADAPTED_FROM).reached(accuracy_sd):
         return sampler
-    fitted = sampler.adapted()
-    fitted.extend(ADAPTED_FROM)
+    mixture = sampler.adapted()
+    mixture.extend(ADAPTED_FROM)
     # a fitted proposal may take twice the points: chains, which come next, are asked for a fifth of the accuracy
-    if fitted.extended(wanted, most=2 * options.most, patience=HEAVY_POINTS, heavy=HEAVY).reached(wanted):
-        return fitted
-    if _trusted(sampler.shape):
-        sampler.extended(wanted, most=options.most, patience=ADAPTED_FROM)
-        if sampler.reached(NEAR_ENOUGH * wanted):
+    if mixture.extended(accuracy_sd, most=2 * options.most, patience=HEAVY_POINTS, heavy=HEAVY).reached(accuracy_sd):
+        return mixture
+    if _can_be_trusted(sampler.shape):
+        sampler.extended(accuracy_sd, most=options.most, patience=ADAPTED_FROM)
+        if sampler.reached(NEAR_ENOUGH * accuracy_sd):
             return sampler
     raise NotConvergedError(
-        f"importance sampling stopped at {fitted.number} points with an end-point error of {fitted.error:.3f} SD "
-        f"(wanted {wanted:g}) and Pareto shape {fitted.shape:.2f} (wanted {TRUSTED_SHAPE:g} or less); "
+        f"importance sampling stopped at {mixture.number} points with an end-point error of {mixture.error:.3f} SD "
+        f"(wanted {accuracy_sd:g}) and Pareto shape {mixture.shape:.2f} (wanted {TRUSTED_SHAPE:g} or less); "
         "use --method ensemble",
-        diagnostics={"pareto_k": float(fitted.shape), "end_error_sd": fitted.error},
+        diagnostics={"pareto_k": float(mixture.shape), "end_error_sd": mixture.error},
     )
 
 
-def _trusted(shape: float) -> bool:
+def _can_be_trusted(shape: float) -> bool:
+    """True for a Pareto shape up to `TRUSTED_SHAPE`, or for equal weights."""
     return shape == -np.inf or bool(np.isfinite(shape) and shape <= TRUSTED_SHAPE)
 
 
-def _settled(
+def _adapted_start(
     log_density: LogDensity, gaussians: Gaussians, *, rng: np.random.Generator, options: ImportanceOptions
 ) -> _Sampler:
-    """First points, from a proposal that is adapted while it is poor."""
-    spent, stretch = 0, STRETCH
+    """First points, from a proposal that is widened or moved while it is poor."""
+    earlier, stretch = 0, STRETCH
     for _ in range(MOST_MOVES):
-        sampler = _Sampler(log_density, gaussians, stretch=stretch, rng=rng, spent=spent)
+        sampler = _Sampler(log_density, gaussians, stretch=stretch, rng=rng, earlier=earlier)
         sampler.extend(options.first)
         weights = sampler.weights
         if not np.isfinite(weights).all():
@@ -340,42 +335,42 @@ def _settled(
                 diagnostics={"pareto_k": float("nan")},
             )
         if sampler.shape > HEAVY_TAIL and stretch < WIDE_STRETCH:
-            stretch, spent = WIDE_STRETCH, sampler.evaluations
+            stretch, earlier = WIDE_STRETCH, sampler.evaluations
             continue
         if 1.0 / np.sum(weights**2) > POOR * sampler.number:
             break
         centre = weights @ sampler.theta
-        about = _covariance(sampler.theta, weights, centre)
-        if not np.linalg.eigvalsh(about)[0] > 1e-6 * np.linalg.eigvalsh(gaussians.covariance[0])[0]:
+        covariance = _covariance(sampler.theta, weights, centre)
+        if not np.linalg.eigvalsh(covariance)[0] > 1e-6 * np.linalg.eigvalsh(gaussians.covariance[0])[0]:
             break
-        gaussians, spent = Gaussians.one(centre, about), sampler.evaluations
+        gaussians, earlier = Gaussians.single(centre, covariance), sampler.evaluations
     return sampler
 
 
 class _Sampler:
-    """Points with densities and smoothed weights, by replicate: independent shifts of the set, whose spread is the
-    error."""
+    """Points with densities and smoothed weights, by replicate: independent shifts of the Sobol set, whose spread gives
+    the Monte-Carlo error."""
 
-    weights: FloatArray  #: (n,) of all points.
+    weights: FloatArray  #: (n,) smoothed weights of all points.
     shape: float  #: Pareto shape of their tail.
     error: float  #: Largest Monte-Carlo error, over the parameters, of a 95 % interval's ends, in SDs; see `extended`.
 
     def __init__(
-        self, log_density: LogDensity, gaussians: Gaussians, *, stretch: float, rng: np.random.Generator, spent: int
+        self, log_density: LogDensity, gaussians: Gaussians, *, stretch: float, rng: np.random.Generator, earlier: int
     ) -> None:
-        self._log_density, self._rng, self._spent = log_density, rng, spent
+        self._log_density, self._rng, self._earlier = log_density, rng, earlier
         self._proposal = Proposal(gaussians, stretch)
         self._shifts = rng.integers(2**draws.BITS, size=(draws.REPLICATES, self._proposal.dimension), dtype=np.uint32)
         self._theta = np.empty((draws.REPLICATES, 0, gaussians.mean.shape[1]))
         self.log_target, self.log_weights = np.empty((draws.REPLICATES, 0)), np.empty((draws.REPLICATES, 0))
 
     def adapted(self) -> _Sampler:
-        """One whose proposal is fitted to these points, without points."""
-        gaussians, spent = fitted_gaussians(
+        """Sampler without points whose proposal is fitted to these points."""
+        gaussians, earlier = fitted_gaussians(
             self._log_density, self._proposal, self.theta, self.log_target.ravel(), rng=self._rng
         )
-        spent += self.evaluations
-        return _Sampler(self._log_density, gaussians, stretch=STRETCH, rng=self._rng, spent=spent)
+        earlier += self.evaluations
+        return _Sampler(self._log_density, gaussians, stretch=STRETCH, rng=self._rng, earlier=earlier)
 
     @property
     def number(self) -> int:
@@ -390,7 +385,7 @@ class _Sampler:
     @property
     def evaluations(self) -> int:
         """Number of densities evaluated, including earlier proposals."""
-        return self._spent + self.number
+        return self._earlier + self.number
 
     @property
     def theta(self) -> FloatArray:
@@ -407,28 +402,29 @@ class _Sampler:
         self.weights, self.shape = smooth_weights(self.log_weights.ravel())
 
     def extended(self, accuracy_sd: float, *, most: int, patience: int, heavy: float = 0.0) -> _Sampler:
-        """Double the points until the error is reached, or `most` a replicate, or the tail is heavier than trusted by
-        `heavy`, from `patience` points a replicate on."""
+        """Double the points until the error is reached or they are `most` per replicate; from `patience` on, also end
+        where the shape is `heavy` above the trusted one."""
         while True:
-            # a few replicates' spread misses what a heavy tail does now and then: 0.036 SD was seen for 0.015
+            # the spread of four replicates misses rare large weights: 0.036 SD was seen for 0.015
             self.error = self._end_error() * (1.0 + max(self.shape, 0.0) if np.isfinite(self.shape) else 1.0)
-            hopeless = self.points >= patience and not _trusted(self.shape - heavy)
+            hopeless = self.points >= patience and not _can_be_trusted(self.shape - heavy)
             if self.reached(accuracy_sd) or self.points >= most or hopeless:
                 return self
             self.extend(self.points)
 
     def reached(self, accuracy_sd: float) -> bool:
         """True where the weights can be trusted and the error is no larger than this."""
-        return _trusted(self.shape) and self.error <= accuracy_sd
+        return _can_be_trusted(self.shape) and self.error <= accuracy_sd
 
     def log_evidence(self) -> tuple[float, float]:
         """Log of the integral of exp(log density), and its standard error, from the replicates."""
-        each = np.logaddexp.reduce(self.log_weights, axis=1)
-        share = np.exp(each - each.max())
+        by_replicate = np.logaddexp.reduce(self.log_weights, axis=1)
+        share = np.exp(by_replicate - by_replicate.max())
         error = float(share.std(ddof=1) / share.mean() / np.sqrt(len(share)))
         return float(np.logaddexp.reduce(self.log_weights.ravel()) - np.log(self.number)), error
 
     def _end_error(self) -> float:
+        """Largest Monte-Carlo error of a 95 % interval's ends over the parameters, in SDs, between the replicates."""
         by_replicate, tails = self.weights.reshape(self.log_weights.shape), np.array([0.025, 0.975])
         worst = 0.0
         for i in range(self._theta.shape[2]):
@@ -436,7 +432,7 @@ class _Sampler:
             mean = float(np.sum(self.weights * values.ravel()))
             sd = float(np.sqrt(np.sum(self.weights * (values.ravel() - mean) ** 2)))
             order = np.argsort(values, axis=1)
-            ordered, weights = (np.take_along_axis(one, order, axis=1) for one in (values, by_replicate))
+            ordered, weights = (np.take_along_axis(array, order, axis=1) for array in (values, by_replicate))
             ends = [draws.weighted_quantiles_of(v, w, tails) for v, w in zip(ordered, weights, strict=True)]
             error = float(np.sqrt(np.mean(np.var(ends, axis=0, ddof=1)) / len(ends)))
             worst = max(worst, error / sd if sd > 0 else 0.0)

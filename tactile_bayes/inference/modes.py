@@ -25,8 +25,8 @@ def stencil(theta: FloatArray, *, step: FloatArray) -> FloatArray:
 def finite_differences(values: FloatArray, *, step: FloatArray) -> tuple[FloatArray, FloatArray]:
     """(p,) gradient and (p, p) Hessian from a function's values at the points of `stencil`."""
     p = len(step)
-    here, up, down = values[0], values[1 : p + 1], values[p + 1 : 2 * p + 1]
-    hessian = np.diag((up - 2 * here + down) / step**2)
+    centre, up, down = values[0], values[1 : p + 1], values[p + 1 : 2 * p + 1]
+    hessian = np.diag((up - 2 * centre + down) / step**2)
     i, j = np.tril_indices(p, -1)
     a, b, c, d = values[2 * p + 1 :].reshape(-1, 4).T
     hessian[i, j] = hessian[j, i] = (a - b - c + d) / (4 * step[i] * step[j])
@@ -52,8 +52,7 @@ ModelFunction = Callable[[FloatArray], FloatArray]
 """Maps (m, p) parameter vectors to (m, k) predictions, all m at once."""
 
 MOST_ITERATIONS = 200
-SETTLED = 0.01
-"""Share of the residual variance: a step that lowers the sum of squares by less moves nothing that the data show."""
+SETTLED = 0.01  #: Share of the residual variance: a step that lowers the sum of squares by less is within the noise.
 
 
 class LeastSquaresFit(Record, eq=False):
@@ -100,16 +99,15 @@ def fit_least_squares(
 ) -> LeastSquaresFit:
     """Minimise ``sum(weight * (data - model(theta))**2)`` by Levenberg-Marquardt.
 
-    Marquardt (1963); the gain ratio controls the damping as in Madsen, Nielsen & Tingleff (2004), section 3.2. The (k,)
-    weights are inverse variances up to one common factor; the (p,) scale is the typical size of a change of each
-    parameter, and steps are damped in these units. It stops when the Gauss-Newton step is smaller than `tolerance` in
-    units of `scale`, or, not converged, where `abandon` is true: at parameters from which no useful minimum can follow.
-    After `patience` iterations a minimum is good enough once a step lowers the sum of squares by less than `SETTLED` of
-    the residual variance: beside large residuals steps shrink by a few per cent each.
+    The (k,) weights are inverse variances up to a common factor; steps are damped in units of the (p,) `scale`, a
+    typical change of each parameter. It stops when the step is smaller than `tolerance` in these units, after
+    `patience` iterations also when a step lowers the sum of squares by less than `SETTLED` of the residual variance,
+    and, not converged, at parameters where `abandon` is true. Marquardt (1963); damping as in Madsen, Nielsen &
+    Tingleff (2004), section 3.2.
     """
     theta = np.array(start, dtype=np.float64)
     residual = data - model(theta[None])[0]
-    sse, damping, grow = float(weight @ residual**2), 1e-3, 2.0
+    sse, damping, growth = float(weight @ residual**2), 1e-3, 2.0
     jacobian = numerical_jacobian(model, theta, scale=scale)
     for iteration in range(1, MOST_ITERATIONS + 1):
         step = _damped_step(jacobian, residual, weight=weight, scale=scale, damping=damping)
@@ -119,19 +117,19 @@ def fit_least_squares(
         trial_residual = data - model(trial[None])[0]
         trial_sse = float(weight @ trial_residual**2)
         if trial_sse <= sse and np.isfinite(trial_sse):
-            small = float(np.abs(step).max()) < tolerance or sse - trial_sse <= 1e-15 * sse
-            small |= patience is not None and iteration > patience and sse - trial_sse <= SETTLED * sse / len(data)
+            settled = float(np.abs(step).max()) < tolerance or sse - trial_sse <= 1e-15 * sse
+            settled |= patience is not None and iteration > patience and sse - trial_sse <= SETTLED * sse / len(data)
             theta, residual, sse = trial, trial_residual, trial_sse
             jacobian = numerical_jacobian(model, theta, scale=scale)
-            damping, grow = max(damping / 5.0, 1e-14), 2.0
-            if small:
+            damping, growth = max(damping / 5.0, 1e-14), 2.0
+            if settled:
                 return LeastSquaresFit(theta, jacobian, residual, sse, True, iteration)
             if abandon is not None and abandon(theta):
                 return LeastSquaresFit(theta, jacobian, residual, sse, False, iteration)
         else:
             if float(np.abs(step).max()) < tolerance:
                 return LeastSquaresFit(theta, jacobian, residual, sse, True, iteration)
-            damping, grow = damping * grow, grow * 2.0
+            damping, growth = damping * growth, growth * 2.0
     return LeastSquaresFit(theta, jacobian, residual, sse, False, MOST_ITERATIONS)
 
 
@@ -177,44 +175,46 @@ def mode_and_covariance(
     The (p,) scale is about one posterior standard deviation of each parameter. `NotConvergedError` when no mode is
     found or the curvature there is not that of a maximum.
     """
-    mode, taken = find_mode(log_density, start, scale=scale, tolerance=tolerance)
-    _, hessian = _slopes(log_density, mode, step=5e-2 * scale)
+    mode, steps = find_mode(log_density, start, scale=scale, tolerance=tolerance)
+    _, hessian = _gradient_and_hessian(log_density, mode, step=5e-2 * scale)
     values, vectors = np.linalg.eigh(-hessian * np.outer(scale, scale))
     if not values[0] > 1e-9 * values[-1]:
         raise NotConvergedError("the posterior has no maximum in every direction; try --method ensemble")
-    return mode, np.asarray((vectors / values) @ vectors.T * np.outer(scale, scale)), taken
+    return mode, np.asarray((vectors / values) @ vectors.T * np.outer(scale, scale)), steps
 
 
 def find_mode(
     log_density: LogDensity, start: FloatArray, *, scale: FloatArray, tolerance: float = 1e-4
 ) -> tuple[FloatArray, int]:
-    """As `mode_and_covariance`, without the curvature; the last step is smaller than `tolerance` in units of `scale`,
-    and the mode nearer than that: steps shrink as their squares, down to the error of differences."""
+    """Mode, and number of steps, as `mode_and_covariance`; the last step is below `tolerance` in units of `scale`, and
+    the mode nearer still: Newton steps converge quadratically, down to the error of differences."""
     theta = np.array(start, dtype=np.float64)
     value = float(log_density(theta[None])[0])
     damping = 1e-8
-    for taken in range(1, MOST_STEPS + 1):
-        gradient, hessian = _slopes(log_density, theta, step=1e-2 * scale)
+    for steps in range(1, MOST_STEPS + 1):
+        gradient, hessian = _gradient_and_hessian(log_density, theta, step=1e-2 * scale)
         # uphill in standardised units; directions of negative curvature are flipped
         values, vectors = np.linalg.eigh(-hessian * np.outer(scale, scale))
-        safe = np.maximum(np.abs(values), 1e-3) + damping * max(1.0, float(np.abs(values).max()))
-        step = scale * np.clip(vectors @ ((vectors.T @ (gradient * scale)) / safe), -2.0, 2.0)
+        curvature = np.maximum(np.abs(values), 1e-3) + damping * max(1.0, float(np.abs(values).max()))
+        step = scale * np.clip(vectors @ ((vectors.T @ (gradient * scale)) / curvature), -2.0, 2.0)
         trial = theta + step
         trial_value = float(log_density(trial[None])[0])
         small = np.abs(step / scale).max() < tolerance
         if trial_value >= value:
             gained, theta, value, damping = trial_value - value, trial, trial_value, max(damping / 10, 1e-8)
             if small and gained < tolerance**2:
-                return theta, taken
+                return theta, steps
         elif small:
-            return theta, taken
+            return theta, steps
         else:
             damping = max(damping * 10, 1e-4)
     raise NotConvergedError(f"no posterior mode found in {MOST_STEPS} Newton steps; try --method ensemble")
 
 
-def _slopes(log_density: LogDensity, theta: FloatArray, *, step: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Gradient and Hessian; an error where a neighbouring point has no density."""
+def _gradient_and_hessian(
+    log_density: LogDensity, theta: FloatArray, *, step: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Gradient and Hessian; `NotConvergedError` where a neighbouring point has no density."""
     values = log_density(stencil(theta, step=step))
     if not np.isfinite(values).all():
         raise NotConvergedError(

@@ -1,4 +1,4 @@
-"""The bump of a lump on a map, the window that it is fitted in, its errors, and the odds of a bump against them."""
+"""The Gaussian bump of a lump on a map, candidates and windows for its fit, and the error model from the residuals."""
 
 from __future__ import annotations
 
@@ -77,19 +77,19 @@ def principal_widths(
 
 
 def drawn_widths(p: FloatArray, q: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The same of draws of one ellipse: the first width is along the axis that they all call x."""
+    """`principal_widths` of draws of one ellipse, the first width along the same axis for all."""
     return principal_widths(p, q, r, first=first_axis(q, r))
 
 
-# --- Cells to be fitted: candidates for a lump, and the window about one of them.
+# --- Candidate places for a lump, and the cells of the window about one of them.
 
 SMOOTHING_MM = 3.0
-"""Width of the Gaussian that smooths a map before candidates are sought: about that of a small lump's bump."""
+"""SD of the Gaussian that smooths a map before the search for candidates: about that of a small lump's bump."""
 RIM_MM, RIM_SHARE = 6.0, 0.6
-"""A place is at the map's rim where less than the share of the disc of this radius about it is covered."""
+"""A place is at the map's rim where less than this share of the disc of this radius about it is covered."""
 FEW_READINGS = 0.1  #: A cell with a smaller share of the median count is left out of the fit.
-MAPS_AT_HAND = 4
-"""Maps of which what was worked out once is kept: the map, its levelled one, and both without the measured lump."""
+CACHED_MAPS = 4
+"""Maps whose results are cached: the map, its levelled one, and both without the measured lump."""
 
 
 class PoseNoise(Record):
@@ -148,18 +148,18 @@ class FitCells(Record, eq=False, dict=True):
         return float(np.sum(self.variance[known] * self.count[known])) / readings if readings > 0 else 0.0
 
 
-@lru_cache(maxsize=MAPS_AT_HAND)
-def trusted(tactile_map: TactileMap) -> BoolArray:
-    """(ny, nx) True for covered cells with at least a tenth of the median count; read-only.
+@lru_cache(maxsize=CACHED_MAPS)
+def trusted_cells(tactile_map: TactileMap) -> BoolArray:
+    """(ny, nx) True for covered cells with at least `FEW_READINGS` of the median count; read-only.
 
-    At the rim of a map a handful of readings from one side of the head decide a cell, and they are off together.
+    The few readings of a cell at the rim come from one side of the head, and share their errors.
     """
-    covered = read_well(tactile_map, FEW_READINGS)
+    covered = well_read_cells(tactile_map, FEW_READINGS)
     covered.flags.writeable = False
     return covered
 
 
-def read_well(tactile_map: TactileMap, share: float) -> BoolArray:
+def well_read_cells(tactile_map: TactileMap, share: float) -> BoolArray:
     """(ny, nx) True for covered cells with at least a share of the median count."""
     covered = tactile_map.covered
     typical = np.median(tactile_map.count[covered]) if covered.any() else 0.0
@@ -169,7 +169,7 @@ def read_well(tactile_map: TactileMap, share: float) -> BoolArray:
 def window_cells(tactile_map: TactileMap, centre_mm: tuple[float, float], *, radius_mm: float) -> FitCells:
     """The trusted cells whose centres lie within `radius_mm` of `centre_mm`."""
     dx, dy = tactile_map.x_mm - centre_mm[0], tactile_map.y_mm[:, None] - centre_mm[1]
-    inside = trusted(tactile_map) & (dx**2 + dy**2 <= radius_mm**2)
+    inside = trusted_cells(tactile_map) & (dx**2 + dy**2 <= radius_mm**2)
     row, column = np.nonzero(inside)
     return FitCells(
         x_mm=tactile_map.x_mm[column],
@@ -198,7 +198,7 @@ def on_map(tactile_map: TactileMap, x_mm: float, y_mm: float) -> bool:
 
 
 def covered_share(tactile_map: TactileMap, centre_mm: tuple[float, float], *, radius_mm: float) -> float:
-    """Share of the disc about `centre_mm` that the map covers, counting what lies beyond its edge as not covered."""
+    """Share of the disc about `centre_mm` that the map covers; beyond its edge nothing is covered."""
     cell = tactile_map.recipe.cell_mm
     radius_mm = max(radius_mm, 0.75 * cell)
     return min(1.0, len(window_cells(tactile_map, centre_mm, radius_mm=radius_mm)) / (np.pi * radius_mm**2 / cell**2))
@@ -208,7 +208,7 @@ def typical_level(tactile_map: TactileMap) -> float:
     """Level away from the lump: fixed by normalising, else the median of the covered cells."""
     if tactile_map.background is not None:
         return tactile_map.background
-    return float(np.median(tactile_map.mean[trusted(tactile_map)]))
+    return float(np.median(tactile_map.mean[trusted_cells(tactile_map)]))
 
 
 def value_scale(tactile_map: TactileMap) -> float:
@@ -223,80 +223,77 @@ def value_scale(tactile_map: TactileMap) -> float:
 def candidate_centres(tactile_map: TactileMap, *, limit: int = 16, rim_limit: int = 8) -> list[tuple[float, float]]:
     """Local maxima (x_mm, y_mm) of the smoothed map, the candidates for a lump, highest first.
 
-    At most `limit` inside the map and `rim_limit` at its rim, which only the head's own rim has felt: on deep fat that
-    presses hardest, and the score of such places can be higher than the lump's. Empty where no covered cell rises above
-    the background.
+    At most `limit` inside the map and `rim_limit` at its rim, which on deep fat may rise above the lump since the
+    head's rim presses hardest. Empty where no covered cell rises above the background.
     """
     excess = smoothed_excess(tactile_map)
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(excess, 1, constant_values=-np.inf), (3, 3))
-    rows, columns = np.nonzero(np.isfinite(excess) & (excess > 0) & (excess >= around.max(axis=(2, 3))))
+    neighbours = np.lib.stride_tricks.sliding_window_view(np.pad(excess, 1, constant_values=-np.inf), (3, 3))
+    rows, columns = np.nonzero(np.isfinite(excess) & (excess > 0) & (excess >= neighbours.max(axis=(2, 3))))
     centres: list[tuple[float, float]] = []
-    left = {False: limit, True: rim_limit}
+    remaining = {False: limit, True: rim_limit}
     for i in np.argsort(-excess[rows, columns], kind="stable"):
         centre = (float(tactile_map.x_mm[columns[i]]), float(tactile_map.y_mm[rows[i]]))
         if any(np.hypot(centre[0] - x, centre[1] - y) <= 2 * SMOOTHING_MM for x, y in centres):
             continue
         at_rim = covered_share(tactile_map, centre, radius_mm=RIM_MM) < RIM_SHARE
-        if left[at_rim]:
+        if remaining[at_rim]:
             centres.append(centre)
-            left[at_rim] -= 1
-        if not left[False]:
+            remaining[at_rim] -= 1
+        if not remaining[False]:
             break
     return centres
 
 
-@lru_cache(maxsize=MAPS_AT_HAND)
+@lru_cache(maxsize=CACHED_MAPS)
 def smoothed_excess(tactile_map: TactileMap) -> FloatArray:
     """(ny, nx) count-weighted Gaussian smoothing of map minus background; -inf where there is no data. Read-only."""
-    covered = trusted(tactile_map)
+    covered = trusted_cells(tactile_map)
     excess = np.where(covered, tactile_map.mean - typical_level(tactile_map), 0.0)
     weight = np.where(covered, np.sqrt(tactile_map.count.astype(np.float64)), 0.0)
     cell = tactile_map.recipe.cell_mm
-    top, bottom = (_smooth(one, SMOOTHING_MM / cell) for one in (excess * weight, weight))
+    top, bottom = (_gaussian_smoothed(one, SMOOTHING_MM / cell) for one in (excess * weight, weight))
     with np.errstate(invalid="ignore", divide="ignore"):
         smoothed = np.where(covered & (bottom > 0), top / bottom, -np.inf)
     smoothed.setflags(write=False)
     return smoothed
 
 
-@lru_cache(maxsize=MAPS_AT_HAND)
+@lru_cache(maxsize=CACHED_MAPS)
 def levelled(tactile_map: TactileMap) -> TactileMap:
-    """The map less its mean over the head's positions that cover a cell, as frame means would remove it.
-
-    A wide rise, as of a stiff layer, is off it, and lumps stand out. Only a map with a gain per frame needs it.
-    """
+    """The map less its local mean over the head's area, as dividing by frame means would leave it: without wide rises,
+    as of a stiff layer. Only maps with a gain per frame are changed."""
     noise = PoseNoise.of(tactile_map)
     if tactile_map.recipe.normalise != "gain" or noise is None:
         return tactile_map
-    covered = trusted(tactile_map)
+    covered = trusted_cells(tactile_map)
     excess = np.where(covered, tactile_map.mean - typical_level(tactile_map), 0.0)
     across, along = overlap(tactile_map.x_mm, noise.side_mm[0]), overlap(tactile_map.y_mm, noise.side_mm[1])
-    around = (along @ excess @ across) / np.maximum(along @ covered @ across, 1.0)
-    return replace(tactile_map, mean=np.where(covered, tactile_map.mean - around, tactile_map.mean))
+    local_mean = (along @ excess @ across) / np.maximum(along @ covered @ across, 1.0)
+    return replace(tactile_map, mean=np.where(covered, tactile_map.mean - local_mean, tactile_map.mean))
 
 
 def overlap(axis_mm: FloatArray, side_mm: float) -> FloatArray:
     """(n, n) overlap of two equal intervals about points of an axis, as a share of one."""
-    away: FloatArray = np.abs(np.subtract.outer(axis_mm, axis_mm))
-    return np.clip(1.0 - away / side_mm, 0.0, None)
+    distance: FloatArray = np.abs(np.subtract.outer(axis_mm, axis_mm))
+    return np.clip(1.0 - distance / side_mm, 0.0, None)
 
 
-def _smooth(array: FloatArray, width_cells: float) -> FloatArray:
+def _gaussian_smoothed(array: FloatArray, width_cells: float) -> FloatArray:
     """Gaussian smoothing with zeros beyond the edge, and beyond four widths."""
     kernels = []
     for n in array.shape:
-        away = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
-        weight = np.exp(-0.5 * (away / max(width_cells, 0.3)) ** 2)
-        kernels.append(np.where(away <= max(1, int(np.ceil(4 * width_cells))), weight, 0.0))
+        distance = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+        weight = np.exp(-0.5 * (distance / max(width_cells, 0.3)) ** 2)
+        kernels.append(np.where(distance <= max(1, int(np.ceil(4 * width_cells))), weight, 0.0))
     return np.asarray(kernels[0] @ array @ kernels[1])
 
 
 # --- The paper's model of a map: one Gaussian bump on a level background (Eq 7), with its priors.
 
 BLOCK, LEAST_BLOCK = 64, 4
-"""Parameter vectors predicted at a time: few enough for the intermediate arrays to stay in a processor's cache."""
+"""Parameter vectors predicted at a time, so that intermediate arrays stay in a processor's cache; and the least."""
 BLOCK_VALUES = 512 * 1024
-"""Cells times vectors in a block: beyond 8192 cells a block has fewer vectors, but `LEAST_BLOCK`."""
+"""Cells times vectors in a block: for more than 8192 cells a block has fewer vectors."""
 
 
 def block_size(cells: int) -> int:
@@ -430,14 +427,11 @@ def independent_errors(fit: LeastSquaresFit, weight: FloatArray) -> ErrorModel:
 def error_model(cells: FitCells, fit: LeastSquaresFit, weight: FloatArray) -> ErrorModel:
     """Estimate the error model from a fit's residuals.
 
-    Neighbouring cells share frames and the model's misfit, so their errors correlate. The least-squares estimate stays
-    as it is; its covariance becomes the sandwich :math:`H^{-1} J^T W C W J H^{-1}` with C from the residuals'
-    autocorrelation, and `inflation` is the mean factor over the parameters. Dividing the log-likelihood by it is the
-    magnitude adjustment of composite likelihoods (Chandler & Bate 2007, Biometrika 94:167; Pauli, Racugno & Ventura
-    2011, Statistica Sinica 21:149).
-
-    A level and a tilt are taken out of the residuals first. They are the misfit of a fixed background, which the maps
-    that a size calibration was learned from share; `level_offset` reports it instead.
+    `inflation` is the mean factor over the parameters by which the sandwich :math:`H^{-1} J^T W C W J H^{-1}`, with C
+    from the residuals' autocorrelation, widens their covariance. Dividing the log-likelihood by it is the magnitude
+    adjustment of composite likelihoods (Chandler & Bate 2007, Biometrika 94:167; Pauli, Racugno & Ventura 2011,
+    Statistica Sinica 21:149). Level and tilt of the residuals, the misfit of a fixed background, are subtracted first:
+    calibration maps share it, and `level_offset` reports it.
     """
     k, p = fit.jacobian.shape
     dof = max(k - p, 1)
@@ -451,8 +445,8 @@ def error_model(cells: FitCells, fit: LeastSquaresFit, weight: FloatArray) -> Er
     information = inverse_information(fit.jacobian, weight)
     if not np.isfinite(information).all():
         return ErrorModel(float(np.sqrt(noise_variance)), 1.0, float(dof))
-    smeared = _correlate_columns(cells, root, correlation, half)
-    inflation = float(np.trace(information @ (root.T @ smeared)) / p)
+    correlated = _correlate_columns(cells, root, correlation, half)
+    inflation = float(np.trace(information @ (root.T @ correlated)) / p)
     inflation = float(np.clip(inflation, 1.0, k / (p + MINIMUM_DOF)))
     return ErrorModel(float(np.sqrt(noise_variance)), inflation, max(dof / inflation, MINIMUM_DOF))
 
@@ -486,17 +480,17 @@ def residual_autocorrelation(grid: FloatArray, mask: FloatArray) -> tuple[FloatA
     lag_y = np.fft.fftfreq(2 * ny, 1 / (2 * ny))[:, None]
     lag_x = np.fft.fftfreq(2 * nx, 1 / (2 * nx))[None, :]
     ring = np.round(np.hypot(lag_y, lag_x)).astype(int)
-    most = max(1, min(ny, nx) // 2)
-    near = (ring <= most) & (pairs > 0)
-    total = np.bincount(ring[near], products[near], most + 1)
-    number = np.bincount(ring[near], pairs[near], most + 1)
+    largest = max(1, min(ny, nx) // 2)
+    used = (ring <= largest) & (pairs > 0)
+    total = np.bincount(ring[used], products[used], largest + 1)
+    number = np.bincount(ring[used], pairs[used], largest + 1)
     radial = total / np.maximum(number, 1)
-    radial = radial / radial[0] if radial[0] > 0 else np.eye(1, most + 1)[0]
-    quiet = np.flatnonzero(radial < 2.0 / np.sqrt(np.maximum(number / 2.0, 1.0)))
-    half = int(quiet[0]) - 1 if len(quiet) else most
+    radial = radial / radial[0] if radial[0] > 0 else np.eye(1, largest + 1)[0]
+    below_noise = np.flatnonzero(radial < 2.0 / np.sqrt(np.maximum(number / 2.0, 1.0)))
+    half = int(below_noise[0]) - 1 if len(below_noise) else largest
     axis = np.arange(-half, half + 1)
     lag = np.round(np.hypot(axis[:, None], axis[None, :])).astype(int)
-    return np.where(lag <= half, radial[np.minimum(lag, most)], 0.0), half
+    return np.where(lag <= half, radial[np.minimum(lag, largest)], 0.0), half
 
 
 def _correlate_columns(cells: FitCells, columns: FloatArray, correlation: FloatArray, half: int) -> FloatArray:
@@ -517,7 +511,7 @@ class Detection(Record):
 
     log_bayes_factor: float  #: Natural log of the evidence ratio.
     ridge: str = ""
-    """The ridge, in words, that a lump's evidence was held against; empty where it was held against noise alone."""
+    """Text of the ridge against which the lump was tested; empty where it was tested against noise alone."""
 
     @property
     def probability(self) -> float:

@@ -1,4 +1,4 @@
-"""Settings of the sampler, and draws of a bump under either noise model by the method asked for or the next one."""
+"""Settings of the sampler, and draws of a bump under either noise model by the requested method or the next one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, field, names_of, replace
 from tactile_bayes.errors import NotConvergedError, UsageError
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import END_ERROR, INDEPENDENT_DRAWS, ParameterDraws, Solved, distinct_rows
+from tactile_bayes.inference.draws import END_ERROR, INDEPENDENT_DRAWS, ParameterDraws, SolutionCache, distinct_rows
 from tactile_bayes.inference.ensemble import EnsembleOptions, ensemble
 from tactile_bayes.inference.importance import TRUSTED_SHAPE, Gaussians, ImportanceOptions, importance
 from tactile_bayes.inference.modes import LogDensity
@@ -21,7 +21,7 @@ from tactile_bayes.progress import Progress
 from tactile_bayes.size.draws import BUMP, BumpDraws
 from tactile_bayes.size.pooling import SizePriors
 
-# --- Settings as the sampler takes them, and whether they go together.
+# --- Settings of the sampler, and their check.
 
 DETECTED = 0.95
 """Evidence for a bump against smooth errors, as a probability at even odds, below which there is no estimate."""
@@ -29,34 +29,37 @@ ROTATION_ODDS = 3.0  #: Odds above which a rotated ellipse is used instead of on
 
 
 class SamplerSettings(FitSettings, kw_only=True):
-    """Settings as the sampler takes them: nothing is left open, and some are no user's to set."""
+    """Settings of the sampler: the user's with all defaults resolved, and some that users do not set."""
 
     background: Background = "fixed"
     fit_radius_mm: float = FIT_RADIUS_MM
     noise: Noise = "independent"
     start_width_mm: float | None = None
-    """About how wide the bump is, where a fit of the same place has told; None starts from `START_WIDTHS_MM`."""
+    """Width of the bump in an earlier fit of the same place; None starts from `START_WIDTHS_MM`."""
     size_priors: SizePriors = field(default_factory=SizePriors)
-    """Spread between maps and shape of the lump; only a calibration over bodies uses them."""
+    """Priors of the size: spread between maps, shape of the lump; only a calibration over bodies uses them."""
     store: Any = None  #: `ChainStore` where an ensemble keeps its state between runs, under a noise field.
     draws: int = INDEPENDENT_DRAWS
-    """Of ``laplace`` under a noise field; 400 know the ends of an interval to a tenth of an SD."""
-    step_up: bool = True  #: Under a noise field: whether the next method is tried where the one asked for fails.
+    """Number of draws by ``laplace`` under a noise field; of 400 the interval ends have an error of 0.1 SD."""
+    step_up: bool = True  #: Under a noise field: try the next method where the requested one fails.
 
     @property
-    def scene_asked(self) -> SceneName:
+    def requested_scene(self) -> SceneName:
         """The requested scene; where none is named, the rotation option decides."""
         by_rotation: dict[Rotation, SceneName] = {"on": "rotated", "off": "ellipse", "auto": "auto"}
         return by_rotation[self.rotation] if self.scene == "auto" else self.scene
 
 
 def check_options(options: SamplerSettings) -> None:
-    """Refuse options that contradict each other or do not exist."""
+    """`UsageError` for options that contradict each other."""
     if not options.correlated:
-        asked = {"a scene": options.scene not in ("auto", "none"), "an accuracy in mm": options.accuracy_mm is not None}
-        asked |= {"a checkpoint": options.store is not None}
-        for name, given in asked.items():
-            if given:
+        options_in_use = {
+            "a scene": options.scene not in ("auto", "none"),
+            "an accuracy in mm": options.accuracy_mm is not None,
+        }
+        options_in_use |= {"a checkpoint": options.store is not None}
+        for name, in_use in options_in_use.items():
+            if in_use:
                 raise UsageError(f'{name} needs correlated errors; give noise = "field" in --settings FILE.toml')
         return
     if options.store is not None and options.method != "ensemble":
@@ -103,42 +106,41 @@ class ModalBump(Record):
     sigma_y_mm: float
 
 
-# --- Posterior draws of a bump, under either noise model: by the chosen method, or by the next one where it fails.
+# --- Posterior draws of a bump under either noise model, by the requested method or the next one where it fails.
 
-LADDER: tuple[Method, ...] = ("laplace", "importance", "ensemble")
+METHOD_ORDER: tuple[Method, ...] = ("laplace", "importance", "ensemble")
 DISAGREEMENT = 5.0
 """Ends of intervals by two methods differ by more than this many of their joint Monte-Carlo errors: one is wrong."""
 START_ACCURACY_SD = 0.05
 
 
-class Sampled(Record, eq=False):
-    """Density to be sampled: the bump's parameters, with a second structure's fixed at their mode.
+class SamplingTarget(Record, eq=False):
+    """Density of the bump's parameters to be sampled, with a second structure's parameters fixed at their mode.
 
-    A rib whose crest lies outside the window shows a flank only: its place and width trade against each other along a
-    curve that no sampler follows cheaply. What that costs the bump in certainty is added as the Gaussians have it.
+    Offset and width of a rib that shows only a flank are correlated along a curve that no sampler follows cheaply; the
+    variance that they add to the bump's parameters is taken from the Gaussian approximation.
     """
 
     log_density: LogDensity  #: (m,) of (m, k) parameters of the bump.
     mean: FloatArray
     covariance: FloatArray  #: (k,), (k, k) arrays: About those of the density.
     parts: Gaussians | None = None
-    """A Gaussian for each noise field, also for those with little share of the density at the mode: under strongly
-    correlated errors the widths are less certain, so that a field with 0.3 % of the density there had 4 % of the
-    posterior, and all of its tails. None where one of them has no maximum, and under independent errors."""
+    """A Gaussian for each noise field, down to small shares of the density at the mode: a field with 0.3 % there had
+    4 % of the posterior, and all of its tails. None where one has no maximum, and under independent errors."""
     beside: FloatArray = field(default_factory=lambda: np.zeros(0))  #: (j,) array: The second structure's parameters.
     spread: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     """(k, k) array: Root of the covariance that the second structure's uncertainty adds."""
     checkpoint_key: Callable[[str, np.random.Generator], str] | None = None
-    """Hash of everything that chains of some settings and random numbers depend on; None under independent errors,
-    where chains start about the mode and are neither kept nor compared with importance draws."""
+    """Hash of all that chains depend on, from their settings and random numbers; None under independent errors, where
+    chains start about the mode and are neither stored nor compared with importance draws."""
 
-    def finished(self, draws: ParameterDraws, rng: np.random.Generator) -> ParameterDraws:
+    def with_second_structure(self, draws: ParameterDraws, rng: np.random.Generator) -> ParameterDraws:
         """Draws of the whole scene, from draws of the sampled density."""
         if not len(self.beside):
             return draws
-        # copies of a resampled point move together: each new point costs a linear solution
-        points, back = distinct_rows(draws.flat)
-        moved = (points + rng.standard_normal(points.shape) @ self.spread.T)[back]
+        # copies of a resampled point get the same shift: each new point costs a linear solution
+        distinct, index = distinct_rows(draws.flat)
+        moved = (distinct + rng.standard_normal(distinct.shape) @ self.spread.T)[index]
         return replace(draws, theta=with_beside(moved, self.beside).reshape(*draws.theta.shape[:2], -1))
 
 
@@ -147,46 +149,46 @@ def with_beside(theta: FloatArray, beside: FloatArray) -> FloatArray:
     return np.concatenate([theta, np.broadcast_to(beside, (*theta.shape[:-1], len(beside)))], axis=-1)
 
 
-class Drawable(Protocol):
+class FittedBump(Protocol):
     """A bump fitted under one noise model."""
 
     @property
     def width_sd_mm(self) -> float | None:
-        """Posterior SD of the less certain width; None where accuracies in mm are not offered."""
+        """Posterior SD of the less certain width in mm; None where `accuracy_mm` is not supported."""
 
-    def at_mode(self, method: Method, number: int, rng: np.random.Generator) -> ParameterDraws:
-        """Draw from the mode and its curvature; under a noise field `number` draws."""
+    def draw_at_mode(self, method: Method, number: int, rng: np.random.Generator) -> ParameterDraws:
+        """Draw from the Gaussian approximation at the mode; under a noise field `number` draws."""
 
-    def sampled(self, solved: Solved | None = None) -> Sampled:
-        """The density, which stores its solutions in `solved` if draws will be evaluated points."""
+    def sampling_target(self, solved: SolutionCache | None = None) -> SamplingTarget:
+        """The density to sample; it stores its solutions in `solved`, for methods whose draws are evaluated points."""
 
 
 def draw_parameters(
-    fitted: Drawable,
+    fit: FittedBump,
     options: SamplerSettings,
     *,
     rng: np.random.Generator,
     progress: Progress | None = None,
-    solved: Solved | None = None,
+    solved: SolutionCache | None = None,
 ) -> tuple[ParameterDraws, tuple[str, ...]]:
-    """Draw by the requested method, or by the next one if its diagnostics fail, with the faults of those before it.
+    """Draw by the requested method, or by the next one if its diagnostics fail; and the faults of methods that failed.
 
-    `NotConvergedError` when the last method does not converge either; its message says what was wrong with each.
+    `NotConvergedError` with all faults when the last method fails, too.
     """
     passed_over: list[str] = []
     figures: Mapping[str, float] = {}
-    accuracy = accuracy_in_sd(options, fitted.width_sd_mm)
+    accuracy = accuracy_in_sd(options, fit.width_sd_mm)
     for method in methods(options):
         try:
             if method in ("optimise", "laplace"):
-                draws = fitted.at_mode(method, options.draws, rng)
+                draws = fit.draw_at_mode(method, options.draws, rng)
             elif method == "importance":
-                density = fitted.sampled(solved)
-                draws = density.finished(importance_draws(density, rng=rng, accuracy_sd=accuracy), rng)
+                density = fit.sampling_target(solved)
+                draws = density.with_second_structure(importance_draws(density, rng=rng, accuracy_sd=accuracy), rng)
             else:
-                density = fitted.sampled()
+                density = fit.sampling_target()
                 chains = ensemble_draws(density, rng=rng, accuracy_sd=accuracy, options=options, progress=progress)
-                draws = density.finished(chains, rng)
+                draws = density.with_second_structure(chains, rng)
         except NotConvergedError as error:
             passed_over.append(f"{method}: {error}")
             figures = error.diagnostics
@@ -194,9 +196,9 @@ def draw_parameters(
         figures = draws.diagnostics
         shape = figures.get("pareto_k", 0.0)
         if shape == -np.inf or shape <= TRUSTED_SHAPE:
-            if fitted.width_sd_mm is not None:  # of the Gaussians without their bias
+            if fit.width_sd_mm is not None:  # of the Gaussians without their bias
                 error_sd = figures.get("end_error_sd", END_ERROR / float(np.sqrt(draws.effective_draws)))
-                errors = {"end_error_sd": error_sd, "end_error_mm": error_sd * fitted.width_sd_mm}
+                errors = {"end_error_sd": error_sd, "end_error_mm": error_sd * fit.width_sd_mm}
                 draws = replace(draws, diagnostics={**figures, **errors})
             return draws, tuple(passed_over)
         passed_over.append(f"{method}: Pareto shape {shape:.2f} (trusted up to {TRUSTED_SHAPE:g})")
@@ -204,9 +206,9 @@ def draw_parameters(
 
 
 def methods(options: SamplerSettings) -> Sequence[Method]:
-    """The requested method, and the next one where a step up is allowed: who wants a quick one does not wait minutes
-    for chains. Under independent errors only weights that cannot be trusted have a next one: chains need none."""
-    ladder = LADDER if options.correlated else LADDER[1:]
+    """The requested method, and the next of `METHOD_ORDER` where `step_up` allows it; not two further, for chains take
+    minutes. Under independent errors ``laplace`` has no next method, and ``importance`` always has."""
+    ladder = METHOD_ORDER if options.correlated else METHOD_ORDER[1:]
     if options.method not in ladder:
         return (options.method,)
     first = ladder.index(options.method)
@@ -214,29 +216,31 @@ def methods(options: SamplerSettings) -> Sequence[Method]:
 
 
 def accuracy_in_sd(options: SamplerSettings, width_sd_mm: float | None) -> float | None:
-    """Requested accuracy in posterior SDs of the widths; the finer of SD and mm counts."""
+    """Requested accuracy in posterior SDs of the widths: the finer of `accuracy_sd` and `accuracy_mm`."""
     if options.accuracy_mm is None or width_sd_mm is None:
         return options.accuracy_sd
     return min(max(options.accuracy_mm / width_sd_mm, 1e-3), options.accuracy_sd or 0.5)
 
 
-def importance_draws(density: Sampled, *, rng: np.random.Generator, accuracy_sd: float | None = None) -> ParameterDraws:
-    """Draw by importance sampling from the Gaussians' common mean and covariance, or from each of them."""
+def importance_draws(
+    density: SamplingTarget, *, rng: np.random.Generator, accuracy_sd: float | None = None
+) -> ParameterDraws:
+    """Draw by importance sampling, with one Gaussian or one for each noise field as proposal."""
     options = ImportanceOptions() if accuracy_sd is None else ImportanceOptions(accuracy_sd)
     about = density.log_density, density.mean, density.covariance
     return importance(*about, rng=rng, options=options, parts=density.parts)
 
 
 def ensemble_draws(
-    density: Sampled,
+    density: SamplingTarget,
     *,
     rng: np.random.Generator,
     options: SamplerSettings,
     accuracy_sd: float | None = None,
     progress: Progress | None = None,
 ) -> ParameterDraws:
-    """Draw by MCMC, under a noise field starting from importance draws; `NotConvergedError` when chains do not agree
-    with each other, or not with those."""
+    """Draw by MCMC; under a noise field the chains start from importance draws, where these converge.
+    `NotConvergedError` when chains disagree with each other or with those draws."""
     settings = EnsembleOptions()
     if options.max_steps is not None:
         settings = replace(settings, max_steps=options.max_steps)
@@ -274,7 +278,7 @@ def ensemble_draws(
 def disagreement(chains: ParameterDraws, weighted: ParameterDraws) -> float:
     """Largest difference of the ends of 95 % intervals over the parameters, in joint Monte-Carlo errors."""
     sd = weighted.flat.std(axis=0)
-    one, other = (np.quantile(draws.flat, [0.025, 0.975], axis=0) for draws in (chains, weighted))
-    mine = END_ERROR / np.sqrt(min(chains.diagnostics["ess_tail"], chains.diagnostics["ess_bulk"]))
-    theirs = weighted.diagnostics["end_error_sd"]
-    return float((np.abs(one - other) / sd).max() / np.hypot(mine, theirs))
+    chain_ends, weighted_ends = (np.quantile(draws.flat, [0.025, 0.975], axis=0) for draws in (chains, weighted))
+    chain_error = END_ERROR / np.sqrt(min(chains.diagnostics["ess_tail"], chains.diagnostics["ess_bulk"]))
+    weighted_error = weighted.diagnostics["end_error_sd"]
+    return float((np.abs(chain_ends - weighted_ends) / sd).max() / np.hypot(chain_error, weighted_error))

@@ -17,10 +17,10 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plausibility import map_findings
 from tactile_bayes.posterior import verdict, white
 from tactile_bayes.posterior.bump import Detection, levelled, window_cells
-from tactile_bayes.posterior.correlated import Correlated
+from tactile_bayes.posterior.correlated import CorrelatedAssessment
 from tactile_bayes.posterior.draw import DETECTED, ROTATION_ODDS, ModalBump, SamplerSettings, check_options
 from tactile_bayes.posterior.result import Estimate, prior_sensitivity
-from tactile_bayes.posterior.white import BumpFit, Candidate, MapDraws, White
+from tactile_bayes.posterior.white import BumpFit, Candidate, MapDraws, WhiteAssessment
 from tactile_bayes.presets import CELL_PER_SIGMA, INTERVAL
 from tactile_bayes.progress import Progress
 from tactile_bayes.scans import DEFAULT_HEAD, HeadShape
@@ -28,179 +28,181 @@ from tactile_bayes.size import terms
 from tactile_bayes.size.draws import BUMP, EXTREMES, SIZES
 from tactile_bayes.size.pooling import Calibration, draw_sizes
 
-# --- Search for the lump: candidate places, highest first, each fitted and assessed.
-#
-# Both noise models have the same way: assess a place on a map, then draw from its posterior.
+# --- Search for the lump: candidate places, highest first, each fitted and assessed under either noise model.
 
-Assessment = White | Correlated
+Assessment = WhiteAssessment | CorrelatedAssessment
 
 
 def assess(tactile_map: TactileMap, fit: BumpFit, options: SamplerSettings) -> Assessment:
     """Assess whether there is a lump at a fitted place, under the noise model of the options."""
     if options.correlated:
-        return Correlated.of(tactile_map, fit, options)
-    return White(tactile_map, fit, white.detect(tactile_map, fit))
+        return CorrelatedAssessment.of(tactile_map, fit, options)
+    return WhiteAssessment(tactile_map, fit, white.detect(tactile_map, fit))
 
 
-MOST_LOOKS = 3  #: Places that are no lump by the evidence before the search ends: each look is a chance to be wrong.
+MOST_WITHOUT_EVIDENCE = 3
+"""Places without evidence of a lump after which the search ends: each further test may give a false lump."""
 
 
 def search(tactile_map: TactileMap, options: SamplerSettings) -> tuple[tuple[Candidate, ...], Assessment | None]:
-    """All candidates looked at, and the assessment of the last: the highest bump that is a lump by the evidence, or the
-    first where none is; None where none can be a lump."""
-    tried: list[Candidate] = []
+    """All candidates tried, and the assessment of the last: the highest bump with the evidence of a lump, or the first
+    assessed where none has it; None where none can be a lump."""
+    candidates: list[Candidate] = []
     first: tuple[Candidate, Assessment] | None = None
-    looks, settings = 0, _search_options(tactile_map, options)
-    found_on = levelled(tactile_map) if options.correlated else tactile_map
-    for place in white.fitted_candidates(found_on, settings):
+    n_without_evidence, settings = 0, _search_options(tactile_map, options)
+    search_map = levelled(tactile_map) if options.correlated else tactile_map
+    for place in white.fitted_candidates(search_map, settings):
         candidate = place
-        if found_on is not tactile_map and place.fit is not None:
-            candidate = replace(place, fit=_with_cells_of(tactile_map, place.fit, settings))
-        tried.append(candidate)
+        if search_map is not tactile_map and place.fit is not None:
+            candidate = replace(place, fit=_with_window_cells(tactile_map, place.fit, settings))
+        candidates.append(candidate)
         if candidate.fault or candidate.fit is None:
             continue
-        seen = assess(tactile_map, candidate.fit, options)
-        detection = seen.detection
-        if seen.fault:
-            tried[-1] = replace(candidate, fault=seen.fault, detection=detection, assessed=seen.bump())
+        assessment = assess(tactile_map, candidate.fit, options)
+        detection = assessment.detection
+        if assessment.fault:
+            candidates[-1] = replace(candidate, fault=assessment.fault, detection=detection, assessed=assessment.bump())
             continue
         if detection.probability >= DETECTED:
-            return tuple(tried), seen
-        first, looks = first or (candidate, seen), looks + 1
-        if looks == MOST_LOOKS:
+            return tuple(candidates), assessment
+        first, n_without_evidence = first or (candidate, assessment), n_without_evidence + 1
+        if n_without_evidence == MOST_WITHOUT_EVIDENCE:
             break
-        rather = f": rather {detection.ridge}" if detection.ridge else ""
-        tried[-1] = replace(candidate, fault=f"{verdict.NO_EVIDENCE}{rather}")
-    if options.correlated and (close := _close_search(tactile_map, tried, options)) is not None:
+        ridge = f": rather {detection.ridge}" if detection.ridge else ""
+        candidates[-1] = replace(candidate, fault=f"{verdict.NO_EVIDENCE}{ridge}")
+    if options.correlated and (close := _search_in_small_windows(tactile_map, candidates, options)) is not None:
         return close
     if first is None:
-        return tuple(tried), None
-    return (*(one for one in tried if one.centre_mm != first[0].centre_mm), first[0]), first[1]
+        return tuple(candidates), None
+    return (*(one for one in candidates if one.centre_mm != first[0].centre_mm), first[0]), first[1]
 
 
-def _with_cells_of(tactile_map: TactileMap, fit: BumpFit, settings: SamplerSettings) -> BumpFit:
-    """The fit with the map's own cells in the whole window: under a noise field least squares is only a start."""
+def _with_window_cells(tactile_map: TactileMap, fit: BumpFit, settings: SamplerSettings) -> BumpFit:
+    """The fit with the cells of its whole window from the map itself, which a noise field needs."""
     return replace(fit, cells=window_cells(tactile_map, fit.centre_mm, radius_mm=settings.fit_radius_mm))
 
 
-def _close_search(
-    tactile_map: TactileMap, tried: list[Candidate], options: SamplerSettings
+def _search_in_small_windows(
+    tactile_map: TactileMap, candidates: list[Candidate], options: SamplerSettings
 ) -> tuple[tuple[Candidate, ...], Assessment] | None:
-    """Search again close to the highest places from which the fit moved away, as beside a rib; None without a lump."""
-    looks, settings, found_on = 0, _search_options(tactile_map, options), levelled(tactile_map)
-    for i, candidate in enumerate(tried):
+    """Search again, in small windows, at the highest places from which a fit moved away, as beside a rib; None without
+    a lump."""
+    n_without_evidence, settings, search_map = 0, _search_options(tactile_map, options), levelled(tactile_map)
+    for i, candidate in enumerate(candidates):
         if candidate.fit is not None and not candidate.fault.startswith(white.OUTGROWN):
             continue
-        fit, fault = white.fit_close(found_on, candidate.centre_mm, options=settings)
+        fit, fault = white.fit_in_small_window(search_map, candidate.centre_mm, options=settings)
         if fit is None or fault:
             continue
-        seen = assess(tactile_map, _with_cells_of(tactile_map, fit, settings), options)
-        tried[i] = replace(candidate, detection=seen.detection)
-        if seen.scene is None or seen.fault:
+        assessment = assess(tactile_map, _with_window_cells(tactile_map, fit, settings), options)
+        candidates[i] = replace(candidate, detection=assessment.detection)
+        if assessment.scene is None or assessment.fault:
             continue
-        if seen.detection.probability >= DETECTED:
-            return (*tried[:i], *tried[i + 1 :], replace(candidate, fit=seen.fit, fault="")), seen
-        looks += 1
-        if looks == MOST_LOOKS:
+        if assessment.detection.probability >= DETECTED:
+            return (*candidates[:i], *candidates[i + 1 :], replace(candidate, fit=assessment.fit, fault="")), assessment
+        n_without_evidence += 1
+        if n_without_evidence == MOST_WITHOUT_EVIDENCE:
             break
     return None
 
 
-def best_chance(
+def likeliest_lump(
     tactile_map: TactileMap, candidates: Sequence[Candidate], options: SamplerSettings
-) -> verdict.Weighed | None:
+) -> verdict.WeighedRise | None:
     """The most probable lump among rises that cannot be measured; None where none can be assessed.
 
-    Those that the search has weighed count. Where they are fewer than `MOST_LOOKS` the highest others are weighed too.
+    Those that the search has assessed, and up to `MOST_WITHOUT_EVIDENCE` in all the highest others.
     """
-    weighed: list[verdict.Weighed] = []
+    weighed: list[verdict.WeighedRise] = []
     settings = _search_options(tactile_map, options)
     for candidate in sorted(candidates, key=lambda one: one.detection is None):
-        if candidate.detection is None and len(weighed) >= MOST_LOOKS:
+        if candidate.detection is None and len(weighed) >= MOST_WITHOUT_EVIDENCE:
             break
         fit, bump, detection = candidate.fit, candidate.bump, candidate.detection
         if detection is None:
             if fit is None or candidate.fault.startswith(white.OUTGROWN):  # the bump close by
-                fit, _ = white.fit_close(levelled(tactile_map), candidate.centre_mm, options=settings)
+                fit, _ = white.fit_in_small_window(levelled(tactile_map), candidate.centre_mm, options=settings)
             if fit is None or min(fit.widths()[:2]) < white.LEAST_WIDTH_IN_CELLS * fit.cells.cell_mm:
                 continue  # a fit to a single cell says nothing of a lump
             bump = fit.modal()
-            detection = assess(tactile_map, _with_cells_of(tactile_map, fit, settings), options).detection
+            detection = assess(tactile_map, _with_window_cells(tactile_map, fit, settings), options).detection
         if bump is not None:
             weighed.append(verdict.weigh(tactile_map, detection, bump, candidate))
     return max(weighed, key=lambda one: (one.probability, one.detection.log_bayes_factor), default=None)
 
 
-def _search_options(tactile_map: TactileMap, fit: SamplerSettings) -> SamplerSettings:
-    """Options of the least-squares search, which under a noise field only finds the place: there the known level holds
-    it better than a free one, which a rib at the window's rim can lift."""
-    known = fit.correlated and tactile_map.background is not None
-    return replace(fit, background="fixed") if known else fit
+def _search_options(tactile_map: TactileMap, options: SamplerSettings) -> SamplerSettings:
+    """Options of the least-squares search. Under a noise field it only finds the place, for which a known level is
+    better than a free one: a rib at the window's rim may lift that."""
+    known = options.correlated and tactile_map.background is not None
+    return replace(options, background="fixed") if known else options
 
 
-# --- Posterior draws of a map and its size, refined until the size interval is as exact as requested.
+# --- Posterior draws of a map and its size, refined until the size interval is as accurate as requested.
 
 DEFAULT_ACCURACY_SD = {"importance": 0.02, "ensemble": 0.1}
-"""Accuracy of interval ends of sizes, where none is given; the methods have the same for the widths."""
+"""Default accuracy of the interval ends of sizes, as the methods have it for the widths."""
 MOST_REFINEMENTS, SAFETY, LEAST_ACCURACY_SD = 3, 0.8, 1e-3
 
 
-class Work(Record, eq=False):
-    """What an estimate is made of."""
+class EstimationTask(Record, eq=False):
+    """Map, calibration, options and random numbers of one estimate."""
 
     tactile_map: TactileMap
     calibration: Calibration | None
     options: SamplerSettings
     rng: np.random.Generator
-    progress: Progress | None = None  #: Called with effective draws done and wanted.
+    progress: Progress | None = None  #: Called with the effective draws so far and those required.
 
 
-def draw_until_accurate(work: Work, seen: Assessment) -> MapDraws:
+def draw_until_accurate(task: EstimationTask, assessment: Assessment) -> MapDraws:
     """Draw until the size interval is as accurate as requested.
 
-    The method stops when the widths are exact enough, which mostly makes the size so too. Where a method cannot draw
-    more finely the last draws stand, with their error.
+    The method stops when the widths are accurate enough, which mostly is enough for the size. Where a method does not
+    converge at a finer accuracy the last draws stand.
     """
-    sized = draw_with_size(work, seen)
+    result = draw_with_size(task, assessment)
     for _ in range(MOST_REFINEMENTS):
-        finer = _finer(sized, work.options)
+        finer = _next_accuracy(result, task.options)
         if finer is None:
             break
-        work = replace(work, options=replace(work.options, accuracy_sd=finer))
+        task = replace(task, options=replace(task.options, accuracy_sd=finer))
         try:
-            sized = draw_with_size(work, seen)
+            result = draw_with_size(task, assessment)
         except NotConvergedError:
             break
-    return sized
+    return result
 
 
-def _finer(sized: MapDraws, options: SamplerSettings) -> float | None:
+def _next_accuracy(result: MapDraws, options: SamplerSettings) -> float | None:
     """Accuracy in SDs for the next draws; None where the size is accurate enough, or no accuracy is requested."""
-    wanted = options.accuracy_sd or DEFAULT_ACCURACY_SD.get(sized.draws.method)
-    if sized.size is None or wanted is None:
+    target = options.accuracy_sd or DEFAULT_ACCURACY_SD.get(result.draws.method)
+    if result.size is None or target is None:
         return None
-    ends = [sized.size.summarise(name, probability=INTERVAL) for name in EXTREMES]
-    short = min(wanted * one.sd / one.mc_error for one in ends)
+    extremes = [result.size.summarise(name, probability=INTERVAL) for name in EXTREMES]
+    ratio = min(target * one.sd / one.mc_error for one in extremes)
     if options.accuracy_mm is not None:
-        short = min(short, *(options.accuracy_mm / one.mc_error for one in ends))
-    return None if short >= 1.0 else max(SAFETY * short * wanted, LEAST_ACCURACY_SD)
+        ratio = min(ratio, *(options.accuracy_mm / one.mc_error for one in extremes))
+    return None if ratio >= 1.0 else max(SAFETY * ratio * target, LEAST_ACCURACY_SD)
 
 
-def draw_with_size(work: Work, seen: Assessment) -> MapDraws:
-    """Draw once, and size the draws where the calibration reaches so far."""
-    options, cell_mm = work.options, work.tactile_map.recipe.cell_mm
-    made = seen.draw(options, rng=work.rng, progress=work.progress)
-    posterior, calibration = made.posterior, work.calibration
+def draw_with_size(task: EstimationTask, assessment: Assessment) -> MapDraws:
+    """Draw once, and draw sizes where the bump lies within the calibration's range."""
+    options, cell_mm = task.options, task.tactile_map.recipe.cell_mm
+    result = assessment.draw(options, rng=task.rng, progress=task.progress)
+    posterior, calibration = result.posterior, task.calibration
     fault = verdict.shape_fault(posterior.sigma_x_mm, posterior.sigma_y_mm, cell_mm=cell_mm, prior=options.prior)
     if calibration is None:
-        return replace(made, fault=fault)
+        return replace(result, fault=fault)
     calibration = calibration.at_depth_or_fallback(*posterior.medians)
-    if fault is None and (far := calibration.outside(*posterior.medians, far=True)):
-        fault = terms.extrapolated(far)
-    made = replace(made, calibration=calibration, fault=fault)
+    if fault is None and (reasons := calibration.outside(*posterior.medians, far=True)):
+        fault = terms.extrapolated(reasons)
+    result = replace(result, calibration=calibration, fault=fault)
     if fault is not None:
-        return made
-    return replace(made, size=draw_sizes(posterior, calibration=calibration, priors=options.size_priors, rng=work.rng))
+        return result
+    return replace(
+        result, size=draw_sizes(posterior, calibration=calibration, priors=options.size_priors, rng=task.rng)
+    )
 
 
 # --- The answer for one map: a size, widths, or the reason for neither.
@@ -208,17 +210,17 @@ def draw_with_size(work: Work, seen: Assessment) -> MapDraws:
 MOST_INVALID = 0.05
 LONGER = "give --method ensemble, with a larger max_steps in --settings FILE.toml"
 OTHER_METHOD_ON_PAPER = "have the size estimated again by the slower method"
+#: How to make a calibration for another head.
 OTHER_HEAD = (
     "learn one for this head: `tactile-bayes population --head HEAD.json -o population.csv`, then `tactile-bayes "
     "calibrate size population.csv --form eq6-residual -o size.json`, and give --size-calibration size.json"
 )
-"""How to make a calibration for another head."""
 _IRREGULAR = finding(
     "irregular",
     "irregular outline, unlike a ball's or an ellipsoid's: two lumps that touch, or an upright, tilted or rough one "
     "look so, and the interval is wider",
 )
-_NEAR_LEVEL = 0.02  #: An offset of the background of this size and more is mentioned.
+_NEAR_LEVEL = 0.02  #: Offset of the background, as a share, from which it is reported.
 
 
 def estimate_map(
@@ -237,109 +239,110 @@ def estimate_map(
     white.check_background(tactile_map, options)
     check_options(options)
     if calibration is not None:
-        differs = recipe_differences(tactile_map, calibration, options)
-        if differs:
+        differences = recipe_differences(tactile_map, calibration, options)
+        if differences:
             raise BadDataError(
-                f"the size calibration was learned by another recipe: {'; '.join(differs)}",
-                way_out=_way_to(calibration.recipe, tactile_map),
+                f"the size calibration was learned by another recipe: {'; '.join(differences)}",
+                way_out=_remedy_for_recipe(calibration.recipe, tactile_map),
             )
         calibration = calibration_for(tactile_map, calibration)
-    estimate = _answer(Work(tactile_map, calibration, options, rng, progress))
-    if estimate.code in NO_LUMP and options.scene != "none" and (why := verdict.no_verdict(tactile_map)) is not None:
-        estimate = _none(why, estimate.candidates)
+    estimate = _estimate_of_map(EstimationTask(tactile_map, calibration, options, rng, progress))
+    if estimate.code in NO_LUMP and options.scene != "none" and (reason := verdict.no_verdict(tactile_map)) is not None:
+        estimate = _no_estimate(reason, estimate.candidates)
     of_map = (*map_findings(tactile_map), *tactile_map.findings)
     return replace(estimate, findings=by_severity((*of_map, *estimate.findings)))
 
 
-def _answer(work: Work) -> Estimate:
-    """The lump's size, or why there is none."""
-    tactile_map, options = work.tactile_map, work.options
+def _estimate_of_map(task: EstimationTask) -> Estimate:
+    """Estimate of the lump's size, or the reason why there is none."""
+    tactile_map, options = task.tactile_map, task.options
     if not tactile_map.covered.any():
-        return _none(Abstention("empty", "the map has no covered cell"))
-    where = verdict.searched(tactile_map, options.centre_mm)
-    candidates, seen = search(tactile_map, options)
+        return _no_estimate(Abstention("empty", "the map has no covered cell"))
+    where = verdict.searched_area(tactile_map, options.centre_mm)
+    candidates, assessment = search(tactile_map, options)
     if not candidates:
         reason = f"no lump found {where}: nothing rises above the background"
-        return _none(Abstention("empty", reason, verdict.FEEL_AGAIN, verdict.FEEL_AGAIN_ON_PAPER))
-    if seen is None:
-        likeliest = best_chance(tactile_map, candidates, options)
-        why = verdict.no_bump(tactile_map, candidates, likeliest, where=where)
+        return _no_estimate(Abstention("empty", reason, verdict.FEEL_AGAIN, verdict.FEEL_AGAIN_ON_PAPER))
+    if assessment is None:
+        likeliest = likeliest_lump(tactile_map, candidates, options)
+        why = verdict.no_bump_reason(tactile_map, candidates, likeliest, where=where)
         if likeliest is None:
-            return _none(why, candidates)
+            return _no_estimate(why, candidates)
         fit, detection = None if likeliest.candidate is None else likeliest.candidate.fit, likeliest.detection
         lump = detection.probability >= DETECTED and why.code not in NO_LUMP
-        estimate = _none(why, candidates, detection, fit.modal() if lump and fit is not None else None)
+        estimate = _no_estimate(why, candidates, detection, fit.modal() if lump and fit is not None else None)
         return replace(estimate, weighed=likeliest)
-    # by the bump's mode where it is a lump by the evidence, else by least squares
-    bump = seen.bump() if seen.detection.probability >= DETECTED else seen.fit.modal()
-    weighed = verdict.weigh(tactile_map, seen.detection, bump)
-    if seen.detection.probability < DETECTED or weighed.probability < verdict.LIKELY:
-        estimate = _none(verdict.undetected(weighed, where=where), candidates, seen.detection)
+    # the bump at the mode where the evidence is for a lump, else that of least squares
+    bump = assessment.bump() if assessment.detection.probability >= DETECTED else assessment.fit.modal()
+    weighed = verdict.weigh(tactile_map, assessment.detection, bump)
+    if assessment.detection.probability < DETECTED or weighed.probability < verdict.LIKELY:
+        estimate = _no_estimate(verdict.undetected_reason(weighed, where=where), candidates, assessment.detection)
     elif options.scene == "none":
-        estimate = _none(Abstention("undetected", "no lump was assumed"), candidates, seen.detection)
+        estimate = _no_estimate(Abstention("undetected", "no lump was assumed"), candidates, assessment.detection)
     else:
-        estimate = _measured(work, seen, candidates)
+        estimate = _estimate_of_lump(task, assessment, candidates)
     if estimate.code == "ridge" and not estimate.reason.startswith("no lump found"):
         estimate = replace(estimate, reason=f"no lump found {where}: {estimate.reason}")
-    return replace(estimate, weighed=verdict.weigh(tactile_map, estimate.detection or seen.detection, bump))
+    return replace(estimate, weighed=verdict.weigh(tactile_map, estimate.detection or assessment.detection, bump))
 
 
-def _measured(work: Work, seen: Assessment, candidates: tuple[Candidate, ...]) -> Estimate:
-    """Draw a lump that is one by the evidence, and size it; or the reason why not."""
-    options, cell_mm = work.options, work.tactile_map.recipe.cell_mm
-    detection, bump = seen.detection, seen.bump()
+def _estimate_of_lump(task: EstimationTask, assessment: Assessment, candidates: tuple[Candidate, ...]) -> Estimate:
+    """Estimate with draws and size of a lump with the evidence for one, or the reason for no size."""
+    options, cell_mm = task.options, task.tactile_map.recipe.cell_mm
+    detection, bump = assessment.detection, assessment.bump()
     hopeless = verdict.width_fault(bump.sigma_x_mm, bump.sigma_y_mm, cell_mm=cell_mm, margin=verdict.HOPELESS)
     if hopeless is not None:
-        return _none(hopeless, candidates, detection, bump)
+        return _no_estimate(hopeless, candidates, detection, bump)
     try:
-        made = draw_until_accurate(work, seen)
+        result = draw_until_accurate(task, assessment)
     except NotConvergedError as error:
         why = Abstention("method", f"no method converged: {error}", LONGER, OTHER_METHOD_ON_PAPER)
         if error.advice:
             why = Abstention("method", str(error), error.advice, "have the size estimated again without this neighbour")
         elif options.method == "ensemble" or not options.correlated:
             raise
-        return _none(why, candidates, detection, bump)
-    detection, posterior, size, fault = made.detection, made.posterior, made.size, made.fault
-    diagnostics = _diagnostics(made)
+        return _no_estimate(why, candidates, detection, bump)
+    detection, posterior, size, fault = result.detection, result.posterior, result.size, result.fault
+    diagnostics = _diagnostics(result)
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
         reason = f"no positive size in {size.invalid} of {size.d_x_mm.size} draws: outside the calibration"
         advice = "learn a calibration whose table holds such lumps"
         fault = Abstention("extrapolated", reason, advice, terms.UNLIKE_ON_PAPER)
     if fault is not None:
-        return _none(fault, candidates, detection, bump, diagnostics if fault.code == "extrapolated" else {})
-    drawn = {"sigma_x_mm": posterior.sigma_x_mm, "sigma_y_mm": posterior.sigma_y_mm}
-    drawn |= {} if size is None else {"max_size_mm": size.max_size_mm}
+        return _no_estimate(fault, candidates, detection, bump, diagnostics if fault.code == "extrapolated" else {})
+    quantities = {"sigma_x_mm": posterior.sigma_x_mm, "sigma_y_mm": posterior.sigma_y_mm}
+    quantities |= {} if size is None else {"max_size_mm": size.max_size_mm}
     return Estimate(
         "estimate",
-        "" if made.calibration is not None else "no size calibration was given: widths only",
+        "" if result.calibration is not None else "no size calibration was given: widths only",
         detection=detection,
-        fit=made.fit,
-        draws=made.draws,
+        fit=result.fit,
+        draws=result.draws,
         map_posterior=posterior,
         size=size,
         candidates=candidates,
         diagnostics=diagnostics,
-        left_out=_left_out(work.tactile_map, options, made),
-        scene=seen.scene,
-        sensitivity=prior_sensitivity(posterior.sigma_x_mm, posterior.sigma_y_mm, drawn, options.prior),
+        left_out=_omissions(task.tactile_map, options, result),
+        scene=assessment.scene,
+        sensitivity=prior_sensitivity(posterior.sigma_x_mm, posterior.sigma_y_mm, quantities, options.prior),
         bump=bump,
-        findings=tuple(_findings(made, cell_mm=cell_mm)),
+        findings=tuple(_findings(result, cell_mm=cell_mm)),
     )
 
 
-def _none(
-    why: Abstention,
+def _no_estimate(
+    reason: Abstention,
     candidates: tuple[Candidate, ...] = (),
     detection: Detection | None = None,
     bump: ModalBump | None = None,
     diagnostics: Mapping[str, Any] = MappingProxyType({}),
 ) -> Estimate:
-    told = asdict(why)
-    if why.code in NO_LUMP and bump is not None:
-        told["about_mm"], bump = (bump.x_mm, bump.y_mm), None
-    told |= {"detection": detection, "bump": bump, "candidates": candidates, "diagnostics": diagnostics}
-    return Estimate("no_estimate", **told)
+    """Answer without an estimate; the centre of a bump that is no lump becomes `about_mm`."""
+    answer = asdict(reason)
+    if reason.code in NO_LUMP and bump is not None:
+        answer["about_mm"], bump = (bump.x_mm, bump.y_mm), None
+    answer |= {"detection": detection, "bump": bump, "candidates": candidates, "diagnostics": diagnostics}
+    return Estimate("no_estimate", **answer)
 
 
 def calibration_for(tactile_map: TactileMap, calibration: Calibration) -> Calibration:
@@ -347,15 +350,15 @@ def calibration_for(tactile_map: TactileMap, calibration: Calibration) -> Calibr
     return calibration.at_fat([terms.head_profile(tactile_map.quality)])
 
 
-def recipe_differences(tactile_map: TactileMap, calibration: Calibration, fit: SamplerSettings) -> list[str]:
+def recipe_differences(tactile_map: TactileMap, calibration: Calibration, options: SamplerSettings) -> list[str]:
     """Differences of a map and its fit options from the calibration's recipe, in words; empty without any."""
     ours, made = calibration.recipe, tactile_map.recipe
     theirs = replace(
         ours,
         normalise=made.normalise,
-        background=fit.background,
-        radius_mm=fit.fit_radius_mm,
-        noise=fit.noise,
+        background=options.background,
+        radius_mm=options.fit_radius_mm,
+        noise=options.noise,
         flat_field=made.flat_field_known,
         head=tactile_map.head,
     )
@@ -368,40 +371,41 @@ def way_to_head(head: HeadShape | None) -> str:
     return f"give --size-calibration solid or eq6, which are for this head; or {OTHER_HEAD}" if shipped else OTHER_HEAD
 
 
-def _way_to(recipe: terms.Recipe, tactile_map: TactileMap) -> str:
+def _remedy_for_recipe(recipe: terms.Recipe, tactile_map: TactileMap) -> str:
     """Command that makes a map fit a calibration: its map command where the map differs, else the fit's options."""
     if recipe.head_differences(tactile_map.head):
         return way_to_head(tactile_map.head)
-    made = (tactile_map.recipe.normalise, tactile_map.recipe.flat_field_known)
-    wanted = (recipe.normalise, made[1] if recipe.flat_field is None else recipe.flat_field)
-    if made[0] != wanted[0] or (made[1] is not None and made[1] != wanted[1]):
+    map_recipe = (tactile_map.recipe.normalise, tactile_map.recipe.flat_field_known)
+    required = (recipe.normalise, map_recipe[1] if recipe.flat_field is None else recipe.flat_field)
+    if map_recipe[0] != required[0] or (map_recipe[1] is not None and map_recipe[1] != required[1]):
         return (
             f"make the map again with {recipe.map_command}, or give --size-calibration solid or eq6 for a default map"
         )
     return "leave the fit's options to the calibration, or learn a calibration for these"
 
 
-def _diagnostics(made: MapDraws) -> dict[str, Any]:
+def _diagnostics(result: MapDraws) -> dict[str, Any]:
+    """Figures of fit, noise and method; of chains also the convergence of each quantity."""
     figures = {
-        "cells": len(made.fit.cells),
-        "covered_share": made.fit.covered_share,
-        "fat_mm": None if made.calibration is None else made.calibration.fat_mm,
-        **made.draws.diagnostics,
-        **made.figures,
-        "method": made.draws.method,
+        "cells": len(result.fit.cells),
+        "covered_share": result.fit.covered_share,
+        "fat_mm": None if result.calibration is None else result.calibration.fat_mm,
+        **result.draws.diagnostics,
+        **result.figures,
+        "method": result.draws.method,
     }
-    if made.draws.method != "ensemble":
+    if result.draws.method != "ensemble":
         return figures
-    drawn = {name: getattr(made.posterior, name) for name in BUMP[:3]}
-    drawn = {name: getattr(made.size, name) for name in SIZES if made.size is not None} | drawn
-    return figures | {"convergence": {name: convergence(values) for name, values in drawn.items()}}
+    quantities = {name: getattr(result.posterior, name) for name in BUMP[:3]}
+    quantities = {name: getattr(result.size, name) for name in SIZES if result.size is not None} | quantities
+    return figures | {"convergence": {name: convergence(values) for name, values in quantities.items()}}
 
 
-def _findings(made: MapDraws, *, cell_mm: float) -> Iterator[Finding]:
-    """Findings against the size of a lump, besides those against its map."""
-    posterior, calibration = made.posterior, made.calibration
+def _findings(result: MapDraws, *, cell_mm: float) -> Iterator[Finding]:
+    """Cautions and checks on the size of a lump, besides those on its map."""
+    posterior, calibration = result.posterior, result.calibration
     if calibration is not None:
-        beyond = [] if made.size is None else calibration.beyond_lumps(made.size.median_mm)
+        beyond = [] if result.size is None else calibration.beyond_lumps(result.size.median_mm)
         for text in (*calibration.outside(*posterior.medians), *beyond):
             yield finding("outside_calibration", f"{terms.UNLIKE_LEARNED}: {text}")
     if posterior.irregular:
@@ -410,7 +414,7 @@ def _findings(made: MapDraws, *, cell_mm: float) -> Iterator[Finding]:
         text = f"the map's cells of {cell_mm:g} mm are coarse for so small a lump"
         remedy, on_paper = "map again with a smaller --cell-mm", "have the scan mapped again with smaller cells"
         yield finding("coarse_cells", text, remedy, on_paper)
-    offset = made.figures.get("level_offset")
+    offset = result.figures.get("level_offset")
     if offset is not None and abs(offset) >= _NEAR_LEVEL:
         text = (
             f"the pressure round the lump is {100 * offset:+.1f} % off that of the rest of the map: something else "
@@ -420,8 +424,9 @@ def _findings(made: MapDraws, *, cell_mm: float) -> Iterator[Finding]:
         yield finding("uneven_level", text)
 
 
-def _left_out(tactile_map: TactileMap, options: SamplerSettings, made: MapDraws) -> tuple[str, ...]:
-    notes, noise, calibration = [], made.figures, made.calibration
+def _omissions(tactile_map: TactileMap, options: SamplerSettings, result: MapDraws) -> tuple[str, ...]:
+    """Sources of error that the estimate does not contain, in words."""
+    notes, noise, calibration = [], result.figures, result.calibration
     if tactile_map.recipe.source == "scan" and noise.get("places_share") is None:
         notes.append("tracker position error and its blur")
     odds = noise["rotation_odds"]

@@ -1,4 +1,4 @@
-"""Scenes that a fit window may hold, and the marginal posterior of their shape: all that is linear integrated out."""
+"""Scenes of a fit window, and the marginal posterior of their shape with all linear parameters integrated out."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
-from tactile_bayes.inference.draws import Solution, Solved, distinct_rows
+from tactile_bayes.inference.draws import Solution, SolutionCache, distinct_rows
 from tactile_bayes.posterior.bump import log_normal_density
 from tactile_bayes.posterior.window import (
     FieldColumns,
@@ -22,21 +22,21 @@ from tactile_bayes.posterior.window import (
     Projected,
     Templates,
     Window,
-    joined,
+    concatenated,
 )
 
 # --- Scenes: the structures that a fit window may hold, with their parameters and prior.
 #
-# Or a ridge in the bump's place: what a lump's evidence is held against where a ridge is to be feared.
+# A scene may have a ridge in the bump's place: the alternative that a lump is tested against.
 
 Shape = Literal["round", "ellipse", "rotated", "ridge"]
 Neighbour = Literal["second lump", "rib"]
 Extra = Literal[Neighbour, ""]
 REACH_IN_RADII = 1.5
-"""How far from the window's middle a second structure is looked for: beyond its rim a flank still shows."""
+"""Distance from the window's middle within which a second structure may lie: its flank shows from beyond the rim."""
 APART = 2.0
-"""A second lump lies at least this many widths from the first: closer, two Gaussians have one top. A rib may run under
-the bump if it is no more than this many times as wide: a wider one is the level's own curve."""
+"""Least distance of a second lump in widths: closer, two Gaussians have one maximum. A rib may run under the bump if it
+is at most this many times as wide: a wider one is the curvature of the level."""
 STEP = {
     "u": 0.06,
     "v": 0.06,
@@ -51,7 +51,7 @@ STEP = {
     "along": 0.08,
     "across": 0.6,
 }
-"""About one posterior standard deviation of each parameter: steps of the search for the mode."""
+"""Step of each parameter in the search for the mode: about one posterior SD."""
 
 _BUMP_NAMES: Final[Mapping[Shape, tuple[str, ...]]] = {
     "round": ("u", "x", "y"),
@@ -69,9 +69,9 @@ _NEIGHBOUR_NAMES: Final[Mapping[Extra, tuple[str, ...]]] = {
 class Scene(Record, dict=True):
     """Structures in a model.
 
-    The parameters are ``u, v, x, y`` (logs of the widths while nothing is turned, and the centre), without v for a
-    round bump, with r for a turned one; then ``x2, y2, w2`` (centre and log width of a second round lump) or
-    ``angle, offset, w2`` (a ridge). A ridge in the bump's place has ``u, along, across``: log width, angle, offset.
+    The parameters are ``u, v, x, y`` (log widths of an unrotated bump, and its centre), without v for a round bump,
+    with r for a rotated one; then ``x2, y2, w2`` (centre and log width of a second round lump) or ``angle, offset, w2``
+    (a rib). A ridge in the bump's place has ``u, along, across``: log width, angle, offset.
     """
 
     shape: Shape = "ellipse"  #: Shape of the bump.
@@ -89,12 +89,12 @@ class Scene(Record, dict=True):
         return np.array([STEP[name] for name in self.names])
 
     @cached_property
-    def own(self) -> int:
-        """Number of the bump's own parameters, which are the first."""
+    def bump_parameters(self) -> int:
+        """Number of the bump's parameters, which are the first."""
         return len(_BUMP_NAMES[self.shape])
 
     def column(self, theta: FloatArray, name: str) -> FloatArray:
-        """(...) values of one parameter of (..., p) vectors; those that the scene does not have are 0, v is u."""
+        """(...) values of one parameter of (..., p) vectors; of one that the scene lacks 0, but v is u."""
         if name in self.names:
             return np.asarray(theta[..., self.names.index(name)])
         return self.column(theta, "u") if name == "v" else np.zeros(theta.shape[:-1])
@@ -104,8 +104,8 @@ class Scene(Record, dict=True):
         u, v = self.column(theta, "u"), self.column(theta, "v")
         return (u + v) / 2.0, (u - v) / 2.0, self.column(theta, "r")
 
-    def carried(self, theta: FloatArray, other: Scene) -> FloatArray:
-        """Convert a vector to another scene: shared parameters keep their values, others are 0."""
+    def converted(self, theta: FloatArray, other: Scene) -> FloatArray:
+        """The vector of another scene: shared parameters keep their values, others are 0."""
         p, _, _ = self.widths(theta)
         values = {name: self.column(theta, name) for name in other.names}
         if other.shape == "round":
@@ -114,7 +114,7 @@ class Scene(Record, dict=True):
 
     @property
     def separable(self) -> bool:
-        """True for a scene that is only a bump along the grid's axes: the product of a profile along each."""
+        """True for a lone bump along the grid's axes, which is a product of two profiles."""
         return self.shape in ("round", "ellipse") and not self.extra
 
     def templates(self, theta: FloatArray, window: Window) -> list[Templates]:
@@ -154,7 +154,7 @@ class Scene(Record, dict=True):
         return np.where(inside, total, -np.inf)
 
     def _log_prior_beside(self, theta: FloatArray, problem: Problem) -> tuple[FloatArray, BoolArray]:
-        """Log prior of the second structure (its amplitude's is in the target), and whether its place is allowed."""
+        """Log prior of the second structure without its amplitude's, and True where its place is allowed."""
         prior, middle, radius_mm = problem.prior, problem.window.middle, problem.radius_mm
         w, reach = self.column(theta, "w2"), REACH_IN_RADII * radius_mm
         total = log_normal_density(w, np.log(prior.width_median_mm), prior.log_width_sd)
@@ -172,12 +172,12 @@ class Scene(Record, dict=True):
         return total - np.log(np.pi * reach**2), allowed
 
     def rib_apart(self, theta: FloatArray, middle: tuple[float, float]) -> BoolArray:
-        """(m,) whether a rib is clear of the bump, or at most `APART` times as wide."""
+        """(m,) True for a rib that is clear of the bump, or at most `APART` times as wide."""
         p, _, _ = self.widths(theta)
         return np.asarray(self.rib_clear(theta, middle) | (self.column(theta, "w2") - p <= np.log(APART)))
 
     def rib_clear(self, theta: FloatArray, middle: tuple[float, float]) -> BoolArray:
-        """(m,) whether a rib lies `APART` widths, of it or the bump, from the bump's centre."""
+        """(m,) True for a rib at least `APART` widths, of it or the bump, from the bump's centre."""
         angle, (p, _, _) = self.column(theta, "angle"), self.widths(theta)
         x, y = self.column(theta, "x") - middle[0], self.column(theta, "y") - middle[1]
         away = np.abs(self.column(theta, "offset") - x * np.cos(angle) - y * np.sin(angle))
@@ -185,59 +185,63 @@ class Scene(Record, dict=True):
 
 
 def neighbour_templates(
-    window: Window, extra: Neighbour, one: FloatArray, two: FloatArray, log_width: FloatArray
+    window: Window, extra: Neighbour, first: FloatArray, second: FloatArray, log_width: FloatArray
 ) -> Templates:
     """Templates of m second structures: lumps at ``x2, y2``, or ribs of ``angle, offset``, each an (m,) array."""
     if extra == "rib":
-        return window.ridges(one, two, log_width=log_width)
-    return window.bumps(one, two, p=log_width, q=np.zeros_like(log_width), r=None)
+        return window.ridges(first, second, log_width=log_width)
+    return window.bumps(first, second, p=log_width, q=np.zeros_like(log_width), r=None)
 
 
 def ridge_place(offset: FloatArray, radius_mm: float) -> tuple[BoolArray, float]:
-    """(m,) whether ridges may lie this far from the window's middle, and the volume of angles and offsets."""
+    """(m,) True for ridges that may lie this far from the window's middle, and the volume of angles and offsets."""
     reach = REACH_IN_RADII * radius_mm
     return np.abs(offset) <= reach, float(np.pi * 2.0 * reach)
 
 
 # --- Low-rank basis shared by many bumps, for fast inner products.
 #
-# Points about one mode have nearly the same bump. Along each axis their profiles are sums of about ten, told by a
-# singular value decomposition of the points' own, and every bump is a sum of products of two. What a posterior
-# needs of a bump is linear or quadratic in it: it is worked out once for the products that span, and for a point
-# only its coefficients are left.
+# Points about one mode have nearly the same bump. Along each axis their profiles are sums of about ten, by a singular
+# value decomposition, and each bump is a sum of products of two of these. The posterior needs linear and quadratic
+# forms of the bump: they are computed once for the products, and combined by each point's coefficients.
 
-DROPPED = 1e-8  #: Norm of what is dropped of all the bumps together, over that of the least of them.
-LEAST_BUMPS = 256  #: Fewer have no basis that pays.
-MOST_PRODUCTS = 200  #: More cost as much as each bump by itself.
+DROPPED = 1e-8  #: Norm of all that is dropped from the bumps together, over that of the least bump.
+LEAST_BUMPS = 256  #: For fewer bumps a basis saves no time.
+MOST_PRODUCTS = 200  #: Of more products the basis costs as much as the bumps.
 
 
-class Spanned(Record, eq=False):
+class LowRankBumps(Record, eq=False):
     """Bumps along the grid's axes in a shared basis: sums of products of two profiles."""
 
     coefficients: FloatArray  #: (m, r) array: A row per bump.
-    products: Projected  #: Inner products of the r templates that span them.
-    gram: FloatArray  #: (r, r) array: Those with each other.
+    products: Projected  #: Inner products of the r basis templates.
+    gram: FloatArray  #: (r, r) array: Inner products of the basis templates with each other.
     linear: LinearModel
 
     @classmethod
-    def of(cls, bumps: Profiles, linear: LinearModel) -> Spanned | None:
+    def of(cls, bumps: Profiles, linear: LinearModel) -> LowRankBumps | None:
         """Find the basis for products of profiles; None where it would not save time."""
         rows, columns = bumps.rows, bumps.columns
         if not (np.isfinite(rows).all() and np.isfinite(columns).all()):
             return None
-        high, wide = (np.sqrt(np.einsum("mn,mn->m", one, one)) for one in (rows, columns))
-        along, across = _basis(rows, high.min()), _basis(columns, wide.min())
+        row_norm, column_norm = (np.sqrt(np.einsum("mn,mn->m", profiles, profiles)) for profiles in (rows, columns))
+        along, across = _basis(rows, row_norm.min()), _basis(columns, column_norm.min())
         by_row, by_column = rows @ along.T, columns @ across.T
-        size = np.square(by_row).T @ np.square(by_column)
-        order = np.argsort(size, axis=None)  # what is dropped sums to `DROPPED` at most
-        kept = order[np.sqrt(np.cumsum(size.ravel()[order])) > DROPPED * (high * wide).min()]
-        i, j = np.unravel_index(kept, size.shape)
+        power = np.square(by_row).T @ np.square(by_column)
+        order = np.argsort(power, axis=None)  # what is dropped sums to `DROPPED` at most
+        kept_pairs = order[np.sqrt(np.cumsum(power.ravel()[order])) > DROPPED * (row_norm * column_norm).min()]
+        i, j = np.unravel_index(kept_pairs, power.shape)
         if not 0 < len(i) <= MOST_PRODUCTS:
             return None
         (products,), _ = linear.projected([Profiles(along[i], across[j])])
-        by_pair = [(one[:, None] * one).reshape(len(one) ** 2, -1) for one in (along, across)]
-        each = (by_pair[0] @ linear.window.weight @ by_pair[1].T).reshape(*[len(along)] * 2, *[len(across)] * 2)
-        return cls(by_row[:, i] * by_column[:, j], products, each[i[:, None], i, j[:, None], j], linear)
+        by_pair = [(profiles[:, None] * profiles).reshape(len(profiles) ** 2, -1) for profiles in (along, across)]
+        pair_gram = (by_pair[0] @ linear.window.weight @ by_pair[1].T).reshape(*[len(along)] * 2, *[len(across)] * 2)
+        return cls(
+            by_row[:, i] * by_column[:, j],
+            products,
+            pair_gram[i[:, None], i, j[:, None], j],
+            linear,
+        )
 
     def solution(self, fields: list[FieldColumns]) -> LinearSolution:
         """Solutions for the bumps under all noise fields."""
@@ -250,11 +254,11 @@ class Spanned(Record, eq=False):
             square = np.stack([np.einsum("mr,mr->m", c @ one, c) for one in power], axis=1)
             inner = Inner((c @ basis.plain.reshape(r, -1)).reshape(m, h, plain), square, np.empty((m, 0)))
             solutions.append(self.linear.solve([inner], None, columns))
-        return joined(solutions, axis=1)
+        return concatenated(solutions, axis=1)
 
 
 def _basis(profiles: FloatArray, least: float) -> FloatArray:
-    """(r, n) orthonormal profiles that span (m, n) ones."""
+    """(r, n) orthonormal basis of (m, n) profiles, but for `DROPPED`."""
     _, size, basis = np.linalg.svd(np.linalg.qr(profiles, mode="r"), full_matrices=False)
     left = np.sqrt(np.cumsum(size[::-1] ** 2)[::-1])
     return np.asarray(basis[left > DROPPED * least])
@@ -263,7 +267,7 @@ def _basis(profiles: FloatArray, least: float) -> FloatArray:
 # --- The marginal posterior of a scene under all noise fields.
 
 BLOCK = 128  #: Shapes solved at a time: fewer spend their time on calls, more leave the processor's cache.
-SPANNED = 2048  #: As many share a basis where they can, see `Spanned`.
+BASIS_BLOCK = 2048  #: Shapes that share a basis, see `LowRankBumps`.
 
 
 class CollapsedTarget:
@@ -274,10 +278,10 @@ class CollapsedTarget:
         self.linear = linear or LinearModel(problem, tilt=scene.tilt)
         self.amplitude_sd = self.linear.amplitude_sd
         self._fields: list[FieldColumns] | None = None
-        self._made_up = 0.0
+        self._left_out_evidence = 0.0
 
     def of_scene(self, scene: Scene) -> CollapsedTarget:
-        """That of another scene in the same window with the same priors; its fields are not settled."""
+        """Target of another scene in the same window with the same priors, with all fields."""
         return CollapsedTarget(self.problem, scene, self.linear if scene.tilt == self.scene.tilt else None)
 
     @property
@@ -287,40 +291,42 @@ class CollapsedTarget:
 
     @property
     def fields(self) -> list[FieldColumns]:
-        """Noise fields of the mixture by length, each with its shares; all of them until settled."""
+        """Noise fields of the mixture by length, each with its shares; all of them until some are selected."""
         if self._fields is None:
             self._fields = list(self.linear.every_field())
         return self._fields
 
-    def __call__(self, theta: FloatArray, solved: Solved | None = None) -> FloatArray:
+    def __call__(self, theta: FloatArray, solved: SolutionCache | None = None) -> FloatArray:
         """(m,) log density of (m, dimension) shape vectors, normalised up to a constant of the data.
 
-        `solved` keeps what `draw_linear` needs at these points.
+        `solved` stores the solutions that `draw_linear` needs at these points.
         """
         if solved is None:
             by_field = self.by_field(theta)
         else:
             solution = self.conditional(theta)
             solved.add(theta, solution)
-            by_field = solution[0] + self._made_up
+            by_field = solution[0] + self._left_out_evidence
         total = np.logaddexp.reduce(by_field, axis=1) + self.scene.log_prior(theta, self.problem)
         return np.where(np.isfinite(total), total, -np.inf)
 
     def by_field(self, theta: FloatArray) -> FloatArray:
         """(m, fields) log of each field's prior times its evidence, without the shape's prior."""
-        return np.concatenate([one.evidence for one in self._solutions(theta)]) + self._made_up
+        return np.concatenate([one.evidence for one in self._solutions(theta)]) + self._left_out_evidence
 
-    def settle_fields(self, theta: FloatArray) -> bool:
-        """Keep only the noise fields with evidence at one shape; True if that changed which."""
-        before = self.chosen_fields()
-        self._fields, self._made_up = self.linear.with_evidence(self.scene.templates(theta[None], self.window))
-        return before != self.chosen_fields()
+    def select_fields(self, theta: FloatArray) -> bool:
+        """Keep only the noise fields with evidence at one shape; True if others were kept before."""
+        before = self.selected_fields()
+        self._fields, self._left_out_evidence = self.linear.with_evidence(
+            self.scene.templates(theta[None], self.window)
+        )
+        return before != self.selected_fields()
 
-    def settle_lengths(self) -> None:
+    def select_lengths(self) -> None:
         """Keep only the lengths with evidence where there is no structure, each with all its shares."""
-        self._fields, self._made_up = self.linear.without_structure()[0], 0.0
+        self._fields, self._left_out_evidence = self.linear.without_structure()[0], 0.0
 
-    def chosen_fields(self) -> list[tuple[float, tuple[float, ...]]]:
+    def selected_fields(self) -> list[tuple[float, tuple[float, ...]]]:
         """Correlation lengths in the mixture, each with its shares."""
         return [(columns.field.length_mm, tuple(columns.shares)) for columns in self._fields or ()]
 
@@ -328,7 +334,7 @@ class CollapsedTarget:
         """Log evidence of level and tilt alone under all fields, on the scale of the log density."""
         return self.linear.without_structure()[1]
 
-    def field_summary(self, theta: FloatArray) -> dict[str, float]:
+    def field_figures(self, theta: FloatArray) -> dict[str, float]:
         """Evidence-weighted correlation length (mm) and share of a cell's error variance in the field, at one shape."""
         weight = self.field_weights(theta)
         length = np.concatenate([np.full(len(one.shares), one.field.length_mm) for one in self.fields])
@@ -338,22 +344,22 @@ class CollapsedTarget:
     def conditional(self, theta: FloatArray) -> Solution:
         """Solutions at (m, p) vectors under each of h fields: log of prior times evidence (m, h), and amplitudes
         (m, h, v), their power (m, h, v, v), the level's fall with each (m, h, v) and the sum of squares (m, h)."""
-        solution = joined(self._solutions(theta), axis=0)
+        solution = concatenated(self._solutions(theta), axis=0)
         return solution._replace(level_slope=solution.level_slope[..., 0])
 
     def draw_linear(
-        self, theta: FloatArray, rng: np.random.Generator, *, solved: Solved | None = None
+        self, theta: FloatArray, rng: np.random.Generator, *, solved: SolutionCache | None = None
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Draw amplitudes (m, v), level (m,) and noise scale (m,) given the shape: exact, field first."""
-        unique, back = distinct_rows(theta)
+        """Draw amplitudes (m, v), level (m,) and noise scale (m,) given the shape, exactly, after drawing the field."""
+        unique, index = distinct_rows(theta)
         evidence, centre, power, slope, squares = (solved or self.conditional)(unique)
         at_zero = np.concatenate([one.level()[:, 0] for one in self.fields])
         level_variance = np.concatenate([one.inverse[:, 0, 0] for one in self.fields])
-        h = choose(evidence[back], rng)
-        tau2 = squares[back, h] / rng.chisquare(self.dof, size=len(theta))
-        amplitude = self._draw_amplitudes(centre[back, h], power[back, h], tau2, rng)
-        about = np.sqrt(tau2 * level_variance[h]) * rng.standard_normal(len(theta))
-        level = (self.linear.mean + at_zero)[h] - np.sum(slope[back, h] * amplitude, axis=1) + about
+        h = choose_fields(evidence[index], rng)
+        tau2 = squares[index, h] / rng.chisquare(self.dof, size=len(theta))
+        amplitude = self._draw_amplitudes(centre[index, h], power[index, h], tau2, rng)
+        level_noise = np.sqrt(tau2 * level_variance[h]) * rng.standard_normal(len(theta))
+        level = (self.linear.mean + at_zero)[h] - np.sum(slope[index, h] * amplitude, axis=1) + level_noise
         return amplitude, level, np.sqrt(tau2 * self.window.variance.mean())
 
     def _draw_amplitudes(
@@ -392,18 +398,18 @@ class CollapsedTarget:
         weight = np.exp(solution.evidence[0] - np.logaddexp.reduce(solution.evidence[0]))
         return float(weight @ solution.amplitude[0, :, 0])
 
-    def products(self, one: FloatArray, other: FloatArray, theta: FloatArray) -> FloatArray:
+    def products(self, left: FloatArray, right: FloatArray, theta: FloatArray) -> FloatArray:
         """(v, w) inner products of (v, n) and (w, n) cell values under the noise field likeliest at one shape."""
-        return np.asarray(self.products_by_field(one, other)[int(np.argmax(self.by_field(theta[None])[0]))])
+        return np.asarray(self.products_by_field(left, right)[int(np.argmax(self.by_field(theta[None])[0]))])
 
-    def products_by_field(self, one: FloatArray, other: FloatArray) -> FloatArray:
+    def products_by_field(self, left: FloatArray, right: FloatArray) -> FloatArray:
         """(h, v, w) inner products of (v, n) and (w, n) cell values under each noise field."""
         window = self.window
-        low = [window.project(window.on_grid(vectors), self.linear.weighted).low for vectors in (one, other)]
-        independent, products = (one / window.variance) @ other.T, []
+        low = [window.project(window.on_grid(vectors), self.linear.weighted).low for vectors in (left, right)]
+        independent, products = (left / window.variance) @ right.T, []
         for columns in self.fields:
-            first, second = (vectors @ columns.field.turn for vectors in low)
-            products += [independent - (first * weight) @ second.T for weight in columns.weight.T]
+            low_left, low_right = (vectors @ columns.field.turn for vectors in low)
+            products += [independent - (low_left * weight) @ low_right.T for weight in columns.weight.T]
         return np.stack(products)
 
     def field_weights(self, theta: FloatArray) -> FloatArray:
@@ -412,30 +418,32 @@ class CollapsedTarget:
         return np.asarray(np.exp(evidence - np.logaddexp.reduce(evidence)))
 
     def gains(self, templates: Templates, theta: FloatArray) -> FloatArray:
-        """(m,) log evidence gained at one shape, of one structure, by adding each template; -inf for a dent."""
+        """(m,) log evidence gained by adding each template to the bump of one shape; -inf where it would be a dent."""
         (bump,) = self.scene.templates(theta[None], self.window)
-        (alone,), _ = self.linear.projected([bump])
-        (beside,), _ = self.linear.projected([templates])
+        (bump_projected,), _ = self.linear.projected([bump])
+        (projected,), _ = self.linear.projected([templates])
         product = self.window.product(bump, templates)
-        base, with_it = [], []
+        base, evidence = [], []
         for columns in self.fields:
-            one, other = Inner.of(alone, columns), Inner.of(beside, columns)
-            base.append(self.linear.solve([one], None, columns).evidence[0])
-            cross = one.product(other, product, columns)
-            with_it.append(self.linear.solve([one.repeated(len(product)), other], cross, columns).evidence)
-        gained = np.logaddexp.reduce(np.concatenate(with_it, axis=1), axis=1)
+            base_inner, template_inner = Inner.of(bump_projected, columns), Inner.of(projected, columns)
+            base.append(self.linear.solve([base_inner], None, columns).evidence[0])
+            cross = base_inner.product(template_inner, product, columns)
+            evidence.append(
+                self.linear.solve([base_inner.repeated(len(product)), template_inner], cross, columns).evidence
+            )
+        gained = np.logaddexp.reduce(np.concatenate(evidence, axis=1), axis=1)
         return np.asarray(gained - np.logaddexp.reduce(np.concatenate(base)))
 
     def _solutions(self, theta: FloatArray) -> Iterator[LinearSolution]:
-        """Blocks of (m, p) vectors, solved under every field; large where they share a basis."""
+        """Solutions of (m, p) vectors under every field, in blocks, which are large where they share a basis."""
         fields = self.fields
-        size = SPANNED if len(theta) >= LEAST_BUMPS and self.scene.separable else BLOCK
+        size = BASIS_BLOCK if len(theta) >= LEAST_BUMPS and self.scene.separable else BLOCK
         for i in range(0, len(theta), size):
             points = theta[i : i + size]
             if len(points) >= LEAST_BUMPS:
                 (bumps,) = self.scene.templates(points, self.window)
                 assert isinstance(bumps, Profiles)
-                spanned = Spanned.of(bumps, self.linear)
+                spanned = LowRankBumps.of(bumps, self.linear)
                 if spanned is not None:
                     yield spanned.solution(fields)
                     continue
@@ -443,10 +451,10 @@ class CollapsedTarget:
                 yield self.linear.under_each(self.scene.templates(points[j : j + BLOCK], self.window), fields)
 
 
-def choose(evidence: FloatArray, rng: np.random.Generator) -> IndexArray:
-    """(m,) random field for each draw by its share of the evidence; the first where a draw has none."""
-    best = evidence.max(axis=1, keepdims=True)
-    weight = np.exp(evidence - np.where(np.isfinite(best), best, 0.0))
+def choose_fields(evidence: FloatArray, rng: np.random.Generator) -> IndexArray:
+    """(m,) random field index for each draw, by its share of the evidence; 0 where a draw has none."""
+    largest = evidence.max(axis=1, keepdims=True)
+    weight = np.exp(evidence - np.where(np.isfinite(largest), largest, 0.0))
     edges = np.cumsum(weight, axis=1)
     uniform = rng.uniform(size=len(evidence)) * edges[:, -1]
     return np.asarray((edges < uniform[:, None]).sum(axis=1))

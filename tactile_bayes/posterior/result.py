@@ -20,7 +20,7 @@ from tactile_bayes.posterior.bump import Detection, FitCells, principal_widths
 from tactile_bayes.posterior.draw import MapPosterior, ModalBump
 from tactile_bayes.posterior.fit import FieldFit, SceneChoice
 from tactile_bayes.posterior.marginal import CollapsedTarget
-from tactile_bayes.posterior.verdict import SmallestLumps, Weighed
+from tactile_bayes.posterior.verdict import SmallestLumps, WeighedRise
 from tactile_bayes.posterior.white import BumpFit, Candidate
 from tactile_bayes.size.draws import BumpDraws, SizePosterior
 from tactile_bayes.size.pooling import Calibration, SizePriors, draw_sizes
@@ -42,9 +42,9 @@ class Sensitivity(Record):
 def prior_sensitivity(
     sigma_x: FloatArray, sigma_y: FloatArray, quantities: Mapping[str, FloatArray], prior: BumpPrior
 ) -> Sensitivity:
-    """Shifts of quantities under a width prior twice as wide, by reweighting without another fit.
+    """Shifts of quantities under a width prior twice as wide, by reweighting the draws.
 
-    Quantities are draws in the order of the widths'; those of another shape are left out, NaN draws count for nothing.
+    Quantities are draws in the order of the widths; those of another number are left out, as are NaN draws.
     """
     p = 0.5 * np.log(sigma_x * sigma_y).ravel()
     z = (p - np.log(prior.width_median_mm)) / prior.log_width_sd
@@ -54,13 +54,13 @@ def prior_sensitivity(
         values = draws.ravel()
         if values.shape != weight.shape:
             continue
-        good = np.isfinite(values)
-        sd = float(values[good].std()) or 1.0
-        at = np.array([0.5, TAIL, 1.0 - TAIL])
-        order = np.argsort(values[good])
-        ordered, weighed = values[good][order], weight[good][order]
-        plain = weighted_quantiles_of(ordered, np.ones(len(order)), at)
-        shift = (weighted_quantiles_of(ordered, weighed, at) - plain) / sd
+        is_finite = np.isfinite(values)
+        sd = float(values[is_finite].std()) or 1.0
+        probabilities = np.array([0.5, TAIL, 1.0 - TAIL])
+        order = np.argsort(values[is_finite])
+        ordered, weights = values[is_finite][order], weight[is_finite][order]
+        plain = weighted_quantiles_of(ordered, np.ones(len(order)), probabilities)
+        shift = (weighted_quantiles_of(ordered, weights, probabilities) - plain) / sd
         medians[name], ends[name] = float(shift[0]), float(shift[1:][np.argmax(np.abs(shift[1:]))])
     return Sensitivity(medians, ends, shape)
 
@@ -85,9 +85,10 @@ class Estimate(Record, eq=False):
     detection: Detection | None = None  #: None when no bump could be tested.
     fit: BumpFit | None = None
     draws: ParameterDraws | None = None
-    map_posterior: MapPosterior | None = None  #: Like the two above None without an estimate.
+    map_posterior: MapPosterior | None = None
+    """`fit`, `draws`, `map_posterior`: None without an estimate."""
     size: SizePosterior | None = None  #: None also without a size calibration.
-    candidates: tuple[Candidate, ...] = ()  #: Every place that was looked at.
+    candidates: tuple[Candidate, ...] = ()  #: All places tried.
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     """Figures of the fit, the noise and the method as the JSON has them: R-hat, effective draws and Monte-Carlo errors
     of chains in ``convergence``; empty where nothing was drawn."""
@@ -96,15 +97,16 @@ class Estimate(Record, eq=False):
     code: str = ""
     advice: str = ""
     on_paper: str = ""
-    about_mm: tuple[float, float] | None = None  #: Like the three above as in `Abstention`, without an estimate.
-    weighed: Weighed | None = None  #: The lump of the answer, or what rises most like one.
+    about_mm: tuple[float, float] | None = None
+    """`code`, `advice`, `on_paper`, `about_mm`: Of the `Abstention`, without an estimate."""
+    weighed: WeighedRise | None = None  #: The answer's lump, or the rise that is likeliest one.
     smallest: SmallestLumps | None = None
-    """On a map without a lump: the smallest that it would have shown; None where nobody has asked."""
-    scene: SceneChoice | None = None  #: Under a noise field: what the window holds, and what was asked about it.
-    sensitivity: Sensitivity | None = None  #: How far the answer leans on the prior of the widths.
-    other_rises: tuple[Rise, ...] = ()  #: The masses besides the reported one; empty where nobody has looked.
-    bump: ModalBump | None = None  #: At the mode, of the lump that the answer is about, sized or not; None without one.
-    masses: tuple[Mass, ...] = ()  #: All masses of the map, see `masses.with_masses`; empty where nobody has looked.
+    """On a map without a lump: the smallest that it would have shown; None where that was not computed."""
+    scene: SceneChoice | None = None  #: Under a noise field: the chosen scene, with the tests of its structures.
+    sensitivity: Sensitivity | None = None  #: Sensitivity to the prior of the widths.
+    other_rises: tuple[Rise, ...] = ()  #: The masses besides the reported one; empty where none were searched.
+    bump: ModalBump | None = None  #: Bump at the mode of the answer's lump, sized or not; None without one.
+    masses: tuple[Mass, ...] = ()  #: All masses of the map, see `masses.with_masses`; empty where none were searched.
     findings: tuple[Finding, ...] = ()  #: Findings against the answer, cautions first.
 
     @property
@@ -119,7 +121,7 @@ class Estimate(Record, eq=False):
 
     @property
     def lump(self) -> ModalBump | None:
-        """The bump of the lump that the answer is about: at the posterior medians where it was drawn."""
+        """The bump of the answer's lump: at the posterior medians where it was drawn, else at the mode."""
         return self.measured or self.bump
 
 
@@ -147,9 +149,9 @@ class Mass(Record, eq=False):
 
 # --- Density of a window's cells under correlated errors: the density of each given the others.
 #
-# A likelihood with correlated errors is no product over cells. What takes the place of a cell's factor is the
-# density of its value given all the others, with level, tilt, amplitudes and the noise scale integrated out as in
-# `marginal`. For one field, with :math:`Q = C^{-1} - C^{-1} X (X^T C^{-1} X)^{-1} X^T C^{-1}`,
+# A likelihood with correlated errors is no product over cells. A cell's factor is replaced by the density of its value
+# given all the others, with level, tilt, amplitudes and the noise scale integrated out as in `marginal`. For one
+# field, with :math:`Q = C^{-1} - C^{-1} X (X^T C^{-1} X)^{-1} X^T C^{-1}`,
 #
 # .. math::
 #     y_i \mid y_{-i}, \theta \sim t_{\nu - 1}\Bigl(y_i - (Qy)_i / Q_{ii},\; S_{-i} / ((\nu - 1)\, Q_{ii})\Bigr),
@@ -161,29 +163,29 @@ class Mass(Record, eq=False):
 # ----------
 # Buerkner, Gabry & Vehtari (2021), Computational Statistics 36:1243 (non-factorised models).
 
-LEAST_SHARE = 1e-6  #: Fields with a smaller share of the evidence at a draw add nothing there.
+LEAST_SHARE = 1e-6  #: Fields with a smaller share of the evidence at a draw are left out.
 
 
 def pointwise_log_likelihood(target: CollapsedTarget, theta: FloatArray) -> FloatArray:
     """(m, n) log density of each cell's value given the other cells, at (m, p) draws of the scene's parameters."""
     evidence = target.by_field(theta)
     log_share = evidence - np.logaddexp.reduce(evidence, axis=1)[:, None]
-    window, fixed = target.window, target.linear.plain[:-1]
+    window, fixed_columns = target.window, target.linear.plain[:-1]
     templates = [window.of_cells(one) for one in target.scene.templates(theta, window)]
-    inverse = np.full((len(theta), len(window.cells)), -np.inf)
-    for h, precision in enumerate(_fields(target)):
+    inverse_likelihood = np.full((len(theta), len(window.cells)), -np.inf)
+    for h, precision in enumerate(_precisions(target)):
         for m in np.flatnonzero(log_share[:, h] > log(LEAST_SHARE)):
-            regressors = np.stack([*fixed, *(one[m] for one in templates)])
-            log_density = _without_each(precision, regressors, window.cells.value)
+            regressors = np.stack([*fixed_columns, *(one[m] for one in templates)])
+            log_density = _leave_one_out_density(precision, regressors, window.cells.value)
             # p(field | the others) is its share over the cell's density under it
-            inverse[m] = np.logaddexp(inverse[m], log_share[m, h] - log_density)
-    return -inverse
+            inverse_likelihood[m] = np.logaddexp(inverse_likelihood[m], log_share[m, h] - log_density)
+    return -inverse_likelihood
 
 
-def _fields(target: CollapsedTarget) -> Iterator[_Precision]:
+def _precisions(target: CollapsedTarget) -> Iterator[_Precision]:
     """The precision of each field and share, in the order of `CollapsedTarget.by_field`."""
     window = target.window
-    # a row for each cell: its products with the cosines, over its independent variance
+    # a row per cell: its inner products with the cosines
     unit = window.on_grid(np.eye(len(window.cells)))
     cosines = window.project(unit, np.zeros((1, *window.weight.shape))).low
     for columns in target.fields:
@@ -204,9 +206,9 @@ class _Precision:
         return np.asarray(rows * self._weight - ((rows @ self._low) * self._taken) @ self._low.T)
 
 
-def _without_each(precision: _Precision, regressors: FloatArray, value: FloatArray) -> FloatArray:
+def _leave_one_out_density(precision: _Precision, regressors: FloatArray, value: FloatArray) -> FloatArray:
     """(n,) log density of each value given the others, for (v, n) columns with free coefficients."""
-    # without its mean, a large level does not cost the digits that the bump is in
+    # centred, so that a large level costs no digits of the bump
     centred = value - value.mean()
     weighted = precision.times(np.concatenate([regressors, centred[None]]))
     across, data = weighted[:-1], weighted[-1]
@@ -222,24 +224,21 @@ def _without_each(precision: _Precision, regressors: FloatArray, value: FloatArr
     )
 
 
-# --- Fitted values of an estimate's window beside its data: level, tilt, bump and what lies beside it, without noise.
+# --- Fitted values of an estimate's window: level, tilt, bump and neighbour, without noise.
 
 
 class FittedCells(Record, eq=False):
     """Cells of a fit window."""
 
     cells: FitCells
-    fit: FloatArray  #: (n,) array: The model's values at the posterior's middle.
+    fit: FloatArray  #: (n,) array: The model's values at the posterior medians.
     shared: FloatArray | None = None
-    """(n,) array: What neighbouring cells share of the noise, as the noise field has it; None for independent noise.
-
-    It takes up whatever is broad, also what the bump lacks, so the level is that of the window's rim: about a lump most
-    maps lie higher than that, by 1 to 6 % of its amplitude, as far as the head reaches.
-    """
+    """(n,) array: Expected noise field, which neighbouring cells share; None for independent noise. It contains all
+    that is broad, also of the lump: within the head's reach most maps lie 1 to 6 % of the amplitude above the level."""
 
     @property
     def residual(self) -> FloatArray:
-        """(n,) values less the fit and what neighbouring cells share: noise of single cells."""
+        """(n,) values less the fit and the noise field: independent noise."""
         left = self.cells.value - self.fit
         return left if self.shared is None else left - self.shared
 
@@ -255,32 +254,32 @@ def fitted_cells(estimate: Estimate) -> FittedCells | None:
     if estimate.scene is None:
         cells = estimate.fit.cells
         return FittedCells(cells, estimate.fit.bump.predict(estimate.fit.theta[None], cells)[0])
-    target, at = estimate.scene.fit.target, np.median(estimate.draws.flat, axis=0)[None]
+    target, theta = estimate.scene.fit.target, np.median(estimate.draws.flat, axis=0)[None]
     window, value = target.window, target.window.cells.value
-    templates = [window.of_cells(one)[0] for one in target.scene.templates(at, window)]
+    templates = [window.of_cells(one)[0] for one in target.scene.templates(theta, window)]
     regressors = np.stack([*target.linear.plain[:-1], *templates])
-    precision = next(islice(_fields(target), int(np.argmax(target.by_field(at)[0])), None))
+    precision = next(islice(_precisions(target), int(np.argmax(target.by_field(theta)[0])), None))
     middle, across = value.mean(), precision.times(regressors)
-    solved = np.linalg.solve(across @ regressors.T, across @ (value - middle))
-    fit = np.asarray(middle + solved @ regressors)
-    left = value - fit
+    coefficients = np.linalg.solve(across @ regressors.T, across @ (value - middle))
+    fit = np.asarray(middle + coefficients @ regressors)
+    residual = value - fit
     # the field's expectation given the data: the part of what is left that neighbouring cells share
-    return FittedCells(window.cells, fit, left - precision.times(left[None])[0] * window.variance)
+    return FittedCells(window.cells, fit, residual - precision.times(residual[None])[0] * window.variance)
 
 
-# --- What goes beside a posterior's draws in a file that arviz opens: statistics, likelihood, data and prior.
+# --- Groups beside ``posterior`` in a file for arviz: sampler statistics, likelihood, data and prior.
 #
 # Groups and names are those of the InferenceData schema of ArviZ (Kumar et al. 2019, JOSS 4:1143).
 
 PRIOR_DRAWS = 2000
-LIKELIHOOD_DRAWS = 400  #: Evenly thinned: a value for each cell and draw takes a second and 4 MB for 400 of them.
-LEAST_SIZED = 100  #: Fewer prior draws within the calibration's range say nothing of a size.
+LIKELIHOOD_DRAWS = 400  #: Draws with a log likelihood, evenly thinned: 400 take a second and 4 MB.
+LEAST_SIZED = 100  #: Least number of prior draws within the calibration's range for a prior of sizes.
 
 
 def inference_groups(
     estimate: Estimate, *, calibration: Calibration | None, size_priors: SizePriors, rng: np.random.Generator
 ) -> dict[str, DrawGroup]:
-    """The groups that an estimate has besides ``posterior``; empty without an estimate.
+    """Groups of an estimate besides ``posterior``; empty without an estimate.
 
     ``sample_stats``, ``log_likelihood`` (of chains under a noise field), ``observed_data`` and ``prior`` (under a noise
     field); the prior's sizes are drawn by the `calibration` and `size_priors` of the posterior's.
@@ -303,6 +302,7 @@ def inference_groups(
 
 
 def _statistics(draws: ParameterDraws, fit: FieldFit | None) -> DrawGroup | None:
+    """The sampler's statistics of each draw, with notes; None where there are none."""
     statistics = dict(draws.statistics)
     if draws.method == "laplace" and fit is not None:
         statistics["lp"] = fit.target(draws.flat).reshape(draws.theta.shape[:2])
@@ -321,8 +321,8 @@ def _statistics(draws: ParameterDraws, fit: FieldFit | None) -> DrawGroup | None
 
 def _log_likelihood(theta: FloatArray, fit: FieldFit) -> DrawGroup:
     """Log likelihood of some of the draws, evenly thinned, as many of each chain."""
-    some = theta[:, :: max(1, -(-theta.shape[0] * theta.shape[1] // LIKELIHOOD_DRAWS))]
-    values = pointwise_log_likelihood(fit.target, some.reshape(-1, some.shape[2])).reshape(*some.shape[:2], -1)
+    thinned = theta[:, :: max(1, -(-theta.shape[0] * theta.shape[1] // LIKELIHOOD_DRAWS))]
+    values = pointwise_log_likelihood(fit.target, thinned.reshape(-1, thinned.shape[2])).reshape(*thinned.shape[:2], -1)
     note = (
         "log density of each cell's value given all the other cells (leave-one-out predictive, Buerkner, Gabry & "
         "Vehtari 2021), for evenly thinned draws: under correlated errors a likelihood is no product over cells"
@@ -333,20 +333,23 @@ def _log_likelihood(theta: FloatArray, fit: FieldFit) -> DrawGroup:
 def _prior(
     fit: FieldFit, calibration: Calibration | None, size_priors: SizePriors, rng: np.random.Generator
 ) -> DrawGroup:
-    """Draws of what has a proper prior, and the sizes that these imply where the calibration holds."""
-    problem, turned = fit.target.problem, fit.scene.shape == "rotated"
+    """Draws of the parameters with a proper prior, and their sizes within the calibration's range."""
+    problem, rotated = fit.target.problem, fit.scene.shape == "rotated"
     prior, middle = problem.prior, problem.window.middle
-    # more than needed: those wider than the window allows are left out
+    # more than needed, since widths beyond the window's limit are left out
     number = 4 * PRIOR_DRAWS
     p = np.log(prior.width_median_mm) + prior.log_width_sd * rng.standard_normal(number)
     q = np.zeros(number) if fit.scene.shape == "round" else prior.log_ratio_sd * rng.standard_normal(number)
-    r = prior.log_ratio_sd * rng.standard_normal(number) if turned else np.zeros(number)
-    kept = np.flatnonzero(p + np.hypot(q, r) <= np.log(problem.widest_mm))[:PRIOR_DRAWS]
-    sigma_x, sigma_y, angle = principal_widths(p[kept], q[kept], r[kept])
-    amplitude = fit.target.amplitude_sd * rng.standard_normal(len(kept))
-    away, direction = problem.radius_mm * np.sqrt(rng.uniform(size=len(kept))), rng.uniform(0, 2 * np.pi, len(kept))
+    r = prior.log_ratio_sd * rng.standard_normal(number) if rotated else np.zeros(number)
+    allowed = np.flatnonzero(p + np.hypot(q, r) <= np.log(problem.widest_mm))[:PRIOR_DRAWS]
+    sigma_x, sigma_y, angle = principal_widths(p[allowed], q[allowed], r[allowed])
+    amplitude = fit.target.amplitude_sd * rng.standard_normal(len(allowed))
+    distance, direction = (
+        problem.radius_mm * np.sqrt(rng.uniform(size=len(allowed))),
+        rng.uniform(0, 2 * np.pi, len(allowed)),
+    )
     values = {"amplitude": amplitude, "sigma_x_mm": sigma_x, "sigma_y_mm": sigma_y, "angle_rad": angle}
-    values |= {"x_mm": middle[0] + away * np.cos(direction), "y_mm": middle[1] + away * np.sin(direction)}
+    values |= {"x_mm": middle[0] + distance * np.cos(direction), "y_mm": middle[1] + distance * np.sin(direction)}
     notes = {"left_out": "level, tilt and noise scale have improper priors"}
     if calibration is not None:
         inside = calibration.within_reach(amplitude, sigma_x, sigma_y)
@@ -355,8 +358,8 @@ def _prior(
         if inside.sum() >= LEAST_SIZED:
             a, x, y, turn = (one[inside][None] for one in (amplitude, sigma_x, sigma_y, angle))
             size = draw_sizes(BumpDraws(a, x, y, turn), calibration=calibration, priors=size_priors, rng=rng)
-            ranks = (np.arange(len(kept)) + 0.5) / len(kept)
+            ranks = (np.arange(len(allowed)) + 0.5) / len(allowed)
             for name in ("max_size_mm", "min_size_mm"):
-                known = np.sort(getattr(size, name).ravel())
-                values[name] = rng.permutation(quantiles_of(known[np.isfinite(known)], ranks))
+                sizes = np.sort(getattr(size, name).ravel())
+                values[name] = rng.permutation(quantiles_of(sizes[np.isfinite(sizes)], ranks))
     return DrawGroup({name: (("chain", "draw"), one[None]) for name, one in values.items()}, notes)

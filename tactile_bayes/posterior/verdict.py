@@ -14,7 +14,15 @@ from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import TactileMap, orientation_of
 from tactile_bayes.mapping.plausibility import against_no_lump
 from tactile_bayes.options import BumpPrior
-from tactile_bayes.posterior.bump import Detection, covered_share, map_ends, on_map, trusted, value_scale, window_cells
+from tactile_bayes.posterior.bump import (
+    Detection,
+    covered_share,
+    map_ends,
+    on_map,
+    trusted_cells,
+    value_scale,
+    window_cells,
+)
 from tactile_bayes.posterior.draw import DETECTED, ModalBump
 from tactile_bayes.posterior.marginal import CollapsedTarget, Scene
 from tactile_bayes.posterior.white import AT_RIM, LEAST_COVERED_SHARE, LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, Candidate
@@ -25,26 +33,26 @@ from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM
 
 SHARE_WITH_LUMP: Final = 0.5  #: Half of the simulated exams hold a lump: the prior probability behind the answer.
 COEFFICIENTS: Final = (1.14, 0.8, -2.36, -4.3, -2.32, -2.47)
-"""Intercept and those of `Weighed.features`; printed by ``python -m validation lump_probability learn``, 0127."""
+"""Intercept and those of `WeighedRise.features`; printed by ``python -m validation lump_probability learn``, 0127."""
 ENDS: Final = (0.05, 0.99)
-"""The exams that were simulated cannot tell probabilities nearer to 0 or 1: of the 40 rises that say least in the exams
-learned from, 2 lie within 10 mm of a lump that the map does not show."""
+"""Least and largest probability: the simulated exams resolve none nearer to 0 or 1. Of the 40 least likely rises there,
+2 lie within 10 mm of a lump that the map does not show."""
 LIKELY: Final = 0.5  #: A rise with a lower probability is no lump by the verdict, whatever its evidence.
-UNPROVEN: Final = 0.49  #: Most that is told of a rise without the evidence for a size: it is not told as a lump.
+UNPROVEN: Final = 0.49  #: Largest probability of a rise without the evidence for a size, so that it is no lump.
 MOST_EVIDENCE: Final = 50.0
 WIDE_MM: Final = 8.0
 NO_EVIDENCE: Final = "no lump by the evidence"
 
 
-class Weighed(Record, eq=False):
+class WeighedRise(Record, eq=False):
     """A rise with the odds of a bump there, and the probability that it is a lump."""
 
     detection: Detection  #: Evidence for a bump against smooth errors, and a ridge where one rises.
     centre_mm: tuple[float, float]  #: Centre of the bump.
     features: tuple[float, ...]
-    """Log of 1 plus the log Bayes factor, log of the axis ratio, by how much the log of the width exceeds that of
-    `WIDE_MM`, share of the bump that the map does not cover, and 1 where a fault speaks against measuring it."""
-    candidate: Candidate | None = None  #: Where the search met it.
+    """Log of 1 plus the log Bayes factor, log of the axis ratio, excess of the log width over that of `WIDE_MM`, share
+    of the bump that the map does not cover, and 1 where the candidate has a fault."""
+    candidate: Candidate | None = None  #: The candidate of the search.
 
     @property
     def axis_ratio(self) -> float:
@@ -55,8 +63,7 @@ class Weighed(Record, eq=False):
     def chance(self) -> float:
         """Probability of a lump, where half of the exams hold one, with or without the evidence for a size.
 
-        The evidence of a bump is against smooth errors. Rims, ridges, ribs, creases and uneven fat rise, too; they are
-        told by the other features.
+        The evidence is against smooth errors only; the other features tell rims, ridges, ribs, creases and uneven fat.
         """
         score = COEFFICIENTS[0] + float(np.dot(COEFFICIENTS[1:], self.features))
         return float(np.clip(1.0 / (1.0 + exp(-score)), *ENDS))
@@ -69,8 +76,8 @@ class Weighed(Record, eq=False):
 
 def weigh(
     tactile_map: TactileMap, detection: Detection, bump: ModalBump, candidate: Candidate | None = None
-) -> Weighed:
-    """A rise with the bump that the odds are of; `candidate` as the search met it."""
+) -> WeighedRise:
+    """The rise of a bump with its odds and features; `candidate` is that of the search."""
     centre_mm, (narrow, wide) = (bump.x_mm, bump.y_mm), sorted((bump.sigma_x_mm, bump.sigma_y_mm))
     evidence = log1p(float(np.clip(detection.log_bayes_factor, 0.0, MOST_EVIDENCE)))
     too_wide = max(log(max(wide, 1e-3) / WIDE_MM), 0.0)
@@ -78,7 +85,7 @@ def weigh(
     fault = "" if candidate is None else candidate.fault
     faulty = float(bool(fault) and not fault.startswith(NO_EVIDENCE))
     features = (evidence, min(log(wide / max(narrow, 1e-3)), 2.0), min(too_wide, 2.0), open_share, faulty)
-    return Weighed(detection, centre_mm, features, candidate)
+    return WeighedRise(detection, centre_mm, features, candidate)
 
 
 # --- Reasons for giving no size: codes and sentences, with what would help.
@@ -94,33 +101,28 @@ BEYOND_IT = "extend the strokes beyond it"
 LARGER_WINDOW_ON_PAPER = "nothing by this exam: the rise is wider than the program measures"
 MORE_LINES = "scan again, more slowly or with more lines, and map all scans together"
 MORE_LINES_ON_PAPER = "scan the place again, more slowly or with more strokes"
-NEEDED_IN_WIDTHS = 2.0
-"""Widths of the bump beyond its centre that strokes should reach, so that its flank shows on every side."""
+STROKES_IN_WIDTHS = 2.0
+"""Distance from the bump's centre, in widths, that strokes should reach, so that its flank shows on every side."""
 WIDE_IN_RADII = 0.4
 ENCLOSED_IN_WIDTHS = 1.6
-"""How far the map must reach on every side of a bump wide for its window: a rise to the edge looks like half.
-
-Of 800 simulated exams 46 showed a lump wider than 8 mm, all of them enclosed so; the end of strokes made one more rise.
-"""
-LEAST_SEEN = 0.25  #: Share of a side's breadth that must be covered for the side to reach as far.
+"""Distance in widths that the map must reach on every side of a bump wide for its window: all 46 lumps wider than 8 mm
+in 800 simulated exams were enclosed so."""
+LEAST_SEEN = 0.25  #: Least share of a sector's breadth that must be covered for it to reach as far.
 LEAST_READ = 0.25
-"""Least share of the map's typical number of readings in a cell, for a bump's cells: 134 lumps had 1.8 and more.
-
-One empty scan of 45 had a spot of 0.16 at its corner, in cells of 3 readings for 29.
-"""
+"""Least share of the map's median count in the cells of a bump: 134 lumps had 1.8 and more, a spot of noise 0.16."""
 COARSEST_MM = 4.0
-"""Cells above this say nothing of a lump that they do not show: one of 10 mm close to the skin has a sigma of 2 mm."""
+"""Largest cells that can show a lump of 10 mm close to the skin, whose sigma is 2 mm."""
 HOPELESS = 2.0
-"""Widths at the mode so many times beyond a limit decide without draws: chains for a stripe of readings took 30 s."""
+"""Factor beyond a limit of the widths at the mode that decides without draws: chains for a stripe took 30 s."""
 MOST_PRIOR_SHARE = 0.5
-"""Above this ratio of the posterior's to the prior's SD of a log width the prior, not the map, gives the interval."""
+"""Ratio of the posterior's to the prior's SD of a log width above which the prior, not the map, gives the interval."""
 SIDES = {"-x": (-1.0, 0.0), "+x": (1.0, 0.0), "-y": (0.0, -1.0), "+y": (0.0, 1.0)}
 
 
-def searched(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> str:
-    """The area searched for a lump, in words: the place given, which must lie on the map, or all that is covered."""
+def searched_area(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> str:
+    """Text of the area searched for a lump: a given centre, which must lie on the map, or all covered cells."""
     if centre_mm is None:
-        area = float(trusted(tactile_map).sum()) * tactile_map.recipe.cell_mm**2 / 100.0
+        area = float(trusted_cells(tactile_map).sum()) * tactile_map.recipe.cell_mm**2 / 100.0
         return f"on the {f'{area:.0f}' if area >= 10 else f'{area:.2g}'} cm2 that the map covers"
     if not on_map(tactile_map, *centre_mm):
         reach = " and ".join(
@@ -128,115 +130,114 @@ def searched(tactile_map: TactileMap, centre_mm: tuple[float, float] | None) -> 
         )
         place = f"centre_mm ({centre_mm[0]:g}, {centre_mm[1]:g})"
         raise UsageError(f"{place} lies off the map, which has {reach}; give a place on it")
-    return _near(centre_mm)
+    return _near_text(centre_mm)
 
 
 def no_verdict(tactile_map: TactileMap) -> Abstention | None:
-    """Reason why a map that shows no lump does not say that there is none; None where one would show."""
+    """Reason why a map without a rise does not exclude a lump; None where it would have shown one."""
     cell = tactile_map.recipe.cell_mm
     if not tactile_map.covered.any():
         return cannot_show("the map has no covered cell", "map a scan that covers the place", SCAN_AGAIN)
     if cell > COARSEST_MM:
         advice = "map the scan again with smaller cells (they have 1 mm by default)"
         return cannot_show(f"its cells of {cell:g} mm are too large", advice, SMALLER_CELLS_ON_PAPER)
-    against = against_no_lump(tactile_map)
-    if not against:
+    findings = against_no_lump(tactile_map)
+    if not findings:
         return None
-    first, remedies = against[0], dict.fromkeys(one.remedy for one in against if one.remedy)
-    on_paper = dict.fromkeys(one.on_paper for one in against if one.on_paper)
+    first, remedies = findings[0], dict.fromkeys(one.remedy for one in findings if one.remedy)
+    on_paper = dict.fromkeys(one.on_paper for one in findings if one.on_paper)
     return cannot_show(first.text, "; ".join(remedies), "; ".join(on_paper))
 
 
 def cannot_show(why: str, advice: str = "", on_paper: str = "") -> Abstention:
-    """Data that cannot show whether there is a lump, and what would help."""
+    """Abstention for data that cannot show whether there is a lump, and the remedy."""
     return Abstention(CANNOT_SHOW, f"the data cannot show whether there is a lump: {why}", advice, on_paper)
 
 
 def chance_text(probability: float, digits: int = 2) -> str:
-    """Format a probability with no more digits than it is worth: "0.32", "below 0.01" or "above 0.99"."""
+    """Text of a probability to so many digits: "0.32", "below 0.01" or "above 0.99"."""
     least = 10.0**-digits
     if least <= probability <= 1.0 - least:
         return f"{probability:.{digits}f}"
     return f"below {least:g}" if probability < least else f"above {1.0 - least:g}"
 
 
-def no_bump(
-    tactile_map: TactileMap, candidates: Sequence[Candidate], likeliest: Weighed | None, *, where: str
+def no_bump_reason(
+    tactile_map: TactileMap, candidates: Sequence[Candidate], likeliest: WeighedRise | None, *, where: str
 ) -> Abstention:
-    """Reason when no candidate can be measured, by the likeliest: no lump, or one that the map covers too poorly."""
+    """Reason when no candidate can be measured, from the likeliest: no lump, or one that the map covers too little."""
     candidate = None if likeliest is None else likeliest.candidate
     if candidate is not None and likeliest is not None and likeliest.probability >= LIKELY:
-        reason = f"the rise {_near(candidate.centre_mm)} cannot be measured: {candidate.fault}"
-        return _for_fault(tactile_map, candidate, reason)
+        reason = f"the rise {_near_text(candidate.centre_mm)} cannot be measured: {candidate.fault}"
+        return _reason_for_fault(tactile_map, candidate, reason)
     first = candidates[0]
     if likeliest is None and "covered cells" in first.fault:
-        short = missing_strokes(tactile_map, first.centre_mm, reach_mm=10.0)
-        advice = extend_advice(short) or "cover the place with more strokes"
+        shortfall = coverage_shortfall(tactile_map, first.centre_mm, reach_mm=10.0)
+        advice = stroke_advice(shortfall) or "cover the place with more strokes"
         return Abstention("window", f"no lump found {where}: {first.fault}", advice, advice, first.centre_mm)
     if candidate is not None and likeliest is not None and likeliest.detection.log_bayes_factor > 0:
-        rise = f"what rises {_near(candidate.centre_mm)} is a ridge"
-        why = _for_fault(tactile_map, candidate, f"no lump found {where}: {rise}")
+        rise = f"what rises {_near_text(candidate.centre_mm)} is a ridge"
+        why = _reason_for_fault(tactile_map, candidate, f"no lump found {where}: {rise}")
         if why.code == "ridge":
             return why
     rises = f"none of the {len(candidates)} places that rise is one" if len(candidates) > 1 else first.fault
     return Abstention("undetected", f"no lump found {where}: {rises}", FEEL_AGAIN, FEEL_AGAIN_ON_PAPER)
 
 
-def _near(place_mm: tuple[float, float]) -> str:
+def _near_text(place_mm: tuple[float, float]) -> str:
     return f"near ({place_mm[0]:.1f}, {place_mm[1]:.1f}) mm"
 
 
-def _for_fault(tactile_map: TactileMap, candidate: Candidate, reason: str) -> Abstention:
-    """The reason with the code and the remedies of a candidate's fault."""
-    fit, at = candidate.fit, candidate.centre_mm
+def _reason_for_fault(tactile_map: TactileMap, candidate: Candidate, reason: str) -> Abstention:
+    """Abstention with the code and the remedies of a candidate's fault."""
+    fit, centre_mm = candidate.fit, candidate.centre_mm
     if fit is None:
-        advice = extend_advice(missing_strokes(tactile_map, at, reach_mm=10.0))
-        return Abstention("window" if advice else "undetected", reason, advice, advice, at)
+        advice = stroke_advice(coverage_shortfall(tactile_map, centre_mm, reach_mm=10.0))
+        return Abstention("window" if advice else "undetected", reason, advice, advice, centre_mm)
     narrow, wide = sorted(fit.widths()[:2])
     if not fit.theta[0] > 0:
-        return Abstention("undetected", reason, about_mm=at)
+        return Abstention("undetected", reason, about_mm=centre_mm)
     if wide / max(narrow, 1e-9) > MOST_AXIS_RATIO:
-        return Abstention("ridge", reason, FEEL_A_RIB, FEEL_A_RIB_ON_PAPER, at)
+        return Abstention("ridge", reason, FEEL_A_RIB, FEEL_A_RIB_ON_PAPER, centre_mm)
     if narrow < LEAST_WIDTH_IN_CELLS * fit.cells.cell_mm:
-        return _coarse(reason, narrow, at)
-    extend = extend_advice(missing_strokes(tactile_map, fit.centre_mm, reach_mm=NEEDED_IN_WIDTHS * wide))
+        return _coarse(reason, narrow, centre_mm)
+    extend = stroke_advice(coverage_shortfall(tactile_map, fit.centre_mm, reach_mm=STROKES_IN_WIDTHS * wide))
     if not extend and candidate.fault.startswith(AT_RIM):
         extend = BEYOND_IT  # under correlated errors the rise is wider than least squares made it
     if extend:
-        return Abstention("window", reason, extend, extend, at)
-    return Abstention("window", reason, LARGER_WINDOW, LARGER_WINDOW_ON_PAPER, at)
+        return Abstention("window", reason, extend, extend, centre_mm)
+    return Abstention("window", reason, LARGER_WINDOW, LARGER_WINDOW_ON_PAPER, centre_mm)
 
 
-def _coarse(reason: str, narrow_mm: float, at: tuple[float, float] | None = None) -> Abstention:
-    """The reason, with the remedies for a rise that the cells do not resolve."""
+def _coarse(reason: str, narrow_mm: float, centre_mm: tuple[float, float] | None = None) -> Abstention:
+    """Abstention with the remedies for a rise that the cells do not resolve."""
     advice = f"map again with --cell-mm {max(0.1, narrow_mm / 0.75):.1g}"
-    return Abstention("unresolved", reason, advice, SMALLER_CELLS_ON_PAPER, at)
+    return Abstention("unresolved", reason, advice, SMALLER_CELLS_ON_PAPER, centre_mm)
 
 
-def missing_strokes(tactile_map: TactileMap, centre_mm: tuple[float, float], *, reach_mm: float) -> dict[str, float]:
+def coverage_shortfall(tactile_map: TactileMap, centre_mm: tuple[float, float], *, reach_mm: float) -> dict[str, float]:
     """Distance in mm by which coverage falls short of `reach_mm` from a centre, per side, where at least a cell.
 
-    The sides are named as a viewer of the map's picture sees them: "the patient's left (-x)" with landmarks. A side is
-    a quarter turn about its direction. It ends where less than `LEAST_SEEN` of its breadth is covered: a flank of which
-    a corner is missing is still seen.
+    Sides are named as on the map's picture: "the patient's left (-x)" with landmarks. A side is a sector of 90 degrees
+    about its direction, and ends where less than `LEAST_SEEN` of its breadth is covered.
     """
-    cell, mask = tactile_map.recipe.cell_mm, trusted(tactile_map)
+    cell, mask = tactile_map.recipe.cell_mm, trusted_cells(tactile_map)
     dx, dy = tactile_map.x_mm - centre_mm[0], tactile_map.y_mm[:, None] - centre_mm[1]
-    short, view = {}, orientation_of(tactile_map)
+    shortfall, view = {}, orientation_of(tactile_map)
     for axis, (x, y) in SIDES.items():
         along, across = dx * x + dy * y, np.abs(dx * y - dy * x)
         sector = across <= along
-        reached = _reached(along[sector], mask[sector], cell, reach_mm)
+        reached = _covered_distance(along[sector], mask[sector], cell, reach_mm)
         if reach_mm - reached >= cell:
-            short[view.side_words(axis)] = reach_mm - reached
-    return short
+            shortfall[view.side_words(axis)] = reach_mm - reached
+    return shortfall
 
 
-def _reached(along: FloatArray, covered: BoolArray, cell: float, reach: float) -> float:
-    """Distance that a quarter-turn sector is covered, mm; next to its corner one covered cell is enough."""
+def _covered_distance(along: FloatArray, covered: BoolArray, cell: float, reach: float) -> float:
+    """Distance in mm to which a sector of 90 degrees is covered; next to its corner one covered cell is enough."""
     for step in range(1, int(np.ceil(reach / cell))):
-        here = (along >= (step - 0.5) * cell) & (along < (step + 0.5) * cell)
-        if covered[here].sum() < (LEAST_SEEN * 2 * step if step > 1 else 1):
+        ring = (along >= (step - 0.5) * cell) & (along < (step + 0.5) * cell)
+        if covered[ring].sum() < (LEAST_SEEN * 2 * step if step > 1 else 1):
             return max(step - 0.5, 0.0) * cell
     return reach
 
@@ -248,39 +249,39 @@ def rim_fault(tactile_map: TactileMap, bump: ModalBump, *, radius_mm: float) -> 
     share = covered_share(tactile_map, centre_mm, radius_mm=1.5 * wide)
     if share < LEAST_COVERED_SHARE:
         return f"{AT_RIM} ({100 * share:.0f} % of the bump is covered, with a sigma of {wide:.3g} mm)"
-    short = missing_strokes(tactile_map, centre_mm, reach_mm=ENCLOSED_IN_WIDTHS * wide)
-    if wide > WIDE_IN_RADII * radius_mm and short:
-        side, millimetres = max(short.items(), key=lambda one: one[1])
+    shortfall = coverage_shortfall(tactile_map, centre_mm, reach_mm=ENCLOSED_IN_WIDTHS * wide)
+    if wide > WIDE_IN_RADII * radius_mm and shortfall:
+        side, millimetres = max(shortfall.items(), key=lambda one: one[1])
         return f"{AT_RIM} (with a sigma of {wide:.3g} mm its flank to {side} is {millimetres:.0f} mm short)"
     if narrow < LEAST_WIDTH_IN_CELLS * cell:
         return f"narrower than a cell (sigma {narrow:.2g} mm on {cell:g} mm cells): not resolved"
     typical = float(np.median(tactile_map.count[tactile_map.covered]))
     cells = window_cells(tactile_map, centre_mm, radius_mm=max(1.5 * wide, cell))
-    here = float(np.median(cells.count)) if len(cells) else 0.0
-    if here >= LEAST_READ * typical:
+    typical_here = float(np.median(cells.count)) if len(cells) else 0.0
+    if typical_here >= LEAST_READ * typical:
         return ""
-    return f"{AT_RIM} (its cells hold {here:g} readings, where {typical:g} are typical)"
+    return f"{AT_RIM} (its cells hold {typical_here:g} readings, where {typical:g} are typical)"
 
 
-def extend_advice(short: dict[str, float]) -> str:
+def stroke_advice(shortfall: dict[str, float]) -> str:
     """Advice on the sides where the strokes end too early, the worst first; empty when none does."""
-    parts = [f"{mm:.0f} mm to {side}" for side, mm in sorted(short.items(), key=lambda one: -one[1]) if mm >= 0.5]
+    parts = [f"{mm:.0f} mm to {side}" for side, mm in sorted(shortfall.items(), key=lambda one: -one[1]) if mm >= 0.5]
     return f"extend the strokes {' and '.join(parts[:2])}" if parts else ""
 
 
-def undetected(weighed: Weighed, *, where: str) -> Abstention:
+def undetected_reason(weighed: WeighedRise, *, where: str) -> Abstention:
     """Reason when noise, or a rib-like ridge, explains the map as well as a lump."""
-    at, detection = weighed.centre_mm, weighed.detection
-    rise = f"no lump found {where}: what rises {_near(at)} is"
+    centre_mm, detection = weighed.centre_mm, weighed.detection
+    rise = f"no lump found {where}: what rises {_near_text(centre_mm)} is"
     if detection.ridge:
-        return Abstention("ridge", f"{rise} rather {detection.ridge}", FEEL_A_RIB, FEEL_A_RIB_ON_PAPER, at)
+        return Abstention("ridge", f"{rise} rather {detection.ridge}", FEEL_A_RIB, FEEL_A_RIB_ON_PAPER, centre_mm)
     if detection.probability < DETECTED:
         reason = f"no lump found {where}: errors of the map explain what rises as well as a lump does"
         return Abstention("undetected", reason, FEEL_AGAIN, FEEL_AGAIN_ON_PAPER)
     if weighed.axis_ratio > MOST_AXIS_RATIO:
-        return Abstention("ridge", f"{rise} a ridge, not a lump", FEEL_A_RIB, FEEL_A_RIB_ON_PAPER, at)
+        return Abstention("ridge", f"{rise} a ridge, not a lump", FEEL_A_RIB, FEEL_A_RIB_ON_PAPER, centre_mm)
     reason = f"{rise} wider or less covered than a lump: uneven fat, a rib and the map's rim look so"
-    return Abstention("undetected", reason, FEEL_AGAIN, FEEL_AGAIN_ON_PAPER, at)
+    return Abstention("undetected", reason, FEEL_AGAIN, FEEL_AGAIN_ON_PAPER, centre_mm)
 
 
 def shape_fault(sigma_x: FloatArray, sigma_y: FloatArray, *, cell_mm: float, prior: BumpPrior) -> Abstention | None:
@@ -312,26 +313,25 @@ def width_fault(x: float, y: float, *, cell_mm: float, margin: float) -> Abstent
 
 # --- Smallest lump that a map without one would have shown, by place and depth.
 #
-# A lump of a given size and depth makes a bump whose amplitude and width are known on average, with a spread over
-# stiffnesses and bodies. What amplitude a bump needs at a place follows from the map's coverage, readings and
-# errors there, by the evidence that decides about a lump. Simulated lumps tell how far above it a bump must be to
-# be found.
+# A lump of a given size and depth makes a bump of known mean amplitude and width, with a spread over stiffnesses and
+# bodies. The amplitude that has the evidence of a lump at a place follows from the map's coverage, readings and errors
+# there; simulated lumps give the margin above it that most detected ones had.
 
 PROBABILITY: Final = 0.95
 DEPTHS_IN_FAT: Final = (0.5, 0.75, 1.0)
-"""Depth of the lump's middle below the skin, over that of the fat: in it, and on its lower edge. In the gland a lump
-that is no stiffer does not show at all."""
+"""Depths of the lump's centre below the skin, over that of the fat: in it, and on its lower edge. In the gland a lump
+that is no stiffer does not show."""
 SIZES_MM: Final = np.arange(4.0, 30.5, 0.5)
 LEAST_DEPTH_RATIO: Final = 0.56
-"""Depth of the ball's middle, over its diameter: nearer to the skin no ball was simulated."""
-USUAL_FAT_MM: Final = 15.0  #: Where a map does not tell the depth of fat.
+"""Least simulated depth of a ball's centre, over its diameter."""
+USUAL_FAT_MM: Final = 15.0  #: Depth of fat where it is unknown.
 LOG_AMPLITUDE: Final = (-2.61, 3.393, -3.27, 1.003, 0.251, -0.049, -0.983)
 LOG_SIGMA: Final = (1.865, -0.168, 0.988, -0.155)
 """Coefficients of `lump_features`, and of its first four: ``python -m validation smallest_lump learn`` prints them."""
 LOG_FACTOR: Final = 10.0
 MARGIN: Final = 0.5
-"""ln of the expected amplitude over the one that `LOG_FACTOR` needs, from which 19 of 20 simulated lumps were found:
-stiffness, body and noise, and what the search misses (decision 0127)."""
+"""ln of the expected amplitude over that which `LOG_FACTOR` needs, above which 19 of 20 simulated lumps were detected:
+it allows for stiffness, body, noise and the search (decision 0127)."""
 MOST_PLACES: Final = 20
 WIDTHS_MM: Final = np.geomspace(2.0, 12.0, 6)
 AMPLITUDES: Final = np.geomspace(1e-3, 10.0, 120)
@@ -342,7 +342,7 @@ class SmallestLumps(Record, eq=False):
     """Diameters in mm of the smallest ball that a map would have shown with `PROBABILITY`."""
 
     places_mm: FloatArray  #: (n, 2) array: In `plane`.
-    depths_mm: FloatArray  #: (k,) array: Of the ball's middle below the skin.
+    depths_mm: FloatArray  #: (k,) array: Depths of the ball's centre below the skin.
     d_mm: FloatArray
     """(n, k) array: At each place for each depth; inf where not even the largest ball would have shown."""
     spacing_mm: float  #: Between the places.
@@ -354,25 +354,25 @@ def smallest_lumps(tactile_map: TactileMap, *, fat_mm: float | None = None) -> S
     needed = np.array([needed_amplitudes(tactile_map, (float(x), float(y))) for x, y in places])
     fat = USUAL_FAT_MM if fat_mm is None else fat_mm
     depths = np.round(fat * np.array(DEPTHS_IN_FAT))
-    columns = [_smallest(needed, float(depth), max(fat, float(depth))) for depth in depths]
+    columns = [_smallest_shown(needed, float(depth), max(fat, float(depth))) for depth in depths]
     return SmallestLumps(places, depths, np.stack(columns, axis=1), spacing)
 
 
 def _places(tactile_map: TactileMap) -> tuple[FloatArray, float]:
     """At most about `MOST_PLACES` covered places on a grid, and its spacing."""
-    mask, cell = trusted(tactile_map), tactile_map.recipe.cell_mm
+    mask, cell = trusted_cells(tactile_map), tactile_map.recipe.cell_mm
     spacing = float(np.sqrt(mask.sum() * cell**2 / MOST_PLACES))
     rows, columns = np.nonzero(mask)
     x, y = tactile_map.x_mm[columns], tactile_map.y_mm[rows]
     middle = (x.min() + x.max()) / 2, (y.min() + y.max()) / 2
     numbers = (int(np.ptp(one) / spacing / 2) for one in (x, y))
-    across, along = (at + spacing * np.arange(-n, n + 1) for at, n in zip(middle, numbers, strict=True))
+    across, along = (centre + spacing * np.arange(-n, n + 1) for centre, n in zip(middle, numbers, strict=True))
     grid = [(a, b) for b in along for a in across]
-    kept = [at for at in grid if covered_share(tactile_map, at, radius_mm=NEAR_MM) >= LEAST_SHARE]
+    kept = [centre for centre in grid if covered_share(tactile_map, centre, radius_mm=NEAR_MM) >= LEAST_SHARE]
     return np.array(kept or [middle]), spacing
 
 
-def _smallest(needed: FloatArray, depth_mm: float, fat_mm: float) -> FloatArray:
+def _smallest_shown(needed: FloatArray, depth_mm: float, fat_mm: float) -> FloatArray:
     """(n,) least of `SIZES_MM` that shows at each place; inf where none does."""
     features = lump_features(SIZES_MM, depth_mm, fat_mm)
     log_a = features @ np.array(LOG_AMPLITUDE)
@@ -380,10 +380,10 @@ def _smallest(needed: FloatArray, depth_mm: float, fat_mm: float) -> FloatArray:
     fits = depth_mm >= LEAST_DEPTH_RATIO * SIZES_MM
     sizes = np.full(len(needed), np.inf)
     for i, row in enumerate(needed):
-        least = np.interp(log_sigma, np.log(WIDTHS_MM), np.log(np.minimum(row, 1e9)))
-        shown = (log_a - least >= MARGIN) & fits
-        # from the largest down: what is larger shows, too
-        hidden = np.flatnonzero(~shown & fits)
+        threshold = np.interp(log_sigma, np.log(WIDTHS_MM), np.log(np.minimum(row, 1e9)))
+        is_shown = (log_a - threshold >= MARGIN) & fits
+        # the least size above which all sizes are shown
+        hidden = np.flatnonzero(~is_shown & fits)
         first = 0 if not len(hidden) else int(hidden[-1]) + 1
         if first < fits.sum():
             sizes[i] = SIZES_MM[first]
@@ -391,7 +391,7 @@ def _smallest(needed: FloatArray, depth_mm: float, fat_mm: float) -> FloatArray:
 
 
 def lump_features(d_mm: FloatArray, depth_mm: FloatArray | float, fat_mm: FloatArray | float) -> FloatArray:
-    """(n, 7) features of balls in fat: size, depth, and how far they stand out of the gland, with products."""
+    """(n, 7) features of balls in fat: log size, log depth and seat out of the gland, with products."""
     depth = np.broadcast_to(depth_mm, d_mm.shape)
     d, h, seat = np.log(d_mm / 10.0), np.log(depth / 15.0), np.tanh(2.0 * (fat_mm - depth) / d_mm)
     return np.stack([np.ones_like(d), d, h, seat, d * h, d**2, h**2], axis=-1)
@@ -400,7 +400,7 @@ def lump_features(d_mm: FloatArray, depth_mm: FloatArray | float, fat_mm: FloatA
 def needed_amplitudes(tactile_map: TactileMap, centre_mm: tuple[float, float]) -> FloatArray:
     """(widths,) amplitude at which a bump of each of `WIDTHS_MM` at a place reaches `LOG_FACTOR`; inf if none.
 
-    That is against the window's level, tilt and errors, without the price of the search.
+    The factor is against the window's level, tilt and errors, without the correction for the search.
     """
     cells = window_cells(tactile_map, centre_mm, radius_mm=FIT_RADIUS_MM)
     if len(cells) < LEAST_CELLS:
@@ -408,7 +408,7 @@ def needed_amplitudes(tactile_map: TactileMap, centre_mm: tuple[float, float]) -
     window = Window(cells, independent_variance(cells), cosines=FIELD_COSINES)
     problem = Problem(window, BumpPrior(), FIT_RADIUS_MM, value_scale(tactile_map))
     target = CollapsedTarget(problem, Scene("round"))
-    target.settle_lengths()
+    target.select_lengths()
     theta = np.array([[log(width), *centre_mm] for width in WIDTHS_MM])
     _, _, power, _, _ = target.conditional(theta)
     amplitudes = AMPLITUDES * value_scale(tactile_map)

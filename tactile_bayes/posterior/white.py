@@ -13,7 +13,7 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import Abstention, UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference import modes
-from tactile_bayes.inference.draws import ParameterDraws, Solved
+from tactile_bayes.inference.draws import ParameterDraws, SolutionCache
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.bump import (
@@ -38,8 +38,8 @@ from tactile_bayes.posterior.draw import (
     ROTATION_ODDS,
     MapPosterior,
     ModalBump,
-    Sampled,
     SamplerSettings,
+    SamplingTarget,
     draw_parameters,
 )
 from tactile_bayes.presets import Background, Method, Noise
@@ -80,10 +80,10 @@ class Target(Record, eq=False):
         rise = np.clip(np.concatenate(sse) - self.sse_min, 0.0, None) / self.errors.inflation
         return np.where(np.isfinite(rise), rise, np.inf)
 
-    def __call__(self, theta: FloatArray, solved: Solved | None = None) -> FloatArray:
+    def __call__(self, theta: FloatArray, solved: SolutionCache | None = None) -> FloatArray:
         """(m,) log density of (m, p) parameter vectors; -inf where the model overflows.
 
-        `solved` keeps the `excess` there for `draw_noise_sd`.
+        `solved` stores the `excess` there for `draw_noise_sd`.
         """
         excess = self.excess(theta)
         if solved is not None:
@@ -101,23 +101,23 @@ class Target(Record, eq=False):
 # --- Least-squares fit of a bump: candidates, window, weights, error model.
 
 START_WIDTHS_MM = (5.0, 2.0, 10.0)
-CLEAR = 0.8
-"""Share of a window's sum of squares: a bump that explains as much is the place, whatever other minima there are."""
+CLEAR_SHARE = 0.8
+"""Share of a window's sum of squares that a bump explains for no other minimum to be sought."""
 LEAST_COVERED_SHARE = 0.6
 LEAST_WIDTH_IN_CELLS = 0.5
 WIDEST_IN_RADII = 0.75
 MOST_AXIS_RATIO = 4.0
-CLOSE_IN_RADII = 0.6  #: Beside a rib 16 mm away a window of 12 mm holds more of the lump than of the rib.
+CLOSE_IN_RADII = 0.6  #: Radius of a small window, over the usual one: 12 mm hold less of a rib 16 mm away.
 PATIENCE = 16  #: Iterations: a clear lump takes 4 to 15.
 OUTGROWN, AT_RIM = "wider than the window", "at the rim of the map"
 FIT_TOLERANCE = 1e-8
 """Tolerance of the least squares, in units of `Bump.step_scale`: far below any error that a map has."""
-PLACE_TOLERANCE = 1e-2  #: The same where least squares only finds the place: the posterior's mode is sought from there.
-JOINED = 0.05  #: So near to a minimum, in the same units, a fit ends in it.
+PLACE_TOLERANCE = 1e-2  #: The same where least squares only gives a start for the posterior's mode.
+SAME_MINIMUM = 0.05  #: A fit this near to a known minimum, in the same units, is stopped.
 
 
 class BumpFit(Record, eq=False, dict=True):
-    """A least-squares bump, with all that the methods need."""
+    """A bump fitted by least squares: its cells, error model and covariance."""
 
     bump: Bump  #: The model.
     cells: FitCells  #: Of the window.
@@ -125,10 +125,10 @@ class BumpFit(Record, eq=False, dict=True):
     fit: modes.LeastSquaresFit  #: The minimum.
     errors: ErrorModel
     covariance: FloatArray
-    """(p, p) array: Of the parameters, correlated errors included, but under a noise field: its model has them."""
+    """(p, p) array: Of the parameters; with correlated errors, except under a noise field, which models them."""
     covered_share: float  #: Share of the disc of 1.5 widths about the centre that the map covers.
     prior: BumpPrior  #: Of the parameters.
-    width_sd_mm: None = None  #: Accuracies in mm are not offered, see `Drawable`.
+    width_sd_mm: None = None  #: Accuracies in mm are not offered, see `FittedBump`.
 
     @property
     def theta(self) -> FloatArray:
@@ -154,8 +154,8 @@ class BumpFit(Record, eq=False, dict=True):
     def target(self) -> Target:
         """Posterior density of the parameters.
 
-        The prior is of the bumps that `lump_fault` accepts: a rise, no wider than the window, its centre within it.
-        Without these bounds a background a little off its fixed level is "fitted" by a wide shallow dent.
+        The prior is bounded as in `lump_fault`: a rise, no wider than the window, its centre within it. Else a wide
+        shallow dent fits a background that is a little off its fixed level.
         """
         x, y = self.theta[1:3]
         radius = float(np.hypot(self.cells.x_mm - x, self.cells.y_mm - y).max())
@@ -176,7 +176,7 @@ class BumpFit(Record, eq=False, dict=True):
             dimension=len(self.theta),
         )
 
-    def at_mode(self, method: Method, number: int, rng: np.random.Generator) -> ParameterDraws:
+    def draw_at_mode(self, method: Method, number: int, rng: np.random.Generator) -> ParameterDraws:
         """Draw from the least-squares estimate, or from the posterior's mode, and the curvature there."""
         del number
         if method == "optimise":
@@ -184,12 +184,12 @@ class BumpFit(Record, eq=False, dict=True):
         scale = np.sqrt(np.diag(self.covariance))
         return modes.laplace(self.target, self.theta, scale=scale, dof=self.errors.dof, rng=rng)
 
-    def sampled(self, solved: Solved | None = None) -> Sampled:
-        """The density, which keeps its sums of squares in `solved`."""
+    def sampling_target(self, solved: SolutionCache | None = None) -> SamplingTarget:
+        """The density to sample, which stores its sums of squares in `solved`."""
         scale = np.sqrt(np.diag(self.covariance))
         mode, covariance, _ = modes.mode_and_covariance(self.target, self.theta, scale=scale)
         density = self.target if solved is None else partial(self.target, solved=solved)
-        return Sampled(density, mode, covariance)
+        return SamplingTarget(density, mode, covariance)
 
 
 class Candidate(Record, eq=False):
@@ -197,8 +197,8 @@ class Candidate(Record, eq=False):
 
     centre_mm: tuple[float, float]  #: Where the search began.
     fit: BumpFit | None  #: None where least squares found no minimum.
-    fault: str  #: Why the place cannot be a lump; empty when it can.
-    detection: Detection | None = None  #: Odds of a lump there; None where nobody has weighed them.
+    fault: str  #: Reason why the place cannot be a lump; empty without one.
+    detection: Detection | None = None  #: Odds of a bump there; None where they were not computed.
     assessed: ModalBump | None = None  #: The bump that the odds are of; None where it is the fit's.
 
     @property
@@ -217,8 +217,8 @@ def fitted_candidates(tactile_map: TactileMap, options: SamplerSettings) -> Iter
 def fit_bump(
     tactile_map: TactileMap, centre_mm: tuple[float, float], *, options: SamplerSettings
 ) -> tuple[BumpFit | None, str]:
-    """Fit a bump near `centre_mm`, which the window follows; None when none can be made at all, and why the bump cannot
-    be a lump, empty when it can."""
+    """Fit of a bump near `centre_mm`, which the window follows, or None; and the fault for which it cannot be a lump,
+    or empty."""
     check_background(tactile_map, options)
     level = None if options.background == "free" else tactile_map.background
     bump = Bump(rotated=options.rotation == "on", background=level, scale=value_scale(tactile_map))
@@ -229,12 +229,16 @@ def fit_bump(
         if len(cells) < len(bump.names) + 2:
             return None, f"{len(cells)} covered cells for {len(bump.names)} parameters"
         weight = np.ones(len(cells)) if weight_variance is None else count_weights(cells, weight_variance)
-        starts = [start] if start is not None else [_start(tactile_map, bump, cells, centre, width) for width in widths]
+        starts = (
+            [start]
+            if start is not None
+            else [_start_vector(tactile_map, bump, cells, centre, width) for width in widths]
+        )
         fit = _best_fit(bump, cells, starts, weight=weight, centre=centre, options=options)
-        moved = float(np.hypot(fit.theta[1] - centre[0], fit.theta[2] - centre[1]))
-        if not fit.converged or moved > options.fit_radius_mm / 2:
+        shift = float(np.hypot(fit.theta[1] - centre[0], fit.theta[2] - centre[1]))
+        if not fit.converged or shift > options.fit_radius_mm / 2:
             return None, "no bump that the window holds: the fit ran away"
-        settled = weight_variance is not None and moved < 0.25 * cells.cell_mm
+        settled = weight_variance is not None and shift < 0.25 * cells.cell_mm
         centre, start = (float(fit.theta[1]), float(fit.theta[2])), fit.theta
         weight_variance = float(np.mean(fit.residual**2))
         if settled:
@@ -250,21 +254,19 @@ def fit_bump(
     return result, lump_fault(result, options)
 
 
-def fit_close(
+def fit_in_small_window(
     tactile_map: TactileMap, centre_mm: tuple[float, float], *, options: SamplerSettings
 ) -> tuple[BumpFit | None, str]:
-    """Fit in a window of `CLOSE_IN_RADII`, where a neighbour would pull the bump away; it turns, so a ridge shows."""
+    """Fit in a window of `CLOSE_IN_RADII`, beside a neighbour that would attract the bump; rotated, to show a ridge."""
     near = replace(options, fit_radius_mm=CLOSE_IN_RADII * options.fit_radius_mm, rotation="on")
     return fit_bump(tactile_map, centre_mm, options=near)
 
 
 def default_errors(tactile_map: TactileMap) -> tuple[Background, Noise]:
-    """Default background and noise, where neither an option nor a size calibration decides.
+    """Default background and noise, where neither an option nor a size calibration decides (docs/decisions/0071).
 
-    As the paper printed it where the level is known. Without a level the background is free, under correlated errors,
-    which also take a sloping level: least squares alone then takes a slope for errors and its intervals grow several
-    times too wide. A grid of single values, such as a picture, says nothing of its errors; there what the field would
-    take up is the shape itself, so its errors are independent (docs/decisions/0071).
+    The paper's where the level is known. Else a free background under correlated errors, or under independent ones for
+    a grid of single values, where a noise field would fit the shape itself.
     """
     if tactile_map.background is not None:
         return "fixed", "independent"
@@ -272,11 +274,8 @@ def default_errors(tactile_map: TactileMap) -> tuple[Background, Noise]:
 
 
 def check_background(tactile_map: TactileMap, options: SamplerSettings) -> None:
-    """Refuse a fixed background for a map whose level is not known.
-
-    The map's median, which is the nearest guess, moves with the lump itself: nominal 90 % intervals of widths then
-    cover 4 to 29 % (docs/coverage.md).
-    """
+    """`UsageError` for a fixed background of a map whose level is not known: fixed at the map's median, intervals of
+    widths cover 4 to 29 % instead of 90 % (docs/coverage.md)."""
     if options.background == "fixed" and tactile_map.background is None:
         raise UsageError(
             f"the map's level far from a lump is not known (normalise {tactile_map.recipe.normalise}), so a background "
@@ -295,45 +294,45 @@ def _best_fit(
 ) -> modes.LeastSquaresFit:
     """The lowest minimum from several starts.
 
-    One that leaves the window, outgrows it or comes to a minimum that another has found is not followed further. Under
-    a noise field least squares only finds the place: it need not dwell on a rise that is hardly one, nor look for
-    another minimum beside one that is `CLEAR`.
+    A fit that leaves the window, outgrows it or comes to a known minimum is abandoned. Under a noise field least
+    squares only finds the place: it has little `PATIENCE`, and ends with a minimum of `CLEAR_SHARE`.
     """
     radius_mm, place_only = options.fit_radius_mm, options.correlated
     fits: list[modes.LeastSquaresFit] = []
 
-    def lost(theta: FloatArray) -> bool:
-        away = np.hypot(theta[1] - centre[0], theta[2] - centre[1]) > radius_mm
+    def is_abandoned(theta: FloatArray) -> bool:
+        outside = np.hypot(theta[1] - centre[0], theta[2] - centre[1]) > radius_mm
         outgrown = max(bump.widths(theta)[:2]) > 4.0 * radius_mm
-        reached = [other.theta for other in fits if other.converged]
-        joins = any((np.abs(theta - other) < JOINED * bump.step_scale).all() for other in reached)
-        return bool(away or outgrown or joins)
+        minima = [fit_.theta for fit_ in fits if fit_.converged]
+        joins = any((np.abs(theta - fit_) < SAME_MINIMUM * bump.step_scale).all() for fit_ in minima)
+        return bool(outside or outgrown or joins)
 
     mean = float(weight @ cells.value) / float(weight.sum())
     about_mean = float(weight @ (cells.value - mean) ** 2)
-    for begin in starts:
+    for start in starts:
         fit = modes.fit_least_squares(
             lambda theta: bump.predict(theta, cells),
-            begin,
+            start,
             data=cells.value,
             weight=weight,
             scale=bump.step_scale,
             tolerance=PLACE_TOLERANCE if place_only else FIT_TOLERANCE,
-            abandon=lost,
+            abandon=is_abandoned,
             patience=PATIENCE if place_only else None,
         )
         fits.append(fit)
-        if place_only and fit.converged and fit.sse < (1.0 - CLEAR) * about_mean:
+        if place_only and fit.converged and fit.sse < (1.0 - CLEAR_SHARE) * about_mean:
             break
     return min(fits, key=lambda fit: (not fit.converged, fit.sse))
 
 
-def _start(
+def _start_vector(
     tactile_map: TactileMap, bump: Bump, cells: FitCells, centre: tuple[float, float], width_mm: float
 ) -> FloatArray:
+    """Start parameters: a round bump of this width at a centre, as high as the map there."""
     level = typical_level(tactile_map)
-    near = np.argmin((cells.x_mm - centre[0]) ** 2 + (cells.y_mm - centre[1]) ** 2)
-    height = float(cells.value[near]) - level
+    nearest = np.argmin((cells.x_mm - centre[0]) ** 2 + (cells.y_mm - centre[1]) ** 2)
+    height = float(cells.value[nearest]) - level
     values = {"amplitude": height or bump.scale, "x_mm": centre[0], "y_mm": centre[1], "background": level}
     values["p"] = float(np.log(max(width_mm, 0.6 * cells.cell_mm)))
     return np.array([values.get(name, 0.0) for name in bump.names])
@@ -364,20 +363,19 @@ def rotation_odds(
 
     The Savage-Dickey ratio at r = 0 of the larger model: prior over posterior density there.
     """
-    turned, fault = fit_bump(tactile_map, unrotated.centre_mm, options=replace(options, rotation="on"))
-    if turned is None or fault:
+    rotated, fault = fit_bump(tactile_map, unrotated.centre_mm, options=replace(options, rotation="on"))
+    if rotated is None or fault:
         return 0.0, None
-    r, sd = float(turned.theta[5]), float(np.sqrt(turned.covariance[5, 5]))
+    r, sd = float(rotated.theta[5]), float(np.sqrt(rotated.covariance[5, 5]))
     log_odds = np.log(sd / options.log_ratio_sd) + 0.5 * (r / sd) ** 2
-    return float(np.exp(np.clip(log_odds, -700, 700))), turned
+    return float(np.exp(np.clip(log_odds, -700, 700))), rotated
 
 
 # --- Detection of a lump: evidence for a bump against noise alone, over the whole map.
 
-LENGTHS_IN_WIDTHS = (0.35, 0.7, 1.4, 2.8, 5.6)
-"""Correlation lengths tried for the noise, in widths of the bump under test."""
+LENGTHS_IN_WIDTHS = (0.35, 0.7, 1.4, 2.8, 5.6)  #: Correlation lengths of the noise, in widths of the bump under test.
 FIELD_SHARES = (0.5, 0.9, 0.99)
-"""Share of the error variance that is correlated; none of it is as likely as each of them, at every length."""
+"""Shares of the error variance that is correlated; at every length 0 is as likely a priori as each of them."""
 MOST_BLOCKS = 480
 
 
@@ -392,18 +390,15 @@ class _Blocks(Record, eq=False):
 
 
 def detect(tactile_map: TactileMap, fit: BumpFit) -> Detection:
-    """Bayes factor of "a bump of this shape somewhere on the map" against "correlated noise on a level background".
+    """Bayes factor of a bump of this shape somewhere on the map against correlated noise on a level background.
 
-    Both models carry the same noise, an exponentially
-    correlated field plus independent errors, whose length and share are averaged over a grid. The field is either alike
-    all over the map, as the model's misfit is, or larger where readings are few, as errors are that a frame's readings
-    share: few frames reach the map's rim, and with the same errors there as in the middle a rise of the rim would be
-    "detected". Level, amplitude and noise scale are integrated out; position and widths enter by their Laplace volume
-    against the map's area and the prior (the Occam factor, MacKay 2003, Information Theory, Inference, and Learning
-    Algorithms, ch. 28), so that a search over a large map costs what it should. A lump-free map has bumps of its own,
-    and with independent noise each would be "detected".
+    The noise of both models is an exponentially correlated field plus independent errors, averaged over a grid of
+    lengths and shares; the field's variance is constant or goes with 1 / count, as that of errors which a frame's
+    readings share. Level, amplitude and noise scale are integrated out; position and widths enter by their Laplace
+    volume over the map's area and the prior: the Occam factor, MacKay (2003), Information Theory, Inference, and
+    Learning Algorithms, ch. 28.
     """
-    blocks = _blocks(tactile_map, fit)
+    blocks = _block_means(tactile_map, fit)
     if len(blocks.value) < 8 or fit.theta[0] <= 0:
         return Detection(-np.inf)
     sigma_x, sigma_y, _ = fit.widths()
@@ -412,7 +407,7 @@ def detect(tactile_map: TactileMap, fit: BumpFit) -> Detection:
     return Detection(lump - null + _log_occam_factor(tactile_map, fit))
 
 
-def _blocks(tactile_map: TactileMap, fit: BumpFit) -> _Blocks:
+def _block_means(tactile_map: TactileMap, fit: BumpFit) -> _Blocks:
     cell = tactile_map.recipe.cell_mm
     side = max(1, int(min(fit.widths()[:2]) / cell))
     radius = np.sqrt(MOST_BLOCKS / pi) * side * cell
@@ -421,10 +416,10 @@ def _blocks(tactile_map: TactileMap, fit: BumpFit) -> _Blocks:
         return _Blocks(*[np.zeros(0)] * 5)
     key = (cells.row // side) * (int(cells.column.max()) // side + 1) + cells.column // side
     _, index, number = np.unique(key, return_inverse=True, return_counts=True)
-    keep = number >= 0.5 * side**2
-    averaged = (cells.x_mm, cells.y_mm, cells.value, fit.bump.unit_bump(fit.theta[None], cells)[0], 1.0 / cells.count)
-    x, y, value, template, reading = ((np.bincount(index, one) / number)[keep] for one in averaged)
-    return _Blocks(x, y, value, template, reading / number[keep])
+    is_full = number >= 0.5 * side**2
+    columns = (cells.x_mm, cells.y_mm, cells.value, fit.bump.unit_bump(fit.theta[None], cells)[0], 1.0 / cells.count)
+    x, y, value, template, reading_variance = ((np.bincount(index, one) / number)[is_full] for one in columns)
+    return _Blocks(x, y, value, template, reading_variance / number[is_full])
 
 
 def _log_evidences(blocks: _Blocks, width_mm: float, *, amplitude_sd: float) -> tuple[float, float]:
@@ -435,9 +430,9 @@ def _log_evidences(blocks: _Blocks, width_mm: float, *, amplitude_sd: float) -> 
     white = _log_evidence_pair(blocks, np.diag(nugget), amplitude_sd=amplitude_sd)
     pairs = [np.array(white) + log(len(scales) * len(LENGTHS_IN_WIDTHS))]
     for length in LENGTHS_IN_WIDTHS:
-        alike = np.exp(-distance / (length * width_mm))
+        correlation = np.exp(-distance / (length * width_mm))
         for scale in scales:
-            field = alike * scale[:, None] * scale
+            field = correlation * scale[:, None] * scale
             for share in FIELD_SHARES:
                 errors = share * field + (1.0 - share) * np.diag(nugget)
                 pairs.append(np.array(_log_evidence_pair(blocks, errors, amplitude_sd=amplitude_sd)))
@@ -449,12 +444,12 @@ def _log_evidence_pair(blocks: _Blocks, errors: FloatArray, *, amplitude_sd: flo
     """Log evidence without and with the bump for errors of one covariance (n, n), up to a common constant."""
     n = len(blocks.value)
     factor = np.linalg.cholesky(errors + 1e-9 * np.eye(n))
-    white = np.linalg.solve(factor, np.stack([np.ones(n), blocks.value, blocks.template], axis=1))
-    one, y, g = white.T
+    whitened = np.linalg.solve(factor, np.stack([np.ones(n), blocks.value, blocks.template], axis=1))
+    ones, y, g = whitened.T
     half_log_det = float(np.log(np.diag(factor)).sum())
-    level = one @ one
-    y = y - one * (one @ y) / level
-    g = g - one * (one @ g) / level
+    level = ones @ ones
+    y = y - ones * (ones @ y) / level
+    g = g - ones * (ones @ g) / level
     tiny = np.finfo(float).tiny
     rss = max(float(y @ y), tiny)
     null = -half_log_det - 0.5 * log(level) + lgamma((n - 1) / 2) - (n - 1) / 2 * log(pi * rss)
@@ -462,9 +457,9 @@ def _log_evidence_pair(blocks: _Blocks, errors: FloatArray, *, amplitude_sd: flo
     amplitude = float(g @ y) / power if power > 0 else 0.0
     if not power > 1e-12 or amplitude <= 0:
         return null, -np.inf
-    left = max(rss - power * amplitude**2, 1e-12 * rss)
+    residual = max(rss - power * amplitude**2, 1e-12 * rss)
     prior = -0.5 * (amplitude / amplitude_sd) ** 2 - log(amplitude_sd) - 0.5 * log(2 * pi)
-    lump = -half_log_det - 0.5 * log(level * power) + lgamma((n - 2) / 2) - (n - 2) / 2 * log(pi * left) + prior
+    lump = -half_log_det - 0.5 * log(level * power) + lgamma((n - 2) / 2) - (n - 2) / 2 * log(pi * residual) + prior
     return null, lump
 
 
@@ -489,7 +484,7 @@ def _log_occam_factor(tactile_map: TactileMap, fit: BumpFit) -> float:
 class MapDraws(Record, eq=False):
     """Posterior draws of one lump under a noise model, and its size."""
 
-    detection: Detection  #: The odds of a lump, as the draws left them.
+    detection: Detection  #: The odds of a bump, with the evidence from the draws where they give it.
     fit: BumpFit  #: The least-squares fit that the draws started from.
     draws: ParameterDraws  #: Draws of the model's own parameters.
     posterior: MapPosterior  #: The joint draws by name.
@@ -499,8 +494,8 @@ class MapDraws(Record, eq=False):
     fault: Abstention | None = None  #: Why there is no size; None also without a calibration.
 
 
-class White(Record, eq=False):
-    """A place on a map under independent errors."""
+class WhiteAssessment(Record, eq=False):
+    """Assessment of a place on a map under independent errors."""
 
     tactile_map: TactileMap
     fit: BumpFit
@@ -516,19 +511,19 @@ class White(Record, eq=False):
         """Draw from the posterior, rotated where the odds favour it."""
         fit, odds = self.fit, None
         if options.rotation == "auto":
-            odds, turned = rotation_odds(self.tactile_map, fit, options=options)
-            fit = turned if turned is not None and odds > ROTATION_ODDS else fit
-        solved = Solved(lambda theta: (fit.target.excess(theta),))
-        draws, _ = draw_parameters(fit, options, rng=rng, progress=progress, solved=solved)
+            odds, rotated = rotation_odds(self.tactile_map, fit, options=options)
+            fit = rotated if rotated is not None and odds > ROTATION_ODDS else fit
+        cache = SolutionCache(lambda theta: (fit.target.excess(theta),))
+        draws, _ = draw_parameters(fit, options, rng=rng, progress=progress, solved=cache)
         theta = draws.theta
         sigma_x, sigma_y, angle = drawn_widths(*fit.bump.shape_parameters(theta))
-        # two of the methods are linear about the mode: for them the exact figure would cost more than all the rest
+        # optimise and laplace are linear about the mode: the exact excess would cost more than all the rest
         if draws.method in ("ensemble", "importance"):
-            excess = solved(draws.flat)[0]
+            excess = cache(draws.flat)[0]
         else:
             information = fit.fit.jacobian.T @ (fit.weight[:, None] * fit.fit.jacobian)
-            off = draws.flat - fit.theta
-            excess = np.einsum("mp,pq,mq->m", off, information, off) / fit.errors.inflation
+            offset = draws.flat - fit.theta
+            excess = np.einsum("mp,pq,mq->m", offset, information, offset) / fit.errors.inflation
         posterior = MapPosterior(
             amplitude=theta[..., 0],
             sigma_x_mm=sigma_x,

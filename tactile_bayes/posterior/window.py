@@ -40,13 +40,13 @@ from tactile_bayes.presets import FIELD_COSINES, FINE_FIELD_COSINES
 # Solin & Saerkkae (2020), Statistics and Computing 30:419 (the basis); Rasmussen & Williams (2006), ch. 4 (the
 #   spectrum).
 
-MARGIN = 1.3  #: Width of the rectangle in widths of the window: the field need not be flat where the window ends.
+MARGIN = 1.3  #: Side of the rectangle over that of the window, at whose edge the field then need not be flat.
 LENGTHS_MM = (1.5, 3.0, 6.0, 12.0)
 SHARES = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 """Variances of the field tried, over the mean independent variance of a cell."""
 HALF_WAVE_IN_WIDTHS = 0.83
-"""The shortest half wave that a bump's width calls for: below 3.5 mm, in a window of 20 mm, more than the fewest."""
-TOUCHED = 1e-2  #: Directions in which the field's variance is a smaller part of the independent one are dropped.
+"""Shortest half wave of the cosines, in widths of the bump: widths below 3.5 mm need more than `FIELD_COSINES`."""
+LEAST_FIELD_VARIANCE = 1e-2  #: Directions with a smaller variance of the field, over the independent one, are dropped.
 
 
 def spectrum(frequency2: FloatArray, length_mm: float) -> FloatArray:
@@ -73,8 +73,8 @@ class Whitening(Record, eq=False):
         return cls(length_mm, root[:, None] * vectors[:, keep], values[keep])
 
     def pruned(self, share: float) -> Whitening:
-        """Copy without the directions that matter little at this share or a smaller one."""
-        keep = share * self.eigenvalues > TOUCHED
+        """Copy without the directions that are negligible up to this share."""
+        keep = share * self.eigenvalues > LEAST_FIELD_VARIANCE
         return Whitening(self.length_mm, np.ascontiguousarray(self.turn[:, keep]), self.eigenvalues[keep])
 
 
@@ -89,10 +89,8 @@ def cosine_profiles(axis_mm: FloatArray, *, cosines: int = FIELD_COSINES) -> tup
 
 
 def cosines_for(width_mm: float, axis_mm: FloatArray) -> int:
-    """Number of cosines along an axis for a bump's width, from `FIELD_COSINES` to `FINE_FIELD_COSINES`.
-
-    Errors shorter than the shortest half wave count as independent, which for a narrow bump they are not.
-    """
+    """Number of cosines along an axis for a bump's width, from `FIELD_COSINES` to `FINE_FIELD_COSINES`: errors shorter
+    than the shortest half wave are modelled as independent."""
     _, side = _phase(axis_mm)
     wanted = np.ceil(side / (HALF_WAVE_IN_WIDTHS * max(width_mm, 1e-6)))
     return int(np.clip(wanted, FIELD_COSINES, FINE_FIELD_COSINES))
@@ -105,7 +103,7 @@ def _phase(axis_mm: FloatArray) -> tuple[FloatArray, float]:
 
 
 def gram_of_cosines(along: FloatArray, across: FloatArray, *, weight: FloatArray) -> FloatArray:
-    """(cosines^2, cosines^2) inner products of the plane's cosines under (ny, nx) weights, y's order counted first."""
+    """(cosines^2, cosines^2) inner products of the plane's cosines under (ny, nx) weights, y's order first."""
     pairs = [(one[:, :, None] * one[:, None, :]).reshape(len(one), -1) for one in (along, across)]
     cosines = along.shape[1]
     # axes: y, y', x, x'
@@ -115,10 +113,10 @@ def gram_of_cosines(along: FloatArray, across: FloatArray, *, weight: FloatArray
 
 # --- The fit window as a regular grid, with fast separable inner products of Gaussian templates and the noise basis.
 #
-# A Gaussian along the grid's axes is a product of two profiles, and so are the cosines: an inner product costs the
-# work of the grid's rows, not of its cells times the cosines. Cells that the map does not cover have weight 0.
+# A Gaussian along the grid's axes is a product of two profiles, and so are the cosines: an inner product is computed
+# row by row, not cell by cell. Cells that the map does not cover have weight 0.
 
-RESOLVED = 3.0  #: Widths above as many cells need no more than a cell's variance.
+RESOLVED = 3.0  #: Widths in cells above which the fourth cumulant of a cell is negligible.
 
 
 class Projected(Record, eq=False):
@@ -266,8 +264,8 @@ def cell_mean_profile(
 ) -> FloatArray:
     """(m, k) means over cells of one-dimensional Gaussians, of unit height before a blur of this SD.
 
-    They are the factors of `cell_mean_gaussian`, but for the two corrections of its series, which are multiplied here
-    and added there: a difference of the order of the terms that both leave out.
+    The factors of `cell_mean_gaussian`, to the order of the terms that both leave out: its two corrections are
+    multiplied here and added there.
     """
     blurred = np.hypot(sigma_mm, blur_mm)
     wide = (blurred**2 + cell_mm**2 / 12.0)[:, None]
@@ -303,7 +301,7 @@ class Problem(Record, eq=False, dict=True):
     prior: BumpPrior  #: On widths and amplitudes.
     radius_mm: float  #: Radius of the window; bounds the centre about the window's middle.
     amplitude_scale: float = 1.0  #: Unit of the amplitudes' prior, see `bump.value_scale`.
-    departure: FloatArray | None = None  #: (k, n) array: Further fixed columns, see `fit.ask_departure`; None for none.
+    departure: FloatArray | None = None  #: (k, n) array: Further fixed columns, see `fit.add_departure`; None for none.
 
     @cached_property
     def widest_mm(self) -> float:
@@ -314,11 +312,9 @@ class Problem(Record, eq=False, dict=True):
 # --- Solutions for the linear parameters (amplitudes, level, tilt) given the shape, for many shapes and noise fields.
 
 FLOOR = 1e-9
-"""Share of the data's sum of squares that is noise in any case: 3e-5 of the signal, less than any sensor's steps.
-Without it a map free of noise leaves differences of large sums, which are rounding."""
-
-LEAST_POWER = 1e-9
-"""Power of a template, over what the prior on its amplitude is worth: less tells nothing and would only overflow."""
+"""Least share of the data's sum of squares that is noise, 3e-5 of the signal: for a map without noise the residual sum
+of squares would be rounding."""
+LEAST_POWER = 1e-9  #: Least power of a template over the precision of its amplitude's prior, against overflow.
 
 
 class LinearSolution(NamedTuple):
@@ -327,7 +323,7 @@ class LinearSolution(NamedTuple):
     evidence: FloatArray  #: (m, h) array: Log of the fields' prior times their evidence.
     amplitude: FloatArray  #: (m, h, v) array: Conditional means under a flat prior.
     power: FloatArray  #: (m, h, v, v) array: Their precision times tau^2.
-    level_slope: FloatArray  #: (m, h, v, c) array: By how much level and tilt fall as an amplitude rises.
+    level_slope: FloatArray  #: (m, h, v, c) array: Decrease of level and tilt per increase of an amplitude.
     sum_of_squares: FloatArray  #: (m, h) array.
 
 
@@ -338,13 +334,12 @@ class FieldColumns(Record, eq=False):
     shares: FloatArray  #: (h,) array.
     log_prior: float  #: Log prior probability of each share.
     weight: FloatArray
-    """(k, h) array: Of the squared projections that the field takes away, ``rho / (1 + rho lambda)``; a column a share.
-    """
-    plain: FloatArray  #: (k, h * (c + 1)) array: Projections of the fixed columns and the data, so weighted.
-    gram: FloatArray  #: (h, c + 1, c + 1) array: Columns and data with each other.
-    inverse: FloatArray  #: (h, c, c) array: Of the columns' part.
+    """(k, h) array: Weight of the squared projections that the field removes, ``rho / (1 + rho lambda)``, per share."""
+    plain: FloatArray  #: (k, h * (c + 1)) array: Projections of the fixed columns and the data, times `weight`.
+    gram: FloatArray  #: (h, c + 1, c + 1) array: Inner products of columns and data.
+    inverse: FloatArray  #: (h, c, c) array: Inverse of the columns' part of `gram`.
     log_det: FloatArray  #: (h,) array: Log determinant of the covariance (over that of D) and of the columns' part.
-    floor: float  #: Sum of squares that is noise in any case.
+    floor: float  #: Least sum of squares, see `FLOOR`.
 
     def rest(self) -> FloatArray:
         """(h,) residual sum of squares of the fixed columns alone."""
@@ -369,11 +364,11 @@ class Inner(Record, eq=False):
     plain: FloatArray  #: (m, h, c + 1) array: With the fixed columns and the data.
     square: FloatArray  #: (m, h) array: With themselves.
     low: FloatArray
-    """(m, k) array: Projections on the field's directions; none where templates are never held against others."""
+    """(m, k) array: Projections on the field's directions; empty where no `product` is needed."""
 
     @classmethod
     def of(cls, projected: Projected, columns: FieldColumns) -> Inner:
-        """Inner products from those without a field."""
+        """Inner products under the fields, from those without a field."""
         low = projected.low @ columns.field.turn
         taken = (low @ columns.plain).reshape(len(low), len(columns.shares), -1)
         return cls(projected.plain[:, None, :] - taken, projected.square[:, None] - low**2 @ columns.weight, low)
@@ -388,8 +383,8 @@ class Inner(Record, eq=False):
 
 
 NEGLIGIBLE = 1e-3
-"""Fields with a smaller share of the evidence are left out of the mixture; what they add at the mode is made up for.
-Once a length has as little, and less than the one before it, shorter ones are not looked at."""
+"""Fields with a smaller share of the evidence are left out of the mixture, and their evidence at the mode is added as a
+constant. Lengths are tried from the longest until one has as little, and less than the one before it."""
 
 
 class LinearModel:
@@ -398,23 +393,23 @@ class LinearModel:
     def __init__(self, problem: Problem, *, tilt: bool) -> None:
         self.window = window = problem.window
         self.amplitude_sd = problem.prior.amplitude_sd * problem.amplitude_scale
-        # without its mean, a large level does not cost the digits that the bump is in
+        # centred, so that a large level costs no digits of the bump
         self.mean = float(np.mean(window.cells.value))
-        fixed = [linear_columns(window.cells, tilt=tilt)]
-        fixed += [] if problem.departure is None else [problem.departure]
-        self.plain = np.concatenate([*fixed, (window.cells.value - self.mean)[None]])
-        scaled = self.plain / window.variance
-        self.weighted = window.on_grid(scaled)
-        self._gram = self.plain @ scaled.T
+        fixed_columns = [linear_columns(window.cells, tilt=tilt)]
+        fixed_columns += [] if problem.departure is None else [problem.departure]
+        self.plain = np.concatenate([*fixed_columns, (window.cells.value - self.mean)[None]])
+        weighted_columns = self.plain / window.variance
+        self.weighted = window.on_grid(weighted_columns)
+        self._gram = self.plain @ weighted_columns.T
         self._low = window.project(window.on_grid(self.plain), self.weighted).low
         self._lengths: dict[float, FieldColumns] = {}
 
     def dof(self, structures: int) -> int:
-        """Degrees of freedom of the noise scale beside so many structures."""
+        """Degrees of freedom of the noise scale with so many structures."""
         return max(len(self.plain[0]) - len(self.plain) + 1 - structures, 1)
 
     def columns(self, field: Whitening, shares: FloatArray) -> FieldColumns:
-        """Level, tilt and data under the fields of one length; without a field, all lengths are one."""
+        """Level, tilt and data under the fields of one length; shares of 0 count once for all lengths."""
         log_prior = -float(np.log(len(LENGTHS_MM) * len(SHARES)))
         log_prior += 0.0 if shares.any() else float(np.log(len(LENGTHS_MM)))
         low, power = self._low @ field.turn, shares[:, None] * field.eigenvalues
@@ -435,52 +430,50 @@ class LinearModel:
         """No field, then each length from the longest on with all shares, computed when reached."""
         shares = np.array(SHARES)
         for length in (0.0, *sorted(LENGTHS_MM, reverse=True)):
-            chosen = shares[(shares > 0) == (length > 0)]
-            if not len(chosen):
+            of_length = shares[(shares > 0) == (length > 0)]
+            if not len(of_length):
                 continue
             if length not in self._lengths:
                 cosines = self.window.cosines**2  # a share of 0, the same for every length, has no directions
-                none = Whitening(float(np.mean(LENGTHS_MM)), np.zeros((cosines, 0)), np.zeros(0))
-                self._lengths[length] = self.columns(self.window.field(length) if length else none, chosen)
+                no_field = Whitening(float(np.mean(LENGTHS_MM)), np.zeros((cosines, 0)), np.zeros(0))
+                self._lengths[length] = self.columns(self.window.field(length) if length else no_field, of_length)
             yield self._lengths[length]
 
     def with_evidence(self, templates: list[Templates]) -> tuple[list[FieldColumns] | None, float]:
-        """The fields with evidence beside one template of each structure, and the log evidence that the others add.
-
-        None and 0 where no field has any.
-        """
+        """The fields with evidence for one template of each structure, and the log evidence that the others add; None
+        and 0 where no field has any."""
         projected, cross = self.projected(templates)
-        walked, total = self._walk(lambda columns: self.under(projected, cross, columns).evidence[0])
+        by_length, total = self._evidence_by_length(lambda columns: self.under(projected, cross, columns).evidence[0])
         if not np.isfinite(total):
             return None, 0.0
-        kept = [(columns, one > total + np.log(NEGLIGIBLE)) for columns, one in walked]
+        selected = [(columns, evidence > total + np.log(NEGLIGIBLE)) for columns, evidence in by_length]
         fields = [
             self.columns(columns.field.pruned(float(columns.shares[keep].max())), columns.shares[keep])
-            for columns, keep in kept
+            for columns, keep in selected
             if keep.any()
         ]
-        left = np.concatenate([self.under(projected, cross, columns).evidence[0] for columns in fields])
-        return fields, total - float(np.logaddexp.reduce(left))
+        kept_evidence = np.concatenate([self.under(projected, cross, columns).evidence[0] for columns in fields])
+        return fields, total - float(np.logaddexp.reduce(kept_evidence))
 
     def without_structure(self) -> tuple[list[FieldColumns], float]:
         """The lengths with evidence for level and tilt alone, with all their shares, and the log evidence of all."""
-        walked, total = self._walk(lambda columns: columns.null_evidence(dof=self.dof(0)))
-        return [columns for columns, one in walked if one.max() > total + np.log(NEGLIGIBLE)], total
+        by_length, total = self._evidence_by_length(lambda columns: columns.null_evidence(dof=self.dof(0)))
+        return [columns for columns, evidence in by_length if evidence.max() > total + np.log(NEGLIGIBLE)], total
 
-    def _walk(
+    def _evidence_by_length(
         self, evidence: Callable[[FieldColumns], FloatArray]
     ) -> tuple[list[tuple[FieldColumns, FloatArray]], float]:
-        """Evidence without a field, then from the longest length down, until it has vanished; and its log sum."""
-        walked: list[tuple[FieldColumns, FloatArray]] = []
-        best = before = -np.inf
+        """Evidence without a field, then from the longest length down until it is negligible; and its log sum."""
+        by_length: list[tuple[FieldColumns, FloatArray]] = []
+        best = previous = -np.inf
         for columns in self.every_field():
-            one = evidence(columns)
-            walked.append((columns, one))
-            if one.max() < min(before, best + np.log(NEGLIGIBLE)):
+            of_length = evidence(columns)
+            by_length.append((columns, of_length))
+            if of_length.max() < min(previous, best + np.log(NEGLIGIBLE)):
                 break
-            best = max(best, float(one.max()))
-            before = float(one.max()) if columns.shares[0] > 0 else -np.inf
-        return walked, float(np.logaddexp.reduce(np.concatenate([one for _, one in walked])))
+            best = max(best, float(of_length.max()))
+            previous = float(of_length.max()) if columns.shares[0] > 0 else -np.inf
+        return by_length, float(np.logaddexp.reduce(np.concatenate([of_length for _, of_length in by_length])))
 
     def projected(self, templates: list[Templates]) -> tuple[list[Projected], FloatArray | None]:
         """Inner products of one or two structures' templates, and those of two with each other."""
@@ -490,10 +483,10 @@ class LinearModel:
     def under_each(self, templates: list[Templates], fields: list[FieldColumns]) -> LinearSolution:
         """Solutions for each structure's (m,) templates under all fields."""
         projected, cross = self.projected(templates)
-        return joined([self.under(projected, cross, columns) for columns in fields], axis=1)
+        return concatenated([self.under(projected, cross, columns) for columns in fields], axis=1)
 
     def under(self, projected: list[Projected], cross: FloatArray | None, columns: FieldColumns) -> LinearSolution:
-        """The same under one length, from inner products without a field."""
+        """Solutions under one length, from inner products without a field."""
         inner = [Inner.of(one, columns) for one in projected]
         return self.solve(inner, None if cross is None else inner[0].product(inner[1], cross, columns), columns)
 
@@ -509,29 +502,28 @@ class LinearModel:
             return np.asarray(product - np.sum(to_level[i] * plain[j][:, :, :c], axis=2))
 
         rest, floor = columns.rest(), columns.floor
-        # a template with hardly any weight in the window, beyond its rim or between its cells, leaves the prior
-        # unchanged
+        # a template with hardly any weight in the window leaves the prior unchanged
         least = LEAST_POWER * (np.maximum(rest, 0.0) + floor) / dof / self.amplitude_sd**2
         diagonal = [np.maximum(power(i, i, one.square), least) for i, one in enumerate(inner)]
         if cross is None:
-            structures = _one(along[0], diagonal[0], rest, floor, dof=dof, amplitude_sd=self.amplitude_sd)
+            structures = _one_structure(along[0], diagonal[0], rest, floor, dof=dof, amplitude_sd=self.amplitude_sd)
         else:
             between = power(0, 1, cross)
-            structures = _two(along, diagonal, between, rest, floor, dof=dof, amplitude_sd=self.amplitude_sd)
+            structures = _two_structures(along, diagonal, between, rest, floor, dof=dof, amplitude_sd=self.amplitude_sd)
         log_factor, amplitude, matrix, squares = structures
         constant = columns.log_prior - 0.5 * columns.log_det + lgamma(dof / 2) - 0.5 * dof * log(pi)
         evidence = constant + log_factor - 0.5 * dof * np.log(squares)
-        # a dent is no lump: only rises have density
+        # only rises have density
         evidence = np.where((amplitude > 0).all(axis=2), evidence, -np.inf)
         return LinearSolution(evidence, amplitude, matrix, np.stack(to_level, axis=2), squares)
 
 
-def joined(solutions: Iterable[LinearSolution], *, axis: int) -> LinearSolution:
+def concatenated(solutions: Iterable[LinearSolution], *, axis: int) -> LinearSolution:
     """Concatenate the fields of several lengths (1), or blocks of shapes (0)."""
     return LinearSolution(*(np.concatenate(parts, axis=axis) for parts in zip(*solutions, strict=True)))
 
 
-def _one(
+def _one_structure(
     along: FloatArray, power: FloatArray, rest: FloatArray, floor: float, *, dof: int, amplitude_sd: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Log factor, amplitudes, precision and sum of squares for one structure."""
@@ -542,7 +534,7 @@ def _one(
     return log_factor, amplitude[..., None], power[..., None, None], squares
 
 
-def _two(
+def _two_structures(
     along: list[FloatArray],
     diagonal: list[FloatArray],
     off: FloatArray,
@@ -552,7 +544,7 @@ def _two(
     dof: int,
     amplitude_sd: float,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """As `_one` for two structures, with the two by two matrices written out."""
+    """As `_one_structure` for two structures, with the two by two matrices written out."""
     one, two = diagonal
     det = np.maximum(one * two - off**2, 1e-12 * one * two)
     first, second = (two * along[0] - off * along[1]) / det, (one * along[1] - off * along[0]) / det

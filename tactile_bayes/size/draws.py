@@ -10,7 +10,7 @@ from scipy.special import chdtrc, ndtri
 
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import Labels, Quantity, even_replicates, picked_rows, summarise
+from tactile_bayes.inference.draws import Labels, Quantity, even_replicates, rows_by_label, summarise
 
 EXTREMES: Final = ("max_size_mm", "min_size_mm")
 SIZES: Final = (*EXTREMES, "d_x_mm", "d_y_mm")  #: Names of the sizes that a posterior has, in the order of reports.
@@ -118,7 +118,7 @@ def matched_draws(
     if number is None and len(maps) == 1:
         return maps, maps[0].replicates
     replicates = even_replicates(len(maps[0].q) if number is None else number)
-    return [m.rows(picked_rows(m.replicates, replicates, rng)) for m in maps], replicates
+    return [m.rows(rows_by_label(m.replicates, replicates, rng)) for m in maps], replicates
 
 
 class ShapePrior(Record):

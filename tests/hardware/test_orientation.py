@@ -14,7 +14,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.hardware.live import LiveMap, LiveState, page_state
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap, orientation_of
-from tactile_bayes.posterior.verdict import missing_strokes
+from tactile_bayes.posterior.verdict import coverage_shortfall
 from tactile_bayes.report.map import map_figure
 from tactile_bayes.scans import Landmarks, Scan
 
@@ -152,7 +152,7 @@ def test_the_sides_where_strokes_are_missing_are_the_patients(head_deg, left):
     x, y = np.meshgrid(tactile_map.x_mm, tactile_map.y_mm)
     for name in names:
         cut = x * towards[name][0] + y * towards[name][1] > 4.0
-        short = missing_strokes(replace(tactile_map, count=np.where(cut, 0, 40)), (0.0, 0.0), reach_mm=8.0)
+        short = coverage_shortfall(replace(tactile_map, count=np.where(cut, 0, 40)), (0.0, 0.0), reach_mm=8.0)
         assert [words.split(" (")[0] for words in short] == [f"the patient's {name}"]
         if name == "left":
             assert list(short) == [f"the patient's left ({left})"]
@@ -161,7 +161,7 @@ def test_the_sides_where_strokes_are_missing_are_the_patients(head_deg, left):
 def test_without_landmarks_missing_strokes_are_on_sides_of_the_picture():
     tactile_map = map_of(None)  # its picture has x to the left
     count = np.where(tactile_map.x_mm[None, :] > 4.0, 0, np.full(tactile_map.count.shape, 40))
-    assert list(missing_strokes(replace(tactile_map, count=count), (0.0, 0.0), reach_mm=8.0)) == [
+    assert list(coverage_shortfall(replace(tactile_map, count=count), (0.0, 0.0), reach_mm=8.0)) == [
         "the picture's left (+x)"
     ]
 

@@ -7,7 +7,7 @@ import pytest
 from posterior_maps import bump_map, find_bump
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.inference.draws import Solution, Solved
+from tactile_bayes.inference.draws import Solution, SolutionCache
 from tactile_bayes.posterior.bump import Bump, cell_mean_gaussian, covariance_from_log_widths, window_cells
 from tactile_bayes.posterior.draw import SamplerSettings, draw_parameters
 from tactile_bayes.posterior.fit import FieldFit
@@ -29,7 +29,7 @@ def drawn(method: str) -> tuple[Counting, list[np.ndarray], list[np.ndarray], li
     """What was solved for the draws; amplitude, level and noise with a memory, without, and by other random numbers."""
     fit = fitted(cells_of(noise(5, field=0.01)))
     counting = Counting(fit)
-    solved = Solved(counting)
+    solved = SolutionCache(counting)
     draws, _ = draw_parameters(fit, SamplerSettings(method=method), rng=np.random.default_rng(1), solved=solved)
     kept = fit.target.draw_linear(draws.flat, np.random.default_rng(2), solved=solved)
     again, other = (fit.target.draw_linear(draws.flat, np.random.default_rng(seed)) for seed in (2, 3))
@@ -59,7 +59,7 @@ def test_a_memory_is_of_its_own_points_only() -> None:
         return (theta.sum(axis=1),)
 
     points = np.random.default_rng(0).standard_normal((50, 3))
-    solved = Solved(solve)
+    solved = SolutionCache(solve)
     np.testing.assert_array_equal(solved(points)[0], points.sum(axis=1))
     solved.add(points[:20], (np.arange(20.0),))
     solved.add(points[20:], (np.arange(20.0, 50.0),))
@@ -76,7 +76,7 @@ def test_independent_errors_keep_their_sums_of_squares() -> None:
     fit = find_bump(bump_map(noise=noise(3)), SamplerSettings(rotation="off"))[-1].fit
     assert fit is not None
     target = fit.target
-    solved = Solved(lambda theta: (np.full(len(theta), np.nan),))
+    solved = SolutionCache(lambda theta: (np.full(len(theta), np.nan),))
     theta = fit.theta + 0.01 * np.random.default_rng(1).standard_normal((70, len(fit.theta)))
     np.testing.assert_array_equal(target(theta, solved), target(theta))
     np.testing.assert_allclose(solved(theta[::-1])[0], target.excess(theta)[::-1], rtol=1e-9)

@@ -138,7 +138,7 @@ def test_points_that_can_be_trusted_go_on_where_a_fitted_proposal_is_worse(monke
 
     def spoilt(*points: object, **_: object) -> tuple[Gaussians, int]:
         fits.append(points)
-        return Gaussians.one(np.zeros(3), 0.2 * np.eye(3)), 0
+        return Gaussians.single(np.zeros(3), 0.2 * np.eye(3)), 0
 
     monkeypatch.setattr("tactile_bayes.inference.importance.fitted_gaussians", spoilt)
 

@@ -71,7 +71,7 @@ def test_fitted_gaussians_cover_both_modes() -> None:
     def two(theta: np.ndarray) -> np.ndarray:
         return np.logaddexp(norm.logpdf(theta[:, 0]), norm.logpdf(theta[:, 0] - 12.0)) + norm.logpdf(theta[:, 1])
 
-    first = Proposal(Gaussians.one(np.zeros(2), 9.0 * np.eye(2)), STRETCH)
+    first = Proposal(Gaussians.single(np.zeros(2), 9.0 * np.eye(2)), STRETCH)
     theta, _ = first.points(np.random.default_rng(3).uniform(size=(2000, 2)))
     found, evaluations = adaptation.fitted_gaussians(two, first, theta, two(theta), rng=np.random.default_rng(4))
     assert evaluations == adaptation.ADDED * (len(found) - 1) > 0
@@ -82,7 +82,7 @@ def test_fitted_gaussians_cover_both_modes() -> None:
 def test_a_proposals_density_is_that_of_its_points() -> None:
     """By one Gaussian from normal coordinates, by several from the points: the same number."""
     covariance = np.array([[1.0, 0.6], [0.6, 2.0]])
-    one = Proposal(Gaussians.one(np.array([1.0, -2.0]), covariance), STRETCH)
+    one = Proposal(Gaussians.single(np.array([1.0, -2.0]), covariance), STRETCH)
     uniform = np.random.default_rng(5).uniform(size=(50, 2))
     theta, log_density = one.points(uniform)
     np.testing.assert_allclose(one.log_density(theta), log_density, atol=1e-9)
@@ -99,5 +99,5 @@ def test_a_mixture_given_some_parameters_is_the_conditional_density() -> None:
     mixture = Gaussians(np.array([0.4, 0.6]), rng.standard_normal((2, 3)), roots @ roots.transpose(0, 2, 1) + np.eye(3))
     last, some = np.array([0.7]), rng.standard_normal((5, 2))
     joint = mixture.log_density(np.column_stack([some, np.full(5, last[0])]))
-    gap = joint - mixture.given(last).log_density(some)
+    gap = joint - mixture.conditional(last).log_density(some)
     np.testing.assert_allclose(gap, gap[0], atol=1e-9)  # the marginal density of the last parameter

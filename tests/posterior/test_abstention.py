@@ -16,7 +16,7 @@ from tactile_bayes.posterior.bump import Detection
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.posterior.verdict import Weighed, extend_advice, missing_strokes, no_bump, shape_fault
+from tactile_bayes.posterior.verdict import WeighedRise, coverage_shortfall, no_bump_reason, shape_fault, stroke_advice
 from tactile_bayes.posterior.white import AT_RIM, Candidate, fit_bump
 
 FIELD = SamplerSettings(background="free", noise="field")
@@ -87,8 +87,8 @@ def test_a_bump_that_cannot_be_measured_has_its_code(
     fit, found = fit_bump(tactile_map, (bump.get("x", 1.3), bump.get("y", -0.8)), options=SamplerSettings())
     assert fault in found
     candidate = Candidate((0.0, 0.0), fit, found)
-    lump = Weighed(Detection(50.0), (0.0, 0.0), (4.0, 0.0, 0.0, 0.0, 0.0), candidate)
-    answer = no_bump(tactile_map, [candidate], lump, where="here")
+    lump = WeighedRise(Detection(50.0), (0.0, 0.0), (4.0, 0.0, 0.0, 0.0, 0.0), candidate)
+    answer = no_bump_reason(tactile_map, [candidate], lump, where="here")
     assert answer.code == code
     assert advice in answer.advice
     assert answer.about_mm == (0.0, 0.0)
@@ -100,8 +100,8 @@ def test_a_wide_rise_at_the_rim_asks_for_strokes_and_not_for_a_larger_window() -
     tactile_map = grid_map(bump_values(half_mm=45.0, x=0.0, y=0.0, sigma_x=4.0, sigma_y=4.0))
     fit, _ = fit_bump(tactile_map, (0.0, 0.0), options=SamplerSettings())
     candidate = Candidate((0.0, 0.0), fit, f"{AT_RIM} (with a sigma of 13.3 mm its flank to +y is 9 mm short)")
-    lump = Weighed(Detection(50.0), (0.0, 0.0), (4.0, 0.0, 0.0, 0.0, 0.0), candidate)
-    answer = no_bump(tactile_map, [candidate], lump, where="here")
+    lump = WeighedRise(Detection(50.0), (0.0, 0.0), (4.0, 0.0, 0.0, 0.0, 0.0), candidate)
+    answer = no_bump_reason(tactile_map, [candidate], lump, where="here")
     assert answer.code == "window"
     assert answer.advice == answer.on_paper == "extend the strokes beyond it"
 
@@ -158,11 +158,11 @@ def test_a_measurable_lump_has_neither() -> None:
 
 @pytest.mark.parametrize("reached", [3, 6, 9])
 def test_missing_strokes_are_counted_from_the_centre(reached: int) -> None:
-    short = missing_strokes(grid_map(cut(right=reached)), (0.0, 0.0), reach_mm=12.0)
+    short = coverage_shortfall(grid_map(cut(right=reached)), (0.0, 0.0), reach_mm=12.0)
     assert list(short) == ["the picture's right (+x)"]
     assert short["the picture's right (+x)"] == pytest.approx(12.0 - (reached - 0.5), abs=1.0)
-    assert extend_advice(short).startswith("extend the strokes ")
-    assert missing_strokes(grid_map(bump_values()), (0.0, 0.0), reach_mm=12.0) == {}
+    assert stroke_advice(short).startswith("extend the strokes ")
+    assert coverage_shortfall(grid_map(bump_values()), (0.0, 0.0), reach_mm=12.0) == {}
 
 
 def test_a_posterior_as_wide_as_its_prior_is_no_answer() -> None:

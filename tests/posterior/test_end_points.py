@@ -19,7 +19,7 @@ from scipy.stats import t as student
 from tactile_bayes.inference.draws import END_ERROR
 from tactile_bayes.inference.importance import importance
 from tactile_bayes.inference.modes import mode_and_covariance
-from tactile_bayes.posterior.draw import Sampled, importance_draws
+from tactile_bayes.posterior.draw import SamplingTarget, importance_draws
 from tactile_bayes.posterior.fit import FieldFit
 from tactile_bayes.posterior.marginal import Scene
 from tests.inference.test_methods import LINEAR
@@ -65,9 +65,9 @@ def marginal_ends(z: np.ndarray, density: np.ndarray) -> np.ndarray:
 
 
 @cache
-def density_of(name: str) -> Sampled:
+def density_of(name: str) -> SamplingTarget:
     """What is sampled for a map."""
-    return (MAPS | {"round": plainly_round})[name]().sampled()
+    return (MAPS | {"round": plainly_round})[name]().sampling_target()
 
 
 @cache

@@ -9,13 +9,13 @@ from posterior_maps import bump_values, grid_map
 from tactile_bayes.declarations import replace
 from tactile_bayes.posterior.bump import Detection
 from tactile_bayes.posterior.draw import ModalBump, SamplerSettings
-from tactile_bayes.posterior.verdict import LIKELY, Weighed, weigh
+from tactile_bayes.posterior.verdict import LIKELY, WeighedRise, weigh
 from tactile_bayes.posterior.white import Candidate, fit_bump
 
 CLEAR = {"log_bayes_factor": 60.0, "centre_mm": (0.0, 0.0), "widths_mm": (5.0, 4.5), "fault": ""}
 
 
-def weighed(**changes: object) -> Weighed:
+def weighed(**changes: object) -> WeighedRise:
     given = {**CLEAR, **changes}
     detection = Detection(given.pop("log_bayes_factor"))  # type: ignore[arg-type]
     bump = ModalBump(0.2, *given["centre_mm"], *given["widths_mm"])  # type: ignore[misc]

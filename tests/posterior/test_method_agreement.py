@@ -7,7 +7,7 @@ import pytest
 
 from tactile_bayes.inference import importance as sampling
 from tactile_bayes.inference.importance import TOO_WIDE, Gaussians
-from tactile_bayes.posterior.draw import Sampled, importance_draws
+from tactile_bayes.posterior.draw import SamplingTarget, importance_draws
 from tactile_bayes.posterior.fit import FieldFit
 from validation.method_agreement import MAPS, differences, fit_of, rms, under_other_prior
 
@@ -19,20 +19,20 @@ def fit() -> FieldFit:
 
 
 @pytest.fixture(scope="module")
-def nearly_independent(fit: FieldFit) -> Sampled:
-    return fit.sampled()
+def nearly_independent(fit: FieldFit) -> SamplingTarget:
+    return fit.sampling_target()
 
 
-def tail_shape(density: Sampled, gaussians: Gaussians) -> float:
+def tail_shape(density: SamplingTarget, gaussians: Gaussians) -> float:
     """Pareto shape of the weights of 8,192 points."""
     rng = np.random.default_rng(2)
-    sampler = sampling._settled(density.log_density, gaussians, rng=rng, options=sampling.ImportanceOptions())
+    sampler = sampling._adapted_start(density.log_density, gaussians, rng=rng, options=sampling.ImportanceOptions())
     while sampler.number < 8192:
         sampler.extend(sampler.points)
     return sampler.shape
 
 
-def test_a_plain_map_with_nearly_independent_errors_needs_no_chains(nearly_independent: Sampled) -> None:
+def test_a_plain_map_with_nearly_independent_errors_needs_no_chains(nearly_independent: SamplingTarget) -> None:
     density = nearly_independent
     assert density.parts is not None
     assert density.parts.widest(density.covariance) > TOO_WIDE
@@ -41,10 +41,10 @@ def test_a_plain_map_with_nearly_independent_errors_needs_no_chains(nearly_indep
     assert found["evaluations"] <= 20480
     assert tail_shape(density, density.parts) < 0.2
     # the control: under one Gaussian for all fields the tail is heavy, and heavier with every doubling
-    assert tail_shape(density, Gaussians.one(density.mean, density.covariance)) > 0.5
+    assert tail_shape(density, Gaussians.single(density.mean, density.covariance)) > 0.5
 
 
-def test_gaussians_of_all_fields_hold_the_evidence(fit: FieldFit, nearly_independent: Sampled) -> None:
+def test_gaussians_of_all_fields_hold_the_evidence(fit: FieldFit, nearly_independent: SamplingTarget) -> None:
     """The sampled evidence is nearer to theirs than to that of fields with a hundredth of the density at the mode."""
     sampled = importance_draws(nearly_independent, rng=np.random.default_rng(2)).diagnostics["log_evidence"]
     assert nearly_independent.parts is not None
@@ -57,7 +57,9 @@ def test_gaussians_of_all_fields_hold_the_evidence(fit: FieldFit, nearly_indepen
 @pytest.mark.parametrize("name", ["field of 1.5 mm", "half covered", "scan, small"])
 def test_chains_and_weighted_draws_agree_and_another_prior_does_not(name: str) -> None:
     fit = fit_of(MAPS[name]())
-    own, other = differences(fit.sampled(), [fit.sampled(), under_other_prior(fit).sampled()], seed=1)
+    own, other = differences(
+        fit.sampling_target(), [fit.sampling_target(), under_other_prior(fit).sampling_target()], seed=1
+    )
     assert rms(own) < 1.6
     assert np.abs(own).max() < 4.5
     assert rms(other) > 2.5

@@ -93,7 +93,7 @@ def test_a_lump_beside_a_rib_is_found_from_close_by(monkeypatch: pytest.MonkeyPa
         assert np.log(np.median(width) / 5.0) == pytest.approx(0.0, abs=3 * np.std(np.log(width)))
     assert look(beside_a_rib(0.0), rotation="auto").status == "no_estimate"
     # the control: from afar least squares grows over both
-    monkeypatch.setattr(estimate, "_close_search", lambda *_: None)
+    monkeypatch.setattr(estimate, "_search_in_small_windows", lambda *_: None)
     assert look(beside_a_rib(0.3), rotation="auto").status == "no_estimate"
 
 

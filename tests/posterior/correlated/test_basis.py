@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tactile_bayes.posterior import marginal as collapsed
-from tactile_bayes.posterior.marginal import CollapsedTarget, Scene, Spanned
+from tactile_bayes.posterior.marginal import CollapsedTarget, LowRankBumps, Scene
 from tests.posterior.correlated.test_marginal import START, TURNED, cells_of, noise, target_of
 
 NEAR = 0.03
@@ -23,7 +23,7 @@ AROUND = {
 
 
 def points(scene: Scene, spread: float, at: dict[str, float], number: int = 600) -> np.ndarray:
-    start = TURNED.carried(START, scene)
+    start = TURNED.converted(START, scene)
     for name, value in at.items():
         if name in scene.names:
             start[scene.names.index(name)] = value
@@ -46,7 +46,7 @@ def test_many_at_once_are_each_by_itself(
 ) -> None:
     target = target_of(cells_of(noise(0, field=0.01)), scene=scene)
     if settled:
-        target.settle_fields(TURNED.carried(START, scene))
+        target.select_fields(TURNED.converted(START, scene))
     theta = points(scene, spread, at)
     exact = each_by_itself(target, theta, monkeypatch)
     held = np.isfinite(exact[0])
@@ -62,9 +62,9 @@ def test_a_strong_maps_bumps_are_few(monkeypatch: pytest.MonkeyPatch) -> None:
     """600 bumps are sums of 25 to 90; where nothing spans them there is no basis."""
     target = target_of(cells_of(noise(0)), scene=Scene("ellipse"))
 
-    def basis(spread: float, at: dict[str, float]) -> Spanned | None:
+    def basis(spread: float, at: dict[str, float]) -> LowRankBumps | None:
         (bumps,) = target.scene.templates(points(target.scene, spread, at), target.window)
-        return Spanned.of(bumps, target.linear)
+        return LowRankBumps.of(bumps, target.linear)
 
     few = basis(NEAR, {})
     assert few is not None

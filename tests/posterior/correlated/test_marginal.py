@@ -47,7 +47,7 @@ def target_of(cells: FitCells, *, scene: Scene = TURNED) -> CollapsedTarget:
 
 def fitted(cells: FitCells, *, scene: Scene = STRAIGHT, start: np.ndarray | None = None) -> FieldFit:
     window = Window(cells, independent_variance(cells))
-    begin = TURNED.carried(START, scene) if start is None else start
+    begin = TURNED.converted(START, scene) if start is None else start
     return fit_scene(Problem(window, BumpPrior(), RADIUS), scene, begin)
 
 
@@ -114,7 +114,7 @@ def test_bumps_on_the_grid_are_the_forward_models() -> None:
 def test_low_rank_algebra_is_dense_algebra(scene: Scene) -> None:
     cells = cells_of(noise(0, field=0.01), radius=8.0)
     target = target_of(cells, scene=scene)
-    begin = TURNED.carried(START, scene)
+    begin = TURNED.converted(START, scene)
     beside = {"second lump": [7.0, 6.0, 1.2], "rib": [0.7, 5.0, 1.0], "": []}[scene.extra]
     begin[len(begin) - len(beside) :] = beside
     theta = np.array([begin, begin + 0.1])
@@ -165,7 +165,7 @@ def test_dropping_idle_directions_changes_nothing_that_matters() -> None:
     target = target_of(cells, scene=STRAIGHT)
     near = START[:4] + 0.02 * np.random.default_rng(1).standard_normal((6, 4))
     whole, directions = target(near), sum(len(one.weight) for one in target.fields)
-    target.settle_fields(START[:4])
+    target.select_fields(START[:4])
     np.testing.assert_allclose(target(near), whole, atol=5e-3)
     assert sum(len(one.weight) for one in target.fields) < 0.8 * directions
 
@@ -174,26 +174,26 @@ def test_dropping_idle_directions_changes_nothing_that_matters() -> None:
 def test_another_scene_of_the_same_window_is_as_made_anew(scene: Scene) -> None:
     cells = cells_of(noise(2, field=0.01))
     settled = target_of(cells, scene=STRAIGHT)
-    settled.settle_fields(START[:4])
-    theta = np.concatenate([TURNED.carried(START, scene), [0.7, 5.0, 1.0]])[None, : len(scene.names)]
+    settled.select_fields(START[:4])
+    theta = np.concatenate([TURNED.converted(START, scene), [0.7, 5.0, 1.0]])[None, : len(scene.names)]
     derived, anew = settled.of_scene(scene), target_of(cells, scene=scene)
     np.testing.assert_array_equal(derived.by_field(theta), anew.by_field(theta))
-    assert derived.settle_fields(theta[0])
-    anew.settle_fields(theta[0])
+    assert derived.select_fields(theta[0])
+    anew.select_fields(theta[0])
     np.testing.assert_array_equal(derived(theta), anew(theta))
-    assert settled.chosen_fields() != []
+    assert settled.selected_fields() != []
 
 
 def test_independent_errors_are_one_hypothesis() -> None:
     """Four lengths with the share 0 are the same errors: one field of the mixture, with the prior of four."""
     target = target_of(cells_of(noise(3)), scene=STRAIGHT)
-    target.settle_fields(START[:4])
-    assert [shares for _, shares in target.chosen_fields()].count((0.0,)) == 1
-    summary = target.field_summary(START[:4])
+    target.select_fields(START[:4])
+    assert [shares for _, shares in target.selected_fields()].count((0.0,)) == 1
+    summary = target.field_figures(START[:4])
     assert summary["field_share"] < 0.05
     correlated = target_of(cells_of(noise(3, white=0.002, field=0.02)), scene=STRAIGHT)
-    correlated.settle_fields(START[:4])
-    assert (0.0,) not in [shares for _, shares in correlated.chosen_fields()]
+    correlated.select_fields(START[:4])
+    assert (0.0,) not in [shares for _, shares in correlated.selected_fields()]
 
 
 def test_a_level_and_a_tilt_do_not_matter() -> None:
@@ -295,7 +295,7 @@ def test_a_template_that_the_window_hardly_has_changes_nothing_and_overflows_not
     offsets = np.array([20.0, 30.0, 35.0, *np.arange(40.0, 130.0, 0.25), 5000.0])
     templates = target.window.ridges(0.0 * offsets, offsets, log_width=np.full(len(offsets), np.log(3.0)))
     with np.errstate(all="raise", under="ignore"):
-        gains = target.gains(templates, TURNED.carried(START, STRAIGHT))
+        gains = target.gains(templates, TURNED.converted(START, STRAIGHT))
     assert gains[0] < -1.0  # a ridge on the window that is not there costs evidence
     assert np.all((np.abs(gains[1:]) < 0.5) | (gains[1:] == -np.inf))
     assert abs(gains[2]) < 0.1

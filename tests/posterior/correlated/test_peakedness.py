@@ -17,7 +17,7 @@ from tactile_bayes.posterior.fit import (
     FieldFit,
     Structure,
     _departure,
-    ask_departure,
+    add_departure,
     exponent_covariance,
     tangent_columns,
 )
@@ -132,7 +132,7 @@ def test_a_bump_with_a_neighbour_is_not_asked() -> None:
     assert found.scene is not None
     assert found.scene.fit.scene.extra == "second lump"
     assert not any(one.name == "departure" for one in found.scene.structures)
-    assert ask_departure(found.scene) is found.scene
+    assert add_departure(found.scene) is found.scene
 
 
 def test_the_report_says_it_either_way() -> None:

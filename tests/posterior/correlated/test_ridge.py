@@ -8,7 +8,7 @@ from posterior_maps import grid_map
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.posterior import correlated as neighbours
-from tactile_bayes.posterior.correlated import beside_ridge, ridge_instead
+from tactile_bayes.posterior.correlated import best_ridge, bump_beside_ridge
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.fit import fit_scene
@@ -43,7 +43,7 @@ def test_a_ridge_alone_gets_no_number(seed: int) -> None:
 @pytest.mark.long
 def test_it_would_get_one_if_only_noise_were_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     """The control: on these maps nothing but the ridge's own evidence stands against a number."""
-    monkeypatch.setattr(neighbours, "ridge_instead", lambda *_: None)
+    monkeypatch.setattr(neighbours, "best_ridge", lambda *_: None)
     assert [estimate(1.0 + ridge(seed) + errors(seed)).status for seed in (6, 13)] == ["estimate", "estimate"]
 
 
@@ -74,10 +74,10 @@ def test_a_ridge_clear_of_a_lump_does_not_stand_in_its_place() -> None:
         for width, offset in ((0.0, 18.0), (1.6, 0.0))
     )
     assert stripe.log_evidence > choice.plain.log_evidence + 3.0
-    both = beside_ridge(alone, stripe)
+    both = bump_beside_ridge(alone, stripe)
     assert both is not None
     assert both.log_evidence > stripe.log_evidence + 10.0
-    assert beside_ridge(alone, through) is None
+    assert bump_beside_ridge(alone, through) is None
 
 
 def test_a_lump_is_not_held_against_itself_with_a_ridge() -> None:
@@ -86,6 +86,6 @@ def test_a_lump_is_not_held_against_itself_with_a_ridge() -> None:
     problem, at = choice.plain.target.problem, np.array([[np.pi / 2.0, 18.0, np.log(5.0)]])
     moved = fit_scene(problem, Scene("ridge", extra="second lump"), np.array([1.6, np.pi / 2.0, 18.0, 2.0, 0.0, 1.6]))
     assert np.hypot(moved.mode[3] - 1.0, moved.mode[4] + 1.0) < 1.0
-    found = ridge_instead(replace(choice, fit=moved), at)
+    found = best_ridge(replace(choice, fit=moved), at)
     assert found is not None
     assert found.log_evidence < moved.log_evidence - 20.0

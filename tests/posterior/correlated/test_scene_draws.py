@@ -16,7 +16,13 @@ from tactile_bayes.inference.draws import ParameterDraws
 from tactile_bayes.inference.importance import ImportanceOptions, importance
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import draw as methods
-from tactile_bayes.posterior.draw import Sampled, SamplerSettings, disagreement, draw_parameters, importance_draws
+from tactile_bayes.posterior.draw import (
+    SamplerSettings,
+    SamplingTarget,
+    disagreement,
+    draw_parameters,
+    importance_draws,
+)
 from tactile_bayes.posterior.fit import FieldFit, fit_scene
 from tactile_bayes.posterior.marginal import Scene
 from tactile_bayes.posterior.window import Problem
@@ -58,7 +64,7 @@ def ends(draws: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("name", ["weak", "beside", "strong", "half covered"])
 def test_importance_ends_are_as_good_as_they_say(name: str) -> None:
     """Against one long run by other points: six runs, each end within four of its stated errors."""
-    density = FITS[name]().sampled()
+    density = FITS[name]().sampling_target()
     many = ImportanceOptions(accuracy_sd=1.0, first=16384)
     long = importance(
         density.log_density, density.mean, density.covariance, rng=np.random.default_rng(99), options=many
@@ -82,7 +88,7 @@ def test_evidence_is_that_of_a_quadrature() -> None:
     w = np.prod(np.stack([v.ravel() for v in np.meshgrid(weight, weight, weight, indexing="ij")]), axis=0)
     log_density = fit.target(fit.mode + z @ root.T) + 0.5 * np.sum(z**2, axis=1)
     exact = np.logaddexp.reduce(log_density + np.log(w)) + np.linalg.slogdet(root)[1]
-    draws = importance_draws(fit.sampled(), rng=np.random.default_rng(1))
+    draws = importance_draws(fit.sampling_target(), rng=np.random.default_rng(1))
     assert draws.diagnostics["log_evidence"] == pytest.approx(exact, abs=0.01)
     assert fit.log_evidence == pytest.approx(exact, abs=0.1)
     # the fields that were left out are made up for: with all of them the same
@@ -93,18 +99,18 @@ def test_evidence_is_that_of_a_quadrature() -> None:
 @pytest.mark.parametrize("name", list(FITS))
 def test_gaussians_are_as_wide_as_the_density(name: str) -> None:
     fit = FITS[name]()
-    k = fit.scene.own
-    exact = fit.sampled().finished(
-        importance_draws(fit.sampled(), rng=np.random.default_rng(1)), np.random.default_rng(2)
+    k = fit.scene.bump_parameters
+    exact = fit.sampling_target().with_second_structure(
+        importance_draws(fit.sampling_target(), rng=np.random.default_rng(1)), np.random.default_rng(2)
     )
-    drawn = fit.at_mode("laplace", 4000, np.random.default_rng(3))
+    drawn = fit.draw_at_mode("laplace", 4000, np.random.default_rng(3))
     np.testing.assert_allclose(drawn.flat[:, :k].std(axis=0), exact.flat[:, :k].std(axis=0), rtol=0.15)
 
 
 def test_what_stands_beside_adds_its_uncertainty() -> None:
-    density = beside().sampled()
+    density = beside().sampling_target()
     held = importance_draws(density, rng=np.random.default_rng(1))
-    whole = density.finished(held, np.random.default_rng(2))
+    whole = density.with_second_structure(held, np.random.default_rng(2))
     assert whole.flat.shape[1] == len(beside().scene.names)
     np.testing.assert_allclose(whole.flat[:, 4:], np.broadcast_to(beside().mode[4:], whole.flat[:, 4:].shape))
     added = np.diag(density.spread @ density.spread.T)
@@ -113,16 +119,16 @@ def test_what_stands_beside_adds_its_uncertainty() -> None:
 
 @pytest.mark.long
 def test_a_method_that_fails_hands_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    def heavy(_: Sampled, **__: object) -> ParameterDraws:
+    def heavy(_: SamplingTarget, **__: object) -> ParameterDraws:
         raise NotConvergedError("Pareto shape 0.91", diagnostics={"pareto_k": 0.91})
 
-    judged = FieldFit.at_mode
+    judged = FieldFit.draw_at_mode
 
     def untrusted(fit: FieldFit, *options: Any) -> ParameterDraws:
         draws = judged(fit, *options)
         return replace(draws, diagnostics=dict(draws.diagnostics) | {"pareto_k": float("nan")})
 
-    monkeypatch.setattr(FieldFit, "at_mode", untrusted)
+    monkeypatch.setattr(FieldFit, "draw_at_mode", untrusted)
     draws, passed = draw_parameters(
         strong(), SamplerSettings(method="laplace", noise="field"), rng=np.random.default_rng(1)
     )
@@ -217,7 +223,7 @@ def test_ensemble_and_importance_check_each_other(monkeypatch: pytest.MonkeyPatc
 
     honest = methods.importance_draws
 
-    def narrow(density: Sampled, **options: object) -> ParameterDraws:
+    def narrow(density: SamplingTarget, **options: object) -> ParameterDraws:
         draws = honest(density, **options)  # type: ignore[arg-type]
         return replace(draws, theta=density.mean + 0.5 * (draws.theta - density.mean))
 

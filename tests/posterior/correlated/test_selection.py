@@ -12,8 +12,8 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import correlated as beside
 from tactile_bayes.posterior.bump import smoothed_excess, window_cells
-from tactile_bayes.posterior.correlated import Surroundings, add_beside, rising_ribs
-from tactile_bayes.posterior.fit import ASKING, SceneChoice, Structure, choose_shape
+from tactile_bayes.posterior.correlated import Surroundings, add_neighbour, rising_ribs
+from tactile_bayes.posterior.fit import SCENES_TESTED, SceneChoice, Structure, choose_shape
 from tactile_bayes.posterior.marginal import Scene
 from tactile_bayes.posterior.window import Problem, Window, independent_variance
 
@@ -44,10 +44,10 @@ def choose(values: np.ndarray, *, scene: str = "auto", width: float = 5.0, r: fl
     start = np.array([np.log(width), np.log(width), 1.0, -1.0, r])
     window = Window(cells, independent_variance(cells))
     choice = choose_shape(Problem(window, BumpPrior(), RADIUS), start, scene=scene)
-    if scene not in ASKING:
+    if scene not in SCENES_TESTED:
         return choice
     surroundings = Surroundings(tactile_map.x_mm, tactile_map.y_mm, smoothed_excess(tactile_map))
-    return add_beside(choice, surroundings, ridges=rising_ribs(choice.plain, surroundings), scene=scene)
+    return add_neighbour(choice, surroundings, ridges=rising_ribs(choice.plain, surroundings), scene=scene)
 
 
 def asked(choice: SceneChoice, name: str) -> Structure:
@@ -190,6 +190,6 @@ def test_a_scene_that_is_asked_for_is_used(scene: str) -> None:
 def test_a_bump_without_a_direction_is_carried_between_scenes() -> None:
     theta = np.array([1.5, 1.3, 2.0, 3.0, 0.1])
     turned, straight, circle = Scene("rotated"), Scene("ellipse"), Scene("round")
-    np.testing.assert_allclose(turned.carried(theta, straight), theta[:4])
-    np.testing.assert_allclose(turned.carried(theta, circle), [1.4, 2.0, 3.0])
-    np.testing.assert_allclose(circle.carried(np.array([1.4, 2.0, 3.0]), straight), [1.4, 1.4, 2.0, 3.0])
+    np.testing.assert_allclose(turned.converted(theta, straight), theta[:4])
+    np.testing.assert_allclose(turned.converted(theta, circle), [1.4, 2.0, 3.0])
+    np.testing.assert_allclose(circle.converted(np.array([1.4, 2.0, 3.0]), straight), [1.4, 1.4, 2.0, 3.0])

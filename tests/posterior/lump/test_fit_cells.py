@@ -10,7 +10,7 @@ from tactile_bayes.posterior.bump import (
     candidate_centres,
     covered_share,
     smoothed_excess,
-    trusted,
+    trusted_cells,
     typical_level,
     value_scale,
     window_cells,
@@ -32,7 +32,7 @@ def test_a_window_holds_the_cells_of_its_disc() -> None:
 def test_cells_with_a_handful_of_readings_are_not_trusted() -> None:
     count = np.full((5, 5), 40)
     count[0, 0], count[0, 1], count[0, 2] = 3, 4, 0
-    kept = trusted(grid_map(np.ones((5, 5)), count=count))
+    kept = trusted_cells(grid_map(np.ones((5, 5)), count=count))
     assert not kept[0, 0]
     assert kept[0, 1]
     assert not kept[0, 2]
