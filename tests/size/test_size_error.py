@@ -174,7 +174,7 @@ def test_draws_are_made_finer_until_the_size_is_as_exact_as_asked(monkeypatch: p
     monkeypatch.setattr(drawn, "draw_with_size", once)
     for options in (SamplerSettings(), SamplerSettings(accuracy_sd=0.01), SamplerSettings(accuracy_mm=0.005)):
         asked.clear()
-        found = drawn.draw_until_accurate(drawn.Work(None, None, options, np.random.default_rng(2)), None)
+        found = drawn.draw_until_accurate(drawn.EstimationTask(None, None, options, np.random.default_rng(2)), None)
         size = found.size.summarise("max_size_mm", probability=PROBABILITY)
         if options.accuracy_mm is not None:
             assert size.mc_error <= options.accuracy_mm

@@ -23,7 +23,7 @@ from tactile_bayes.posterior.marginal import CollapsedTarget, Scene
 from tactile_bayes.posterior.window import (
     Problem,
     Window,
-    _one,
+    _one_structure,
     cosine_profiles,
     gram_of_cosines,
     independent_variance,
@@ -206,7 +206,7 @@ def test_a_level_and_a_tilt_do_not_matter() -> None:
 def test_a_bump_that_no_cell_shows_overflows_nothing() -> None:
     """Its power is next to nothing and its amplitude next to anything: the prior decides, without a warning."""
     along, power = np.array([1e-30, 0.0, -1e-150]), np.array([1e-200, 1e-300, 1e-310])
-    factor, *_ = _one(along, power, np.ones(3), 1e-12, dof=100, amplitude_sd=2.0)
+    factor, *_ = _one_structure(along, power, np.ones(3), 1e-12, dof=100, amplitude_sd=2.0)
     assert np.isfinite(factor[1:]).all()
     assert factor[0] < factor[1]
 
@@ -305,4 +305,4 @@ def test_a_template_that_the_window_hardly_has_changes_nothing_and_overflows_not
 def test_a_draw_without_evidence_takes_the_first_field_quietly() -> None:
     evidence = np.array([[-np.inf, -np.inf], [-1e300, 0.0]])
     with np.errstate(all="raise", under="ignore"):
-        assert collapsed.choose(evidence, np.random.default_rng(1)).tolist() == [0, 1]
+        assert collapsed.choose_fields(evidence, np.random.default_rng(1)).tolist() == [0, 1]
