@@ -143,7 +143,7 @@ def growing_line(report: TrialReport) -> str | None:
 
 
 def _pair_line(pair: PairedComparison) -> str:
-    head = f"{pair.first} - {pair.second} on {pair.masses} common masses: "
+    head = f"{pair.first} - {pair.second} on {_plural(pair.masses, 'common mass')}: "
     if pair.difference_percent is None:
         return head + f"no comparison: {pair.reasons['difference_percent']}"
     test = "" if pair.p_value is None or pair.p_holm is None else f"; p {pair.p_value:.4f}, p Holm {pair.p_holm:.4f}"

@@ -110,7 +110,7 @@ class NextMass(Record):
         for name, summary in self.modalities.items():
             error, if_detected = summary.mape_percent.shown(".1f"), summary.mape_detected_percent.shown(".1f")
             lines.append(
-                f"{name}: next mass: expected error {error} %, if it is found {if_detected} %; "
+                f"{name}: next mass: expected error of one reading {error} %, if it is found {if_detected} %; "
                 f"bias {summary.bias_percent.shown('+.1f')} %, slope of ln size {summary.log_slope.shown('.2f')}"
             )
         lines += [f"probability that {pair}: {p:.3f}" for pair, p in self.probability_less_error.items()]

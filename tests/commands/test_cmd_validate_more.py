@@ -374,7 +374,8 @@ def test_a_ratio_over_no_error_and_lines_through_one_mass_are_reasons(tmp_path: 
     assert "tactile and us are not compared on 3 masses: the error of us is 0" in text
     assert "us: no MAPE ratio on 3 common masses: " in text
     assert "- times" not in text
-    one = validate(*small(tmp_path, [("A", 1, "tactile", 10.0)], e[:1]), "--methods").output
+    one = validate(*small(tmp_path, [("A", 1, "tactile", 10.0), ("A", 1, "us", 15.0)], e[:1]), "--methods").output
+    assert "tactile - us on 1 common mass: " in one
     assert "tactile: no lines or limits: too few masses were found, or their sizes do not differ" in one
 
 

@@ -104,6 +104,8 @@ def test_draws_find_what_made_the_data_and_who_errs_less() -> None:
     assert tactile.mape_percent.low < truth < tactile.mape_percent.high
     assert found.probability_less_error["tactile errs less than ultrasound"] > 0.99
     assert any("errs less" in line for line in found.lines())
+    # beside errors of means over replicates, the report says of how many readings this one is
+    assert all("expected error of one reading" in line for line in found.lines()[1 : 1 + len(found.modalities)])
 
 
 def test_few_patients_get_no_model_and_are_told_why() -> None:
