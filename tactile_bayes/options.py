@@ -183,7 +183,7 @@ class CompareOptions(Options):
         bool, "Say that the visits are of one mass where landmarks are missing, or place it too far apart."
     ] = False
     registration_mm: Annotated[
-        float, Meta(gt=0), "SD each way of one mass's place between visits, by posture and landmarks."
+        float, Meta(gt=0), "SD along each axis of one mass's place between visits, by posture and landmarks."
     ] = presets.REGISTRATION_MM
 
     def check_visits(self, visits: int) -> None:
@@ -283,7 +283,7 @@ class CampaignOptions(Options, kw_only=True):
     match_mm: Annotated[
         float,
         cli_meta("MM", gt=0),
-        "Distance within which a mass is the one that another exam of the breast names by place.",
+        "Largest distance at which a mass is taken for the one that another exam of the breast names by place.",
     ] = presets.MATCH_MM
     figures: Annotated[bool, "Draw map and size posterior of each exam."] = False
     dry_run: Annotated[bool, "Print what would be done, and do nothing."] = False

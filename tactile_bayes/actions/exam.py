@@ -104,7 +104,7 @@ def demo_action(output: Path, method: str, force: bool) -> None:
         "-o", "{}/posterior.nc", "--figure", "{}/size.png", "--map-figure", "{}/map.png",
     )  # fmt: skip
     step(
-        "3. The same map by the paper's own road: Markov chains over the bump, each draw through Eq 6.",
+        "3. The same map by the paper's own method: Markov chains over the bump, each draw through Eq 6.",
         estimate.estimate_command, "{}/map.nc", "--size-calibration", "eq6", "--method", "ensemble",
         "-o", "{}/posterior_eq6.nc",
     )  # fmt: skip

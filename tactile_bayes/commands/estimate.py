@@ -30,9 +30,8 @@ def map_command() -> None:
     """Build a tactile map from one scan, or one common map from several scans of the same examination.
 
     The plane of the motion is fitted, frames outside the pressure window are left out, the rest are normalised,
-    projected on the plane and averaged in cells. Printed are whether the map is sound, and what was left out and why.
-    From frames that feel no lump it takes how the pressure is spread over the head, which tells `estimate` how deep the
-    fat is.
+    projected on the plane and averaged in cells. The verdict is printed, and what was left out and why. Frames without
+    a lump give the head's pressure profile, from which `estimate` computes the depth of the fat.
 
     Example: tactile-bayes map scan.mcap -o map.nc --figure map.png
     """
@@ -60,9 +59,9 @@ def estimate_command() -> None:
     """Estimate a lump's size from tactile maps, with a credible interval.
 
     Every posterior draw of the map's Gaussian (Eq 7) goes through a size calibration with a draw of its coefficients
-    and of what no map shows. Where the map shows no lump that can be measured there is no number: the reason is
-    printed and the exit code is 6. With --pool the maps are repeats of one mass, and their spread is learned. Where a
-    map tells how deep the fat under the head is, sizes are for that depth; where not, the report says so.
+    and of what no map shows. Where the map shows no lump that can be measured there is no number: the reason is printed
+    and the exit code is 6. With --pool the maps are repeats of one mass, and their spread is learned. Sizes are for the
+    depth of the fat under the head where the map gives it; where not, the report says so.
 
     Example: tactile-bayes estimate map.nc --figure size.png
     """
@@ -125,7 +124,7 @@ _PERCENT = tuple(100 * share for share in GROWTH_SHARES)
     type=options.FiniteRange(),
     multiple=True,
     metavar="DAYS",
-    help="Time of a later visit in days from the first, once for each: growth rates are told.",
+    help="Days from the first visit to a later one, once for each later visit; adds growth rates.",
 )
 @click.option("--dates", metavar="DATE,DATE...", help="The visits' dates, in place of --days: 2026-01-15,2026-04-20.")
 @click.option(
@@ -135,7 +134,7 @@ _PERCENT = tuple(100 * share for share in GROWTH_SHARES)
     default=_PERCENT,
     show_default=True,
     metavar="PERCENT",
-    help="Growth of the diameter, in percent, that a probability of more is told for.",
+    help="Growth of the diameter, in percent: adds the probability of having grown by more.",
 )
 @options.record_options(CompareOptions, "same_mass", "registration_mm")
 @options.record_options(
@@ -164,10 +163,10 @@ def compare_command() -> None:
     """Compare the size of a mass at two visits and more.
 
     Each visit is one map or several. First the visits must be shown to be of one mass: by what their scans say
-    (patient, side, mass) and by where it lies from the landmarks; if not, the reason is printed and the exit code is
-    6. Then the sizes are estimated together: what the body hides is the same at both visits and cancels in the change.
-    A mass has grown, or shrunk, where the 95 % interval of the change leaves out none; else the least growth and
-    shrinkage that would have been seen are told.
+    (patient, side, mass) and by where it lies from the landmarks; if not, the reason is printed and the exit code is 6.
+    Then the sizes are estimated together: what the body hides is the same at both visits and cancels in the change. A
+    mass has grown, or shrunk, where the 95 % interval of the change excludes 0; else the least growth and shrinkage
+    that would have been seen are printed.
 
     Example: tactile-bayes compare jan1.nc jan2.nc --with apr1.nc apr2.nc --days 92 -o growth.html
     """

@@ -35,7 +35,7 @@ def demo_command() -> None:
     """Run the main job on an embedded scan: map, estimate, and the report of a trial.
 
     The scan is simulated: a hard ball of 15 mm, one diameter deep in a breast of fat and gland, with the noise and
-    tracker errors of a real examination. It is sized twice, by the default calibration and by the paper's own road,
+    tracker errors of a real examination. It is sized twice, by the default calibration and by the paper's own method,
     Markov chains through Eq 6, and both results are compared with the true size. The trial is synthetic. Each step is
     printed as the command that does it by hand.
     """
@@ -57,11 +57,15 @@ def demo_command() -> None:
     type=click.Choice(tuple(CORRECTIONS)),
     metavar="CORRECTION",
     multiple=True,
-    help="Scan: correct what is stated of array, lever arm or quaternions; `check` says what is to be corrected. "
+    help="Scan: correct the stated array, lever arm or quaternions, as `check` names it. "
     f"One of {', '.join(CORRECTIONS)}.",
 )
-@click.option("--template", is_flag=True, help="Print a MAP.toml for --columns: of SRC, with what its shapes tell.")
-@path_option("--columns", "MAP.toml", "Scan: what SRC calls its arrays.")
+@click.option(
+    "--template",
+    is_flag=True,
+    help="Print a MAP.toml for --columns, with the arrays of SRC and guesses by their shapes.",
+)
+@path_option("--columns", "MAP.toml", "Scan: names of the arrays in SRC.")
 @path_option("--poses", "FILE", "Scan: the tracker's poses, in a table of their own.")
 @record_options(RecordOptions, "head_geometry", "array_calibration", "landmarks")
 @record_options(Stated)
@@ -99,7 +103,7 @@ import_command.help = f"{cleandoc(import_command.help or '')}\n\n{_ARRAYS}"
 @output_option(
     "HEAD.json",
     None,
-    "Head of the scan with the day of this check, where the scan shows that it is right; for --head-geometry.",
+    "Write the scan's head with the day of this check, where the scan shows that it is right; for --head-geometry.",
 )
 @FORCE
 def check_command() -> None:

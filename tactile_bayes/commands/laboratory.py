@@ -31,7 +31,7 @@ def calibrate_command() -> None:
 @options.path_option(
     "--against",
     "TABLE.csv",
-    "Lumps of another origin, with the columns of `population`: how far their sizes are off goes into intervals.",
+    "Lumps of another origin, with the columns of `population`: the errors of their sizes widen intervals.",
 )
 @options.record_options(declared.LearnOptions, "fit", "normalise", "background", "fit_radius_mm", "noise")
 @options.record_options(declared.LearnOptions, "least_stiffness_ratio")
@@ -49,18 +49,18 @@ def size() -> None:
 
     --fit joint takes m, b, e and f from all rows at once, on the scale of ln d. --fit two-stage is the paper's: d on
     sigma in the rows at depth_ratio 1, then ln Delta sigma on ln a; its spread is a bootstrap over diameters. The
-    report tells how far the other fit lies.
+    report says how far the other fit differs.
 
     With depth_ratio and stiffness_ratio the table is a study: each geometry
     (seat, d_mm, depth_ratio) is also left out of the learning in turn, and the report tells how far Eq 6 and a
     quadratic in logarithms then miss the hard lumps' sizes.
 
-    From a table of `population`, which has a row for each exam of a body, every form tells apart what differs between
-    bodies and between exams of one body. `population` made the maps: nothing is declared, and --normalise chooses among
-    a table's rows. From the pressure over the head where it felt no lump it also learns how deep the fat is: the
-    constants of Eq 6 depend on that, and for a map without that pressure sizes are averaged over the depths that go
-    with it. eq6-residual adds what Eq 6 leaves, a Gaussian process in ln a, ln sigma and the depth; it is the form of
-    the shipped `solid`. The spread between bodies is wide for deep, faint and soft lumps.
+    From a table of `population`, which has a row for each exam of a body, every form separates what differs between
+    bodies from what differs between exams of one body. `population` made the maps: nothing is declared, and --normalise
+    chooses among a table's rows. The depth of the fat is learned from the head's pressure profile on frames without a
+    lump. The constants of Eq 6 depend on it; for a map without a profile sizes are averaged over the likely depths.
+    eq6-residual adds what Eq 6 leaves, a Gaussian process in ln a, ln sigma and the depth; it is the form of the
+    shipped `solid`. The spread between bodies is wide for deep, faint and soft lumps.
 
     --correct keeps a calibration and learns from 3 lumps or more, better 5 to 20, by how much sizes at this site
     differ from it: few lumps change it little, and the uncertainty of the correction goes into every size. TABLE.csv
@@ -84,9 +84,9 @@ def repeatability() -> None:
     """Learn how far sizes of one mass lie apart between its exams at this site.
 
     OUT is the folder of a `campaign run`. Masses with two exams or more at one visit take part, from 3 such masses on,
-    better 10: their own size cancels, and errors that each map has anyway are taken off. What is left is the spread
-    that `estimate --repeatability SITE.json` uses instead of that of simulated exams and of the paper's 15 %. Exams
-    without a size, and those of a scan that another exam has, take no part.
+    better 10: a mass's own size cancels, and each map's own errors are subtracted. What is left is the spread that
+    `estimate --repeatability SITE.json` uses instead of that of simulated exams and of the paper's 15 %. Exams without
+    a size, and further exams of the same scan, take no part.
 
     Example: tactile-bayes calibrate repeatability out -o site.json
     """
@@ -233,11 +233,11 @@ def study_command() -> None:
 
     A head slides over each lump in a layered body; its frames become a map, and a Gaussian is fitted to it: Eq 5 across
     a cylinder in two dimensions, with the background at 1, Eq 7 over a ball in three. There the head's few lines leave
-    stripes and the lump a trough, which a flat field and a free background take off. Cases with an amplitude below
-    0.02 or a width that is not resolved are marked as not detectable. With -o an interrupted study goes on where it
-    stopped. `calibrate size` learns from either table as it is: the table says how its maps were made and fitted. A
-    calibration from the solid model is for maps made with `map --normalise mean --flat-field`. From the joined tables
-    of several seats, thicknesses or heads `calibrate size` also tells what each would change.
+    stripes and the lump a trough, which a flat field and a free background take off. Cases with an amplitude below 0.02
+    or a width that is not resolved are marked as not detectable. With -o an interrupted study goes on where it stopped.
+    `calibrate size` learns from either table as it is: the table says how its maps were made and fitted. A calibration
+    from the solid model is for maps made with `map --normalise mean --flat-field`. Tables of several seats may be
+    joined for it.
 
     A grid file has the columns d_mm, depth_ratio, stiffness_ratio and optionally seat. Seat 0 (centred) puts the
     lump's centre on the fat-gland boundary, 1 (resting) its lowest point; above 1 the lump stands clear of the gland.
@@ -357,7 +357,7 @@ _RUNS = options.number_option(
 
 @click.group("tradeoff", cls=options.CommandGroup)
 def tradeoff_command() -> None:
-    """Measure what more accuracy costs on this machine, and which of it a case does not need."""
+    """Measure what more accuracy costs on this machine, and where it buys nothing."""
 
 
 @options.command("forward", "tradeoff.tradeoff_forward_action", within=tradeoff_command)

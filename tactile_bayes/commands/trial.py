@@ -73,7 +73,7 @@ def campaign_command() -> None:
 @click.option(
     "--names",
     metavar="PATTERN",
-    help="What the files' names say: '{patient}_{visit}_{exam}.npz', also with {mass}, {side}, {reader} and {date}, "
+    help="Pattern of the files' names: '{patient}_{visit}_{exam}.npz', also with {mass}, {side}, {reader} and {date}, "
     "* for anything, and / for folders.",
 )
 @click.option("--add", is_flag=True, help="Keep the rows of an EXAMS.csv that is there, and add those of other files.")
@@ -85,8 +85,9 @@ def campaign_init_command() -> None:
 
     Patient, side and reader are the `subject`, `side` and `examiner` that `record` wrote into each scan; visit and mass
     are its `visit` and `mass`, or 1. Exams of a mass are numbered in the order of their file names. Cells that no scan
-    fills stay blank. Copies, and maps of scans that are listed, are left out and named. With --names the files' names
-    say it too; files that are named otherwise, or say otherwise than their name, are left out and named.
+    fills stay blank. Copies, and maps of scans that are listed, are left out and named. With --names these facts are
+    also read from the files' names; files that do not follow the pattern, or contradict their name, are left out and
+    listed.
 
     Example: tactile-bayes campaign init scans -o exams.csv
     """

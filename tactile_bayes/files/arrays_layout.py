@@ -84,11 +84,11 @@ class Stated(Options, kw_only=True):
     ] = None
     skip_columns: Annotated[
         Annotated[int, Meta(ge=0)] | None,
-        "Scan: columns of a table of frames before its readings. Default: told by the header.",
+        "Scan: columns of a table of frames before its readings. Default: by the header.",
     ] = None
     decimal: Annotated[
         Literal["point", "comma"] | None,
-        "Scan: decimal sign of tables. Default: told by their numbers, where these can tell.",
+        "Scan: decimal sign of tables. Default: by their numbers, where these are clear.",
     ] = None
     rate_hz: Annotated[Rate | None, cli_meta("HZ"), "Scan: frames a second, where they have no times."] = None
     time_unit: Annotated[TimeUnit | None, "Scan: unit of the frames' times. Default: the file's, else s."] = None
