@@ -31,7 +31,7 @@ def test_every_command_has_a_case():
     assert {case.peer for case in CASES} <= set(PEERS)
 
 
-def test_the_cases_find_their_data():
+def test_the_data_of_every_case_exist():
     paths = [word for case in CASES for word in case.words if word.startswith(str(DEMO))]
     assert paths
     assert [path for path in paths if not DEMO.joinpath(path).is_file()] == []

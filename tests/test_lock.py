@@ -62,7 +62,7 @@ def test_the_last_digits_are_no_difference(given, tmp_path):
         ({"values": VALUES[:1]}, "mean: float64 (2, 2) was, float64 (1, 2) is"),
     ],
 )
-def test_what_changed_is_told(given, told, tmp_path):
+def test_a_change_is_reported_where_it_is(given, told, tmp_path):
     assert told in [line.partition(": ")[2] for line in compare(*two(tmp_path, **given))]
 
 

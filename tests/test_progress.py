@@ -32,7 +32,7 @@ def test_nothing_is_drawn_into_a_pipe():
 
 
 @pytest.mark.parametrize("time_left", [True, False])
-def test_a_log_gets_a_line_now_and_then_with_the_hours_left_where_they_are_told(time_left):
+def test_a_log_gets_a_line_now_and_then_with_the_hours_left_where_these_are_known(time_left):
     stream, clock = io.StringIO(), Clock()
     with progress_bar("steps", stream=stream, clock=clock, log_every_s=60.0, time_left=time_left) as progress:
         for done in range(0, 121, 10):
@@ -48,7 +48,7 @@ def test_a_log_gets_a_line_now_and_then_with_the_hours_left_where_they_are_told(
     ]
 
 
-def test_short_work_draws_nothing():
+def test_work_of_a_moment_draws_no_progress():
     stream, clock = Terminal(), Clock()
     with progress_bar("cases", stream=stream, clock=clock) as progress:
         for done in range(3):
@@ -107,7 +107,7 @@ def test_the_line_is_cleared_when_the_work_fails():
     assert stream.getvalue().endswith("\r")
 
 
-def test_it_fits_a_batch():
+def test_a_batch_draws_its_progress():
     stream, clock = Terminal(), Clock()
     with progress_bar("items", stream=stream, clock=clock) as progress:
         clock.now += 50.0

@@ -79,7 +79,7 @@ def test_a_table_is_kept_as_it_is_printed(tmp_path: Path, monkeypatch: pytest.Mo
     assert (tmp_path / "one.csv").read_text() == 'what,\n"a, b",\n'
 
 
-def test_what_is_kept_is_not_made_again(tmp_path: Path) -> None:
+def test_a_kept_result_is_not_computed_again(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "one.pickle"
     assert pickled(path, lambda: 7) == 7
     assert pickled(path, lambda: pytest.fail("made again")) == 7

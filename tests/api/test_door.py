@@ -128,7 +128,7 @@ def test_a_result_has_its_draws_in_every_form(found: tb.SizeEstimate, tmp_path: 
         size.interval(95)
 
 
-def test_what_is_shown_is_short_and_says_research(found: tb.SizeEstimate, folder: Path) -> None:
+def test_a_repr_is_short_and_says_research(found: tb.SizeEstimate, folder: Path) -> None:
     for one in (found, tb.read_map(folder / "map.nc")):
         assert len(repr(one)) < 120
         assert RESEARCH_USE in one._repr_html_()
@@ -295,6 +295,6 @@ def test_scans_are_short_to_look_at() -> None:
         (lambda: tb.estimate([tb.demo_map()]), "a map is wanted, not list; give one map after the other, or pool"),
     ],
 )
-def test_what_is_no_scan_path_or_map_is_one_line(call: Any, words: str) -> None:
+def test_a_wrong_argument_is_one_line(call: Any, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         call()

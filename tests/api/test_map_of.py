@@ -77,7 +77,7 @@ def test_masks_frames_of_pandas_and_files_are_taken(tmp_path: Path) -> None:
         (np.where(values() > 1.3, 0, values()), {"spacing_mm": 1}, BadDataError, "give no_value=0; if all are values"),
     ],
 )
-def test_what_cannot_be_a_map_is_told_in_the_words_of_python(
+def test_impossible_values_are_refused_in_the_words_of_python(
     given: Any, stated: dict[str, Any], error: type[Exception], words: str
 ) -> None:
     with pytest.raises(error, match=words):
@@ -92,7 +92,7 @@ def test_the_path_of_a_grid_says_what_it_lacks(tmp_path: Path) -> None:
     assert tb.map_of(tmp_path / "a.npz").tactile_map.mean.shape == (41, 45)
 
 
-def test_a_map_is_given_as_before() -> None:
+def test_a_map_is_returned_as_it_is() -> None:
     made = tb.map_of(values(), spacing_mm=1, normalise="gain")
     assert tb.map_of(made) is made
     assert tb.map_of(made.tactile_map).tactile_map is made.tactile_map

@@ -31,7 +31,9 @@ def run(blocks: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> dic
     return names
 
 
-def test_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_python_guide_runs_as_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     names = run(blocks_of_page(), tmp_path, monkeypatch)
     said = capsys.readouterr().out
     assert names["low"] < 15.0 < names["high"]

@@ -82,7 +82,7 @@ def closed(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setattr(os, "scandir", refusing)
 
 
-def test_a_folder_of_scans_that_cannot_be_read_is_told(begun: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_of_scans_that_cannot_be_read_is_reported(begun: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its exams were missing from the table without a word."""
     (begun / "scans" / "day 2").mkdir()
     closed(monkeypatch, "day 2")

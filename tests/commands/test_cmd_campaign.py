@@ -332,7 +332,7 @@ def test_workers_that_do_not_see_the_commands_folder_end_the_run_with_the_questi
             store.add("map P1.v1.m1.r1 0", result)
 
 
-def test_half_a_place_is_refused(tmp_path: Path) -> None:
+def test_one_coordinate_of_a_place_alone_is_refused(tmp_path: Path) -> None:
     (tmp_path / "exams.csv").write_text("file,patient,visit,mass,replicate,centre_x_mm\na.mcap,1,1,1,1,4\n")
     done = run_here("campaign", "run", "exams.csv", "-o", "out", cwd=tmp_path)
     assert done.returncode == 3

@@ -68,7 +68,7 @@ def test_a_map_of_a_scan_that_has_a_copy_is_of_the_one_that_is_listed(site: Path
     assert "P01 links – 1.nc: was made from Studie 1/Köhler, M./P01 links – 1.mcap, which" in init(site).stderr
 
 
-def test_codes_that_differ_by_capitals_become_one_and_the_next_command_is_told(site: Path) -> None:
+def test_codes_that_differ_by_capitals_become_one_and_the_next_command_is_printed(site: Path) -> None:
     done = init(site)
     assert done.stdout.splitlines()[0] == "exams.csv: 3 exams of 2 patients"
     assert "P01 links – 1.mcap: its patient P01 is written p01, as in another row" in done.stdout
@@ -98,7 +98,7 @@ def test_a_folder_that_cannot_be_read_is_named(site: Path, monkeypatch: pytest.M
     assert "Studie 1 cannot be read (Permission denied); give a folder that can" in outer.stderr
 
 
-def test_what_run_would_refuse_is_told(site: Path) -> None:
+def test_init_names_what_run_would_refuse(site: Path) -> None:
     write(site / "Studie 1" / "B" / "p2 re.mcap", thinned(3, 20, subject="P02", side="left", examiner="B"))
     done = init(site)
     assert "to correct before the run: exams.csv: line 5, column side: the side right differs from left" in done.stdout

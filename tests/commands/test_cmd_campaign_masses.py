@@ -77,7 +77,7 @@ def test_replicates_and_visits_are_matched_by_place_in_patient_axes(folder: Path
 
 
 @pytest.mark.long
-def test_without_a_place_the_largest_is_taken_and_the_other_is_told(folder: Path) -> None:
+def test_without_a_place_the_largest_is_taken_and_the_other_is_reported(folder: Path) -> None:
     """The control: no row names a place."""
     told = campaign(folder, "b.nc,P1,1,2,2,left,,")
     assert centre(folder, "P1.v1.m2.r2") == (-12, -6)
@@ -106,7 +106,7 @@ def test_a_mass_that_is_not_within_the_distance_is_not_taken(folder: Path) -> No
 
 
 @pytest.mark.long
-def test_exams_of_a_mass_that_lie_apart_are_told(folder: Path) -> None:
+def test_exams_of_a_mass_that_lie_apart_are_reported(folder: Path) -> None:
     """The second row's place is the other mass's; the control has both rows at one."""
     campaign(folder, "a.nc,P1,1,1,1,left,-17,2", "b.nc,P1,1,1,2,left,21,-6")
     rows = {row["replicate"]: row["findings"] for row in rows_of(folder / "out" / "exams_done.csv")}

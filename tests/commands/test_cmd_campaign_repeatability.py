@@ -48,7 +48,7 @@ def own(study: Path, tmp_path: Path) -> Path:
 
 
 @pytest.mark.long
-def test_it_learns_says_so_and_its_file_is_what_the_command_writes(study: Path, tmp_path: Path) -> None:
+def test_a_campaign_learns_the_spread_and_its_file_is_what_the_command_writes(study: Path, tmp_path: Path) -> None:
     said = (study / "said.txt").read_text()
     assert SAYS in said
     assert "at this site, by 5 masses and 10 exams; every size is by this spread" in said
@@ -60,7 +60,7 @@ def test_it_learns_says_so_and_its_file_is_what_the_command_writes(study: Path, 
 
 
 @pytest.mark.long
-def test_the_tables_have_the_sizes_by_it(study: Path) -> None:
+def test_the_tables_have_the_sizes_by_the_learned_spread(study: Path) -> None:
     rows = rows_of(study / "out" / "trial.csv")
     learned = json.loads((study / "out" / "repeatability.json").read_text())
     for row in rows:
@@ -170,7 +170,7 @@ def test_none_leaves_it_out_and_a_file_or_a_stated_spread_takes_its_place(own: P
 
 
 @pytest.mark.long
-def test_fewer_than_five_masses_with_repeats_do_not_teach_it(own: Path) -> None:
+def test_the_spread_is_not_learned_from_fewer_than_five_masses(own: Path) -> None:
     write_table(own / "exams.csv", ROWS[:9])
     done = campaign(own)
     assert "spread between exams not learned: 4 masses have repeated exams, and it takes 5" in done.stdout
@@ -210,7 +210,7 @@ def first_alone(draw: Callable[..., object]) -> Callable[..., None]:
 
 
 @pytest.mark.long
-def test_figures_have_the_size_by_it(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_figures_show_the_size_by_the_learned_spread(own: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("draw_map", "draw_size"):
         monkeypatch.setattr(campaign_steps, name, first_alone(getattr(campaign_steps, name)))
     campaign(own, "--figures")

@@ -194,7 +194,7 @@ def test_a_stated_spread_between_exams_widens_the_change_and_leaves_one_interval
         (("a0.nc", "--with", "no.nc"), 3, "no.nc"),
     ],
 )
-def test_what_cannot_be_compared_is_one_clear_line(folder: Path, words: tuple, code: int, told: str) -> None:
+def test_visits_that_cannot_be_compared_are_one_clear_line(folder: Path, words: tuple, code: int, told: str) -> None:
     done = run(folder, *words)
     assert done.returncode == code
     assert told in done.stderr

@@ -195,7 +195,7 @@ def test_a_spreadsheets_list_of_maps_is_known_as_one(tmp_path: Path, separator: 
 
 
 @pytest.mark.long
-def test_what_cannot_be_corrected_is_refused(folder: Path) -> None:
+def test_a_correction_that_is_impossible_is_refused(folder: Path) -> None:
     words = ("calibrate", "size", "phantoms.csv", "-o", "never.json", "--correct")
     for name in ("plane-strain", "none"):
         done = run_here(*words, name, cwd=folder)

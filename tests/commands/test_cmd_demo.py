@@ -37,7 +37,7 @@ def typed(shown: CompletedProcess[str]) -> list[list[str]]:
 
 
 @pytest.mark.long
-def test_it_shows_the_default_road_first_and_ends_with_truth_and_results(shown: CompletedProcess[str]) -> None:
+def test_the_demo_shows_the_default_first_and_ends_with_truth_and_results(shown: CompletedProcess[str]) -> None:
     assert shown.returncode == 0, shown.stderr
     assert [words[0] for words in typed(shown)] == STEPS
     first_map, first_estimate = typed(shown)[:2]
@@ -76,7 +76,7 @@ def test_the_scan_is_of_a_body_that_the_calibration_has_seen(run_cli: Run, place
 
 
 @pytest.mark.long
-def test_it_leaves_every_file_behind_for_its_owner_only(shown: CompletedProcess[str], place: Path) -> None:
+def test_the_demo_leaves_every_file_for_its_owner_only(shown: CompletedProcess[str], place: Path) -> None:
     assert shown.returncode == 0
     files = {path.name: path for path in (place / "my demo").iterdir()}
     made = {"scan.mcap", "phantoms.csv", "trial.csv", "excision.csv", "map.nc", "posterior.nc", "posterior_eq6.nc"}
@@ -102,7 +102,7 @@ def test_the_printed_commands_do_it_by_hand(run_cli: Run, shown: CompletedProces
         (None, "/somewhere/tactile_bayes/__main__.py", "-m tactile_bayes for it"),
     ],
 )
-def test_it_says_what_to_type_where_the_program_is_not_on_the_path(
+def test_the_demo_says_what_to_type_where_the_program_is_not_on_the_path(
     monkeypatch: pytest.MonkeyPatch, found: str | None, started: str, words: str
 ) -> None:
     monkeypatch.setattr("sys.argv", [started, "demo"])

@@ -67,7 +67,7 @@ def test_too_little_turning_is_refused(options, words):
         (0x1234, "mouse", "unknown"),
     ],
 )
-def test_a_guess_says_that_it_is_one(vendor, product, words):
+def test_a_guessed_device_is_said_to_be_a_guess(vendor, product, words):
     assert words in guess_device(vendor, product)
 
 

@@ -48,7 +48,7 @@ def test_a_mass_is_drawn_alike_wherever_it_is_drawn_and_others_differ() -> None:
     assert one[0].solid_lumps[0].d_mm != other[0].solid_lumps[0].d_mm
 
 
-def test_every_drawn_body_can_be() -> None:
+def test_every_body_drawn_from_the_prior_is_a_valid_scene() -> None:
     """A scene refuses a lump through the skin or the wall: all of the prior must pass it."""
     prior = BodyPrior()
     for i in range(300):
@@ -103,7 +103,7 @@ def test_eq6_is_learned_from_the_same_table(table: Path, tmp_path: Path) -> None
         (["--seed", "4"], 2, "--seed is for tables of lumps"),
     ],
 )
-def test_what_the_table_fixes_cannot_be_declared(table: Path, tmp_path: Path, arguments, code, words) -> None:
+def test_an_option_that_the_table_fixes_is_refused(table: Path, tmp_path: Path, arguments, code, words) -> None:
     done = run_here("calibrate", "size", table, "--form", "eq6", "-o", "x.json", *arguments, cwd=tmp_path)
     assert done.returncode == code
     assert words in done.stderr

@@ -33,7 +33,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.long
-def test_it_is_learned_from_a_campaigns_folder_and_says_what_it_means(site: Path) -> None:
+def test_a_repeatability_is_learned_from_a_campaigns_folder(site: Path) -> None:
     document = json.loads((site / "site.json").read_text())
     assert document["low"] < 0.08 < document["high"]
     assert (document["masses"], document["maps"]) == (10, 30)
@@ -133,7 +133,7 @@ def test_a_comparison_is_at_the_sites_repeatability(site: Path, tmp_path: Path) 
 
 
 @pytest.mark.long
-def test_python_learns_and_uses_it(site: Path, tmp_path: Path) -> None:
+def test_python_learns_and_uses_a_repeatability(site: Path, tmp_path: Path) -> None:
     found = tb.calibrate_repeatability(site / "out", path=tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == (site / "site.json").read_bytes()
     by_object = tb.estimate(site / "map.nc", method="laplace", repeatability=found)

@@ -173,7 +173,9 @@ REFUSED = [
 
 @pytest.mark.long
 @pytest.mark.parametrize(("words", "code", "message"), REFUSED)
-def test_what_makes_no_page_is_one_clear_line(folder: Path, words: tuple[str, ...], code: int, message: str) -> None:
+def test_inputs_that_make_no_page_are_one_clear_line(
+    folder: Path, words: tuple[str, ...], code: int, message: str
+) -> None:
     done = run_here("report", *words, "-o", "bad.html", cwd=folder)
     assert done.returncode == code
     assert message in done.stderr

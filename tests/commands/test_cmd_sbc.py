@@ -23,7 +23,7 @@ def quick(index: int, *, method: str, seed: int, cosines: int) -> MapRanks:
 
 
 @pytest.mark.long
-def test_six_maps(tmp_path: Path) -> None:
+def test_a_run_of_six_maps_prints_the_ranks_and_writes_table_and_figure(tmp_path: Path) -> None:
     words = ("sbc", "--maps", 6, "--method", "laplace", "-o", "s.csv", "--figure", "s.png")
     done = run_here(*words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -65,7 +65,7 @@ def test_an_interrupted_run_goes_on_and_gives_the_same_table(tmp_path: Path, mon
     assert (tmp_path / "s.csv").read_bytes() == first
 
 
-def test_findings_as_data(tmp_path: Path, monkeypatch) -> None:
+def test_the_json_has_ranks_and_maps_without_an_estimate(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(command, "shipped_ranks", quick)
     done = run_here("sbc", "--maps", 100, "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -117,7 +117,7 @@ def test_a_table_is_known_with_a_letter_across_the_end_of_its_first_bytes(tmp_pa
         ("cut.mcap", b"\x89MCAP0\r\n"),
     ],
 )
-def test_what_is_none_of_ours_is_one_line_and_exit_3(tmp_path: Path, name: str, data: bytes | None) -> None:
+def test_a_foreign_file_is_one_line_and_exit_3(tmp_path: Path, name: str, data: bytes | None) -> None:
     if data is not None:
         (tmp_path / name).write_bytes(data)
     done = run_here("show", name, cwd=tmp_path)

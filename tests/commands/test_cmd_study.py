@@ -130,7 +130,7 @@ FAULTS: dict[str, tuple[tuple[object, ...], int, list[str]]] = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_what_cannot_be_is_said_in_one_line(name: str, run_cli: Run, tmp_path: Path) -> None:
+def test_an_impossible_study_is_one_line(name: str, run_cli: Run, tmp_path: Path) -> None:
     words, code, said = FAULTS[name]
     (tmp_path / "there.csv").write_text("")
     done = run_cli("study", *words, cwd=tmp_path)

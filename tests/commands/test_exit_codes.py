@@ -82,7 +82,7 @@ def test_what_nohup_ignores_stays_ignored() -> None:
         (("mapp",), "No such command 'mapp'. Did you mean 'map'?; see `tactile-bayes --help`"),
     ],
 )
-def test_wrong_words_are_one_line_too(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
+def test_a_usage_error_is_one_line_without_the_usage(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
     """They came with two lines of usage before the line that says what is wrong."""
     done = run_here(*words, cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (errors.EXIT_USAGE, "", f"error: {said}\n")

@@ -60,7 +60,7 @@ def folder(exam: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.long
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_does_not_fit_is_told_in_one_line(case: str, folder: Path, tmp_path: Path) -> None:
+def test_an_export_that_does_not_fit_is_one_line(case: str, folder: Path, tmp_path: Path) -> None:
     for package in ("highdicom", "nrrd", "fhir.resources"):
         pytest.importorskip(package)
     words, told = REFUSED[case]

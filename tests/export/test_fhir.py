@@ -63,7 +63,7 @@ def test_sizes_and_intervals_are_read_back_equal(sized: dict[str, Any], estimate
         assert one.status == "preliminary"
 
 
-def test_patient_and_order_are_as_given(sized: dict[str, Any]) -> None:
+def test_patient_and_order_are_those_of_the_worklist(sized: dict[str, Any]) -> None:
     (patient,) = resources(sized, "Patient")
     assert patient["identifier"] == [{"value": "P-77", "assigner": {"display": "Our hospital"}}]
     assert patient["name"] == [{"family": "Doe", "given": ["Jane", "<b>&"]}]
@@ -78,7 +78,7 @@ def test_patient_and_order_are_as_given(sized: dict[str, Any]) -> None:
     assert "95 % credible interval" in report["conclusion"]
 
 
-def test_nobody_is_invented(exam: Path, tmp_path: Path) -> None:
+def test_no_patient_is_written_where_none_was_named(exam: Path, tmp_path: Path) -> None:
     document = bundle(exam, tmp_path / "b.json", "map.json")
     assert resources(document, "Patient") == []
     text = json.dumps(document)

@@ -22,7 +22,7 @@ from tactile_bayes.exports.exam import Identity, Moment, merged_identity, read_w
         ("2026-02-28T23:59:59Z", "20260228", "235959", "+0000", "2026-02-28T23:59:59+00:00"),
     ],
 )
-def test_a_moment_is_read(text: str, date: str, time: str, zone: str, fhir: str) -> None:
+def test_a_date_with_time_and_zone_is_parsed(text: str, date: str, time: str, zone: str, fhir: str) -> None:
     moment = Moment.parse(text, name="study_date")
     assert (moment.date, moment.time, moment.zone, moment.fhir) == (date, time, zone, fhir)
 
@@ -30,7 +30,7 @@ def test_a_moment_is_read(text: str, date: str, time: str, zone: str, fhir: str)
 @pytest.mark.parametrize(
     "text", ["24.11.2026", "2026-02-30", "2026-11-24T25:00", "2026-11-24T10:30+25:00", "٢٠٢٦-11-24"]
 )
-def test_what_is_no_moment_is_refused(text: str) -> None:
+def test_an_impossible_date_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match=r"study_date is .*YYYY-MM-DD"):
         Moment.parse(text, name="study_date")
 
@@ -57,7 +57,7 @@ def test_what_is_no_moment_is_refused(text: str) -> None:
         ("study_uid", "abc"),
     ],
 )
-def test_what_dicom_cannot_hold_is_refused_with_its_name(name: str, value: str) -> None:
+def test_an_identity_that_dicom_cannot_hold_is_refused_by_name(name: str, value: str) -> None:
     with pytest.raises(UsageError, match=name) as caught:
         Identity(**{name: value})
     assert len(str(caught.value).splitlines()) == 1
@@ -71,7 +71,7 @@ def test_an_option_that_contradicts_the_worklist_is_refused(tmp_path: Path) -> N
         merged_identity(path, {"patient_id": "B"})
 
 
-def test_plain_keys(tmp_path: Path) -> None:
+def test_a_worklist_of_plain_keys_is_read_and_checked(tmp_path: Path) -> None:
     path = tmp_path / "w.json"
     path.write_text(json.dumps({"patient_id": "A", "patient_name": "Doe^Jane", "sex": ""}))
     assert read_worklist(path).given == {"patient_id": "A", "patient_name": "Doe^Jane"}
@@ -129,7 +129,7 @@ def test_a_modality_worklist_item(tmp_path: Path) -> None:
     assert found.study is None, "a scheduled date is not the date of the exam"
 
 
-def test_dicom_json(tmp_path: Path) -> None:
+def test_a_worklist_item_is_read_from_dicom_json(tmp_path: Path) -> None:
     path = tmp_path / "item.json"
     path.write_text(worklist_item().to_json())  # type: ignore[attr-defined]
     assert read_worklist(path).given == WANTED

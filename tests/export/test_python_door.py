@@ -86,7 +86,7 @@ def test_a_map_in_memory_and_its_estimate_go_together_and_another_is_refused(fol
         tb.export([folder / "empty.nc", found], folder / "c", to="dicom", **DATED)
 
 
-def test_what_cannot_be_exported_is_told(folder: Path) -> None:
+def test_an_impossible_export_is_refused(folder: Path) -> None:
     with pytest.raises(UsageError, match="give one of dicom, fhir, nrrd, csv"):
         tb.export(folder / "map.json", folder / "x", to="pdf")  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="no keyword 'patient'"):

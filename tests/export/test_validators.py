@@ -57,7 +57,7 @@ def test_dciodvfy_reports_no_error(written: list[Path]) -> None:
         assert [line for line in lines if line.startswith(("Error", "Abort"))] == []
 
 
-def test_dciodvfy_would_report_one(written: list[Path]) -> None:
+def test_dciodvfy_reports_a_missing_attribute(written: list[Path]) -> None:
     """The negative control: a type 1 attribute is taken away."""
     dataset = pydicom.dcmread(written[-1])
     del dataset.SeriesInstanceUID

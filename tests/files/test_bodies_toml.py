@@ -17,7 +17,7 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def test_what_is_given_is_drawn_from(tmp_path: Path) -> None:
+def test_stated_ranges_replace_the_defaults(tmp_path: Path) -> None:
     text = "[bodies]\nd_mm = [8, 9]\nseat = [0, 0]\n[exams]\nlines = [3, 3]\n"
     found = read_toml_record(written(tmp_path, text), BodiesFile, way_out="see the schema")
     bodies, exams = found.bodies, found.exams
@@ -48,7 +48,7 @@ def test_what_is_given_is_drawn_from(tmp_path: Path) -> None:
         ("[exams]\ndrift_kpa = [1, 8]\n", "keep the drift below the mean pressure"),
     ],
 )
-def test_what_is_no_range_is_one_line(tmp_path: Path, text: str, words: str) -> None:
+def test_an_impossible_range_is_one_line(tmp_path: Path, text: str, words: str) -> None:
     path = written(tmp_path, text)
     with pytest.raises(BadDataError) as caught:
         read_toml_record(path, BodiesFile, way_out="see the schema")

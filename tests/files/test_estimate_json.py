@@ -103,7 +103,7 @@ def check(document: Document) -> None:
     checked_report(document, REPORTS[document["schema"]], path=Path("exam.json"))
 
 
-def test_what_the_program_printed_passes() -> None:
+def test_a_printed_estimate_is_accepted() -> None:
     check(estimate_document())
 
 

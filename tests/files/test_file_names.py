@@ -109,7 +109,7 @@ def test_a_name_that_promises_another_format_is_refused_before_any_work(case: st
     assert [path.name for path in tmp_path.iterdir()] == ["exam.json"]
 
 
-def test_the_python_door_refuses_it_too(tmp_path: Path) -> None:
+def test_python_refuses_the_suffix_of_another_format(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"has the suffix '\.csv', and netCDF is written; name it map\.nc"):
         tb.demo_map().save(tmp_path / "map.csv")
     assert list(tmp_path.iterdir()) == []

@@ -81,7 +81,7 @@ ONE_ROW_A_FRAME: dict[str, tuple[Sequence[str], str, dict[str, Any]]] = {
 
 
 @pytest.mark.parametrize("name", ONE_ROW_A_FRAME)
-def test_one_row_a_frame(tmp_path: Path, name: str) -> None:
+def test_a_table_of_one_row_per_frame_is_read(tmp_path: Path, name: str) -> None:
     lines, encoding, stated = ONE_ROW_A_FRAME[name]
     path = tmp_path / "frames.csv"
     path.write_bytes("\r\n".join([*lines, ""]).encode(encoding))

@@ -443,7 +443,7 @@ def test_a_grid_lies_as_its_places_say(tmp_path: Path, arrays: dict[str, Any]) -
         import_grid(tmp_path / "grid.npz", GridOptions(spacing_mm=1.0, normalise="gain"))
 
 
-def test_the_steps_of_an_import_are_told(tmp_path: Path) -> None:
+def test_the_steps_of_an_import_are_reported(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", lump())
     told: list[tuple[int, int]] = []
     import_grid(

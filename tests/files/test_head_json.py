@@ -91,7 +91,7 @@ def sphere() -> dict[str, Any]:
         ),
     ],
 )
-def test_what_is_no_head_is_one_line(tmp_path: Path, document: dict[str, Any], words: str) -> None:
+def test_an_impossible_head_is_one_line(tmp_path: Path, document: dict[str, Any], words: str) -> None:
     path = written(tmp_path, document)
     with pytest.raises(BadDataError) as caught:
         read_simulated_head(path)

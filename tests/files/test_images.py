@@ -227,7 +227,7 @@ def test_what_cannot_be_read_as_it_is_is_refused_with_what_was_found(tmp_path: P
         picture(tmp_path, data)
 
 
-def test_what_a_viewer_would_not_show_is_told(tmp_path: Path) -> None:
+def test_an_inverted_or_turned_image_is_reported(tmp_path: Path) -> None:
     data = tiff({"data": A.astype("<u2").tobytes(), "bits": 16, "photometric": 0, "tags": {274: (3, [3])}})
     found = picture(tmp_path, data)
     assert any("zero is white" in note for note in found.notes)

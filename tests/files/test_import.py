@@ -111,7 +111,7 @@ def test_every_fault_is_one_line(
     ("content", "words"),
     [(b"", "not an .npz"), (b"hello, world", "not an .npz"), (b"\x80\x04pickle", "not an .npz")],
 )
-def test_what_is_no_archive_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
+def test_a_file_that_is_no_archive_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
     path = tmp_path / "x.npz"
     path.write_bytes(content)
     with pytest.raises(BadDataError, match=words):

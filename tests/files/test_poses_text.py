@@ -250,7 +250,7 @@ FAULTS: dict[str, tuple[list[str], dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_what_is_no_path_is_one_line(tmp_path: Path, fault: str) -> None:
+def test_poses_with_a_fault_are_one_line(tmp_path: Path, fault: str) -> None:
     lines, stated, words = FAULTS[fault]
     path = tmp_path / "poses.csv"
     path.write_text("\n".join(lines))

@@ -26,7 +26,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "site.json"
 
 
-def test_what_is_written_is_read(written: Path) -> None:
+def test_a_written_repeatability_is_read_back(written: Path) -> None:
     learned = learn_from_exams(exams_of_campaign(written.parent / "out")).spread()
     read = read_repeatability(written)
     assert read.sha256 == sha256(written)
@@ -50,7 +50,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("case", FAULTS)
-def test_what_cannot_be_one_is_refused_by_its_fault(case: str, written: Path, tmp_path: Path) -> None:
+def test_an_impossible_repeatability_is_refused_by_its_fault(case: str, written: Path, tmp_path: Path) -> None:
     changes, fault = FAULTS[case]
     path = tmp_path / "bad.json"
     path.write_text(json.dumps(json.loads(written.read_text()) | changes))

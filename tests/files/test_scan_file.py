@@ -188,7 +188,7 @@ def chunk_offsets(path: Path) -> list[int]:
 
 
 @pytest.mark.parametrize("which", [0, 1, -1])
-def test_a_changed_byte_in_a_chunk_is_told(scan: Scan, whole: Path, tmp_path: Path, which: int) -> None:
+def test_a_changed_byte_in_a_chunk_is_reported(scan: Scan, whole: Path, tmp_path: Path, which: int) -> None:
     data = bytearray(whole.read_bytes())
     data[chunk_offsets(whole)[which]] ^= 0x41
     bad = tmp_path / "bad.mcap"

@@ -144,7 +144,7 @@ def test_impossible_heads_are_named(options: dict[str, float], words: list[str])
     assert all(word in str(caught.value) for word in words)
 
 
-def test_what_cannot_be_pressed_is_said(surface: SurfaceCompliance) -> None:
+def test_a_head_off_the_surface_is_refused(surface: SurfaceCompliance) -> None:
     with pytest.raises(BadDataError, match="must divide the head's width"):
         Head().cell_profile_mm(0.7)
     with pytest.raises(BadDataError, match=r"the head at 60.5 mm leaves the surface, which ends at 72 mm"):
@@ -168,7 +168,7 @@ def test_the_half_that_is_solved_is_mirrored_to_the_whole(surface: SurfaceCompli
     assert slide(surface, 10.0, positions_mm=(-8.0, 6.0, 2.0)).pressure_kpa.shape == (8, 96)
 
 
-def test_any_position_will_do(surface: SurfaceCompliance) -> None:
+def test_frames_between_two_cells_are_interpolated(surface: SurfaceCompliance) -> None:
     """Between two cells the surface is interpolated; frames then lie between their neighbours'."""
     frames = press(surface, 100.0, np.array([4.0, 4.1, 4.25])).pressure_kpa[:, 12:-12]
     np.testing.assert_allclose(frames[1], frames[0] + 0.4 * (frames[2] - frames[0]), atol=0.02)

@@ -32,7 +32,7 @@ def test_damaged_files_are_read_or_refused_in_one_line(name: str, tmp_path: Path
 
 
 @pytest.mark.parametrize("name", [name for name in FORMATS if name != "json"])
-def test_the_seeds_are_accepted(name: str, tmp_path: Path) -> None:
+def test_the_unmutated_files_are_accepted(name: str, tmp_path: Path) -> None:
     form = FORMATS[name]
     for seed in form.seeds(tmp_path):
         path = tmp_path / f"seed{form.suffix}"

@@ -172,7 +172,7 @@ def test_a_clock_of_coarse_ticks_is_no_clock_that_stands_still():
 
 
 @pytest.mark.parametrize(("factor", "steps"), [(1000, MOST_STEPS), (0.001, 0)])
-def test_a_clock_in_another_unit_is_told(factor, steps):
+def test_a_clock_in_another_unit_is_reported(factor, steps):
     _, report = run_head(lambda t: round(t * factor), seconds=3.0)
     assert report.frames == 600
     assert report.head_clock_steps == steps
@@ -266,7 +266,7 @@ def test_a_restart_is_no_wrap():
     assert wrap_period(50 * S, 0, passed_ns=FRAME_NS) is None
 
 
-def test_a_damaged_frame_counter_is_told():
+def test_a_damaged_frame_counter_is_reported():
     session = Session(tracker=False)
     for i in range(10):
         session.now_ns = i * FRAME_NS
@@ -299,7 +299,7 @@ def mismatch(frames: tuple[float, float], poses: tuple[float, float], *, rate_hz
         ((0, 2), (3, 5), ["no frame has a pose: poses cover 3.00 to 5.00 s, frames 0.00 to 2.00 s"]),
     ],
 )
-def test_poses_that_do_not_cover_the_frames_are_told(frames, poses, said):
+def test_poses_that_do_not_cover_the_frames_are_reported(frames, poses, said):
     report = mismatch(frames, poses)
     assert report.cautions == said
     assert ("none of its" in report.fault) == any("no frame has a pose" in text for text in said)
@@ -326,7 +326,7 @@ def test_no_pose_at_all_is_a_fault():
     assert "tracker fake: none of its 0 poses was measured while frames came" in session.end().fault
 
 
-def test_gaps_a_promise_not_kept_and_a_stuck_tracker_are_told():
+def test_gaps_a_promise_not_kept_and_a_stuck_tracker_are_reported():
     session = Session(shared=True, rate_hz=200.0)
     for i in range(800):
         session.now_ns = i * FRAME_NS

@@ -225,7 +225,7 @@ def test_a_file_that_is_being_recorded_is_left_alone(tmp_path, run_cli):
     assert path.read_bytes() == b""
 
 
-def test_a_tracker_on_the_heads_port_is_told(tmp_path, run_cli):
+def test_a_tracker_on_the_heads_port_is_reported(tmp_path, run_cli):
     write_scan(tmp_path / "scan.mcap", short_scan(0.1), provenance=Provenance("test", {}))
     tracker = EmulatedTracker(short_scan(0.1).poses, protocol="open")
     with serving(tracker, PtyLink()) as emulator:

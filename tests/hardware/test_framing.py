@@ -84,7 +84,7 @@ def test_codes_that_do_not_end_with_the_data_are_refused(broken):
 
 
 @pytest.mark.parametrize("name", GOLDEN)
-def test_golden_packets(name):
+def test_the_golden_packets_are_those_of_the_protocols_page(name):
     made, golden = GOLDEN[name]
     assert made.hex(" ") == golden
     page = (Path(__file__).parents[2] / "docs" / "scan-head-protocol.md").read_text(encoding="utf-8")
@@ -194,7 +194,7 @@ def test_after_anything_the_next_packet_is_found_ten_thousand_times(data, cut):
     check_anything(data, cut)
 
 
-def test_noise_without_a_zero_is_let_go():
+def test_noise_without_a_delimiter_is_dropped():
     parser = PacketParser()
     for _ in range(100):
         parser.packets(b"\x55" * 4000)
@@ -245,7 +245,7 @@ def test_another_version_is_told_apart_from_noise():
     assert parser.garbage_bytes == 0
 
 
-def test_a_payload_has_a_longest():
+def test_a_payload_above_the_limit_is_refused():
     with pytest.raises(BadDataError, match="a packet holds"):
         encode_packet(2, bytes(20_000), sequence=0, device_us=0)
 

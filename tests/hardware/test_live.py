@@ -74,7 +74,7 @@ def state(scan) -> LiveState:
     return live.state(size="largest size 15.0 mm")
 
 
-def test_what_is_fed_is_seen(scan, pipe):
+def test_records_pass_through_the_pipe_unchanged(scan, pipe):
     reader, feed = pipe
     feed.frame(scan.frames.counts[3], 15_000_000)
     feed.pose(pose_of(scan, 2), 16_666_667)

@@ -156,7 +156,7 @@ def test_each_enabled_tool_is_read_and_named_by_handle_and_part():
     ]
 
 
-def test_a_tracker_that_stops_answering_is_told():
+def test_a_tracker_that_stops_answering_is_reported():
     tracker = NdiTracker(FakeLibrary([7] * 10), "/dev/ttyUSB0")
     for _ in range(4):
         assert tracker.readings() == []
@@ -174,7 +174,7 @@ def test_a_tracker_that_stops_answering_is_told():
     ],
     ids=["closed", "no tool", "refused", "no description"],
 )
-def test_what_cannot_be_set_up_is_told_in_one_line(tmp_path, library, rom, words):
+def test_what_cannot_be_set_up_is_one_line(tmp_path, library, rom, words):
     with pytest.raises(DeviceError, match=words) as error:
         NdiTracker(library, "/dev/ttyUSB0", roms=[tmp_path / rom] if rom else [])
     assert "\n" not in str(error.value)
@@ -318,7 +318,7 @@ def test_a_spoilt_reply_costs_that_pose_and_not_the_recording():
     assert device.replies > 60
 
 
-def test_a_port_where_nobody_answers_is_told():
+def test_a_port_where_nobody_answers_is_reported():
     pytest.importorskip(ndi.MODULE)
     with pytest.raises(DeviceError, match=r"tracker /dev/nothing-here: cannot be opened; check its cable") as error:
         open_tracker("ndi", "/dev/nothing-here")

@@ -150,7 +150,7 @@ def test_a_port_without_descriptor_is_read_all_the_same():
 @pytest.mark.parametrize(
     ("data", "words"), [(b"", "nothing"), (b"hello\r\n", repr("hello\r\n")), (bytes(20), "00 00 00"), (b"\xff", "ff")]
 )
-def test_what_came_is_shown(data, words):
+def test_an_unexpected_reply_is_quoted(data, words):
     assert words in preview(data)
 
 

@@ -73,7 +73,7 @@ def test_settings_are_not_negotiated_again_for_every_read(monkeypatch):
 # pyserial 3.5 forgets the socket it gives up.
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_server_that_does_not_speak_it_is_told_in_one_line():
+def test_a_server_that_does_not_speak_it_is_one_line():
     with socket.create_server(("127.0.0.1", 0)) as listener:
         url = f"rfc2217://127.0.0.1:{listener.getsockname()[1]}"
         with pytest.raises(DeviceError, match=r"tracker rfc2217://.* cannot be opened") as error:

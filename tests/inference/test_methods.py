@@ -251,7 +251,7 @@ class TestContract:
         assert np.median(posterior.noise_sd) == pytest.approx(0.02, rel=0.05)
         assert (posterior.background == 1.0).all()
 
-    def test_it_says_what_its_draws_are_worth(self, method: str) -> None:
+    def test_effective_draws_are_between_800_and_all(self, method: str) -> None:
         draws = answer(method).draws
         assert draws is not None
         assert 800 <= draws.effective_draws <= len(draws.flat)

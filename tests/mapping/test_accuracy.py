@@ -126,7 +126,7 @@ MAPS = {
 
 
 @pytest.mark.parametrize(("make", "expected"), MAPS.values(), ids=MAPS)
-def test_extremes_with_a_map(make, expected):
+def test_extreme_scans_that_have_a_map(make, expected):
     tactile_map = build_map(make())
     for name, value in expected.items():
         assert tactile_map.quality[name] == pytest.approx(value, abs=1e-3), name
@@ -148,7 +148,7 @@ NO_MAPS = {
 
 
 @pytest.mark.parametrize(("make", "message"), NO_MAPS.values(), ids=NO_MAPS)
-def test_extremes_without_a_map(make, message):
+def test_extreme_scans_that_are_refused(make, message):
     with pytest.raises(BadDataError, match=message):
         build_map(make())
 

@@ -73,7 +73,7 @@ def test_a_wrong_convention_hardly_ever_passes(name):
 
 
 @pytest.mark.long
-def test_the_right_one_passes():
+def test_the_right_convention_passes():
     assert [verdict(scan_of(seed)) for seed in range(SCANS)] == ["passed"] * SCANS
 
 

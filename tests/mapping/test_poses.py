@@ -142,7 +142,7 @@ def test_a_head_that_rests_or_does_not_turn_is_no_frozen_tracker() -> None:
         assert len(distinct_poses(TrackerPoses(poses.time_s, place, rotation))) == 300
 
 
-def test_no_pose_knows_no_frame():
+def test_without_poses_no_frame_has_a_known_pose():
     nothing = TrackerPoses(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4)))
     found = poses_at(distinct_poses(nothing), np.arange(3.0))
     assert not found.known.any()

@@ -51,7 +51,7 @@ def shared(scan: Scan, **options) -> dict[str, float]:
 
 
 @pytest.mark.parametrize(("share", "length_mm"), [(0.3, 4.0), (0.7, 2.5), (0.9, 6.0)])
-def test_what_was_put_in_is_found(share, length_mm):
+def test_the_simulated_share_and_length_are_recovered(share, length_mm):
     found = shared(noisy_scan(share=share, length_mm=length_mm))
     assert found["shared_share"] == pytest.approx(share, abs=0.05)
     assert found["shared_length_mm"] == pytest.approx(length_mm, rel=0.15)
@@ -125,7 +125,7 @@ UNDETERMINED = {
 
 
 @pytest.mark.parametrize("make", UNDETERMINED.values(), ids=UNDETERMINED)
-def test_where_it_cannot_be_known_it_is_absent_and_the_text_says_so(make):
+def test_unknown_figures_are_absent_and_the_text_says_so(make):
     tactile_map = build_map(make())
     assert not NAMES & set(tactile_map.quality)
     text = map_text(tactile_map)
@@ -134,7 +134,7 @@ def test_where_it_cannot_be_known_it_is_absent_and_the_text_says_so(make):
     assert "nan" not in text
 
 
-def test_an_accumulator_does_not_know_it():
+def test_a_live_map_has_no_figures_of_shared_errors():
     scan = noisy_scan(share=0.5)
     poses = poses_at(distinct_poses(scan.poses), scan.frames.time_s)
     grown = MapAccumulator(scan.head, scan.element_calibration, plane_from_base=np.eye(4))

@@ -37,7 +37,7 @@ def test_all_frames_are_the_scan_itself():
     assert len(first_seconds(whole, 1e9).frames) == len(whole.frames)
 
 
-def test_the_first_seconds_are_those():
+def test_the_first_seconds_of_a_scan_end_at_their_time():
     whole = scan()
     start = whole.frames.time_s[0]
     part = first_seconds(whole, 0.5)

@@ -192,7 +192,7 @@ UNUSUAL: dict[str, tuple[Callable[[Scan], Scan], str]] = {
 
 
 @pytest.mark.parametrize(("made", "told"), UNUSUAL.values(), ids=UNUSUAL)
-def test_what_hides_no_lump_is_told_and_leaves_the_verdict(made: Callable[[Scan], Scan], told: str) -> None:
+def test_a_fault_that_hides_no_lump_is_reported_and_leaves_the_verdict(made: Callable[[Scan], Scan], told: str) -> None:
     one = made(scan(0.0))
     doubts = check_scan(one, pressure_window_kpa=WINDOW, thorough=False).doubts
     assert any(told in each.text for each in doubts if each.kind == "unusual_scan")
@@ -246,7 +246,7 @@ def test_a_tracker_that_stands_still_is_told_and_its_frames_are_left_out(
     assert missing >= 90
 
 
-def test_a_slow_tracker_is_not_told() -> None:
+def test_a_slow_tracker_raises_no_finding() -> None:
     """Each pose sent twice, thrice and four times: up to 40 ms old."""
     for times in (1, 2, 3, 4):
         slow = still()(scan())
@@ -289,7 +289,7 @@ def filled(value: float) -> Callable[[np.ndarray], np.ndarray]:
 
 
 @pytest.mark.parametrize("value", [1e20, -9999.0, 65535.0, 255.0, -1.0, 9999.0])
-def test_values_that_stand_for_none_are_told(value: float) -> None:
+def test_values_that_stand_for_none_are_reported(value: float) -> None:
     assert any("18 of 2601 cells lie far outside the rest" in text for text in grid(filled(value)))
 
 
@@ -301,7 +301,7 @@ def test_a_map_that_dips_where_a_lump_would_rise_is_told_and_a_slope_is_not() ->
     assert grid(lambda v: v + slope) == grid(lambda v: v * (1.0 + slope)) == []
 
 
-def test_a_grid_that_could_not_show_a_lump_is_told() -> None:
+def test_a_grid_that_could_not_show_a_lump_is_reported() -> None:
     assert any("all 2601 cells hold 1: nothing was felt" in text for text in grid(np.ones_like))
     assert any("the grid covers 3.6 cm2" in text for text in grid(lambda v: np.where(corner(19), v, np.nan)))
     assert grid(lambda v: np.where(corner(30), v, np.nan)) == []

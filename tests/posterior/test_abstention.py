@@ -151,7 +151,7 @@ def test_no_place_at_all_is_a_usage_error() -> None:
         replace(FIELD, centre_mm=(float("nan"), 0.0))
 
 
-def test_a_measurable_lump_has_neither() -> None:
+def test_a_measurable_lump_has_no_reason_and_no_advice() -> None:
     found = run(bump_values() + WHITE)
     assert (found.status, found.code, found.advice) == ("estimate", "", "")
 

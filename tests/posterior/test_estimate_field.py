@@ -37,7 +37,7 @@ def calibration(noise: str) -> SizeCalibration:
 
 
 @pytest.mark.parametrize("method", ["laplace", "importance", pytest.param("ensemble", marks=pytest.mark.slow)])
-def test_the_bump_comes_back(method: str) -> None:
+def test_every_method_recovers_the_bump(method: str) -> None:
     found = run(replace(FIELD, method=method))
     assert found.status == "estimate"
     posterior = found.map_posterior

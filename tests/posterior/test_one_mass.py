@@ -87,7 +87,7 @@ def test_without_landmarks_or_a_common_place_nothing_is_estimated_again() -> Non
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_maps_whose_masses_lie_apart_are_told(order: tuple[int, int]) -> None:
+def test_maps_whose_masses_lie_apart_are_reported(order: tuple[int, int]) -> None:
     """The lower one is named whatever the order; 14 mm between exams are landmarks touched anew."""
     far = [document((10.0, 12.0, True)), document((50.0, 14.0, True))]
     told = apart_from_others([far[i] for i in order])

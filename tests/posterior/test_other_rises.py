@@ -189,7 +189,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.long
-def test_text_json_and_pool_name_it(folder: Path) -> None:
+def test_text_json_and_pool_name_the_other_rise(folder: Path) -> None:
     def told(*words: str) -> str:
         return run_here("estimate", *words, "--method", "laplace", cwd=folder).stdout
 

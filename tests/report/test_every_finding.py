@@ -320,7 +320,7 @@ def test_every_finding_is_said(output: str) -> None:
 
 
 @pytest.mark.parametrize("output", OUTPUTS)
-def test_nothing_is_said_where_nothing_speaks_against_it_and_the_verdict_is_told(output: str) -> None:
+def test_nothing_is_said_where_nothing_speaks_against_it_and_the_verdict_is_reported(output: str) -> None:
     clear, doubted = said(output, ()), said(output, tuple(KINDS) if not OUTPUTS[output].shortens else ("side",))
     assert "words for" not in clear
     assert not any(lead in clear for lead in LEADS.values())

@@ -384,7 +384,7 @@ def test_a_nipple_off_the_map_is_pointed_to() -> None:
     assert page.named("path", **{"class": "nipple"}) == []
 
 
-def test_the_age_of_the_array_calibration_is_told() -> None:
+def test_the_age_of_the_array_calibration_is_reported() -> None:
     aged = ({**SCANS[0], "array_calibration_days": "12"},)
     assert "12 days old at the exam" in Page(exam_page(exam(aged))).words
     assert "age not stated" in Page(exam_page(exam(({**SCANS[0], "array_calibration_days": "<b>"},)))).words

@@ -64,7 +64,9 @@ def test_a_depth_that_goes_with_the_map_stays(shipped: BodyCalibration) -> None:
     [(0.3, 5.0, "", ""), (8.0, 6.0, "amplitude 8", ""), (14.0, 6.0, "amplitude 14", "amplitude 14"),
      (0.7, 15.0, "sigma 15 mm", ""), (0.7, 18.0, "sigma 18 mm", "sigma 18 mm"), (0.01, 5.0, "0.01", "0.01")],
 )  # fmt: skip
-def test_how_far_decides(shipped: BodyCalibration, amplitude: float, sigma_mm: float, outside: str, far: str) -> None:
+def test_the_distance_from_the_range_decides_between_caution_and_refusal(
+    shipped: BodyCalibration, amplitude: float, sigma_mm: float, outside: str, far: str
+) -> None:
     found = shipped.outside(amplitude, sigma_mm), shipped.outside(amplitude, sigma_mm, far=True)
     for texts, words in zip(found, (outside, far), strict=True):
         assert words in "; ".join(texts)
@@ -155,7 +157,7 @@ def test_a_size_beyond_the_tables_lumps_is_cautioned(shipped: BodyCalibration, s
     assert shipped.beyond_lumps(float("nan")) == []
 
 
-def test_the_live_view_says_it_first() -> None:
+def test_the_live_view_begins_with_the_caution() -> None:
     said = live_estimate(
         gain_map(profile=EVEN, amplitude=0.348, sigma_x=6.1, sigma_y=5.2), str(SHIPPED), RiseRotation()
     ).text

@@ -230,7 +230,7 @@ def test_the_share_that_a_map_shows_goes_with_d_over_its_width():
     assert shown_share(np.array([2.7]), np.array([1.7 + np.log(2)])) == pytest.approx(SEEN / 2**SHOWN_POWER)
 
 
-def test_an_irregular_outline_widens_both_sizes_and_is_told():
+def test_an_irregular_outline_widens_both_sizes_and_is_reported():
     plain = shape(2.7)
     odd = replace(plain, irregular=True)
     narrow, wide = pooled([plain], priors=KNOWN_0), pooled([odd], priors=KNOWN_0)

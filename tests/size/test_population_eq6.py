@@ -261,7 +261,7 @@ def test_maps_of_a_mass_are_pooled_and_a_known_seat_narrows(learned) -> None:
 @pytest.mark.parametrize(
     ("amplitude", "sigma", "words"), [(0.4, 4.5, None), (60.0, 4.5, "amplitude"), (0.4, 40.0, "sigma")]
 )
-def test_a_map_beyond_the_table_is_told(learned, amplitude, sigma, words) -> None:
+def test_a_map_beyond_the_table_is_reported(learned, amplitude, sigma, words) -> None:
     found = learned.outside(amplitude, sigma)
     assert (not found) if words is None else words in " ".join(found)
 

@@ -71,7 +71,7 @@ def test_ends_of_a_size_stray_over_seeds_by_no_more_than_is_told_and_by_little(n
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.3])
-def test_ends_of_a_pooled_size_stray_by_no_more_than_is_told(noise: float) -> None:
+def test_ends_of_a_pooled_size_stray_by_no_more_than_is_reported(noise: float) -> None:
     """With the spread between maps known to be nothing, what the maps say matters most."""
     priors = SizePriors(between_maps=BetweenMaps(0.0, 0.0)) if noise > 0.1 else SizePriors()
 
@@ -84,7 +84,7 @@ def test_ends_of_a_pooled_size_stray_by_no_more_than_is_told(noise: float) -> No
     assert spread < 1.3 * told
 
 
-def test_ends_of_a_size_by_eq_6_stray_by_no_more_than_is_told() -> None:
+def test_ends_of_a_size_by_eq_6_stray_by_no_more_than_is_reported() -> None:
     rows = np.random.default_rng(1).normal(
         [2.0, 1.0, 0.6, -0.3, 0.15, 0.2], [0.1, 0.3, 0.02, 0.02, 0.01, 0.02], (400, 6)
     )

@@ -24,7 +24,9 @@ def knowing(*, inverted: tuple[str, ...] = ()) -> BodyCalibration:
 
 @pytest.mark.parametrize("inverted", [(), ("stiffness_ratio",)])
 @pytest.mark.parametrize("known", [{}, {"seat": 0.3}])
-def test_it_is_the_size_with_that_known(inverted: tuple[str, ...], known: dict[str, float]) -> None:
+def test_a_supposed_size_is_the_size_with_that_property_known(
+    inverted: tuple[str, ...], known: dict[str, float]
+) -> None:
     use, maps = knowing(inverted=inverted), [shape(2.7), shape(2.75, seed=1)]
     found = pooled(maps, use=use, priors=SizePriors(known=known))
     assert set(found.supposing) == ({"soft", "hard"} if known else {"soft", "hard", "centred", "resting"})

@@ -247,7 +247,7 @@ def test_the_advice_names_the_cheapest_that_is_enough() -> None:
     assert re.search(r"sigma +95 % interval", tradeoff_text({"": none}))
 
 
-def test_what_two_dimensions_get_wrong_is_told() -> None:
+def test_what_two_dimensions_get_wrong_is_reported() -> None:
     made = ladders()
     said = dimensions_note(CASE, made[PLANE], made[SOLID], {PLANE: RULE, SOLID: RULE})
     assert "+0.0 % in width against a ball; a cylinder's map read by the same calibration gives 15.0 mm for 15" in said

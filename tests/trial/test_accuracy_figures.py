@@ -59,7 +59,7 @@ def test_r_squared_below_zero_as_microsoft_prints_it() -> None:
     assert origin_line.CORRELATIONS["r2_pearson"](case) == pytest.approx(1.0)
 
 
-def test_accuracy_by_hand() -> None:
+def test_percent_and_mm_errors_agree_with_hand_calculation() -> None:
     case = sizes([10, 20, 40], [12, 14], [10], [])  # errors +30 %, -50 %, not found; 3, 10, 40 mm
     assert accuracy.mape_percent(case) == pytest.approx((30 + 50 + 100) / 3)
     assert accuracy.mape_percent(case.only_detected()) == pytest.approx(40)
@@ -74,7 +74,7 @@ def test_bias_cancels_twice_with_half() -> None:
     assert figures["bias_percent"].value == pytest.approx(0, abs=1e-12)
 
 
-def test_spread_by_hand() -> None:
+def test_within_mass_sd_agrees_with_hand_calculation() -> None:
     case = sizes([10, 10, 10, 10], [9, 11], [8, 10, 12], [7], [])  # SD sqrt 2 about 10, SD 2 about 10
     assert spread.SPREAD["within_mass_sd_mm"](case.only_replicated()) == pytest.approx((math.sqrt(2) + 2) / 2)
     assert spread.SPREAD["within_mass_sd_rms_mm"](case.only_replicated()) == pytest.approx(

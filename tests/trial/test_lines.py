@@ -113,7 +113,7 @@ def test_weighted_deming_is_a_fixed_point(error_ratio: float) -> None:
     assert line.intercept == pytest.approx(my - line.slope * mx, abs=1e-8)
 
 
-def test_weighted_deming_stops_where_it_is_told() -> None:
+def test_weighted_deming_stops_at_its_limit_of_iterations() -> None:
     x, y = cloud(8)
     first = weighted_deming(x, y, max_iterations=1)
     usual, more = weighted_deming(x, y), weighted_deming(x, y, max_iterations=500, threshold=0)

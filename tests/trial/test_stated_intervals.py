@@ -106,7 +106,7 @@ def test_interval_score_by_hand() -> None:
     assert interval_score(prediction, probability=0.9) == pytest.approx([10, 10 + 60])
 
 
-def test_what_a_reading_states() -> None:
+def test_a_stated_interval_or_sd_gives_the_log_normal() -> None:
     median, sd = stated_by(8, 18, 0.95, 12, None)
     assert stats.lognorm(sd, scale=math.exp(median)).ppf([0.025, 0.975]) == pytest.approx([8, 18])
     median, sd = stated_by(None, None, None, 12, 3)

@@ -54,7 +54,7 @@ def test_a_reading_on_the_day_of_excision_is_before_it() -> None:
     assert kept(reading(None, 16.0, JAN), reading(None, 22.0, MARCH), excised=MARCH)[0] == [22.0]
 
 
-def test_other_modalities_without_a_visit_stay_and_those_of_earlier_visits_alone_are_told() -> None:
+def test_other_modalities_without_a_visit_stay_and_those_of_earlier_visits_alone_are_reported() -> None:
     rows = (
         reading("1", 16.0), reading("2", 22.0), reading(None, 20.0, modality="cbe"),
         reading("1", 15.0, modality="ultrasound"),

@@ -34,7 +34,7 @@ def test_without_two_visible_sizes_there_is_no_pair() -> None:
 @pytest.mark.parametrize(
     ("difference", "words"), [(0.04, "indistinguishable are d 10 mm at h/d 1"), (0.06, "no pair within 5 %")]
 )
-def test_the_line_says_whether_they_are(difference: float, words: str) -> None:
+def test_the_line_says_whether_the_lumps_look_alike(difference: float, words: str) -> None:
     small = CentredFrame(10.0, 1.0, np.ones(4), 0.2 * np.ones(4))
     large = CentredFrame(15.0, 0.9, np.ones(4) + 0.2 * difference, 0.2 * np.ones(4))
     text = lookalikes_text(Lookalikes(small, large))

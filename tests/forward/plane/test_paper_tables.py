@@ -170,7 +170,7 @@ def test_missing_file_and_folder_are_bad_data(tmp_path: Path) -> None:
             read_table(path, TRIAL)
 
 
-def test_the_first_fault_in_reading_order_is_told(tmp_path: Path) -> None:
+def test_the_first_fault_in_reading_order_is_reported(tmp_path: Path) -> None:
     path = write(tmp_path, HEADER + ROW + "P2,1,tactile,1,x,detected\nP3,1,tactile,1,y,detected\n")
     with pytest.raises(BadDataError, match=r"line 3, column size_mm: 'x'"):
         read_table(path, TRIAL)

@@ -97,7 +97,7 @@ def test_the_truth_names_the_model_and_its_shape() -> None:
         assert truth["body"]["fat_mm"] == 15.0
 
 
-def test_the_counts_are_the_frames() -> None:
+def test_the_counts_are_the_models_frames_rounded() -> None:
     scan = simulate(SCENE, rng=np.random.default_rng(0), fidelity="plane-strain").scan
     np.testing.assert_allclose(scan.pressure_kpa(), frames("plane-strain"), atol=0.51 * 34 / 4095)
 
@@ -139,7 +139,7 @@ IMPOSSIBLE = {
 
 @pytest.mark.parametrize("fidelity", ["empirical", "plane-strain"])
 @pytest.mark.parametrize("name", IMPOSSIBLE)
-def test_what_two_dimensions_cannot_follow_is_told_in_one_line(name: str, fidelity: str) -> None:
+def test_a_scene_that_two_dimensions_cannot_model_is_one_line(name: str, fidelity: str) -> None:
     changes, words = IMPOSSIBLE[name]
     with pytest.raises(BadDataError, match=words) as caught:
         simulate(replace(SCENE, **changes), rng=np.random.default_rng(0), fidelity=fidelity)

@@ -171,7 +171,7 @@ def test_elements_find_the_surface_greens_function_of_the_layers(poisson: float)
 
 
 @pytest.mark.parametrize("body", [Body(15, 1.0, 0.0), Body(10, 0.7, 1.0), Body(12, 1.3, 0.4), Body(12, 0.9, 1.2)])
-def test_condensing_changes_nothing(body: Body) -> None:
+def test_the_condensed_body_gives_the_whole_bodys_change(body: Body) -> None:
     """The change that a lump makes, by one solution of the whole body with it less one without it."""
     surface = condense(body, fineness=1)
     ratio, press = 30.0, np.zeros(len(surface.row))

@@ -135,7 +135,7 @@ def test_a_harder_lump_shows_higher(rows: list[StudyRow]) -> None:
     assert rows[1].sigma_x_mm == pytest.approx(rows[2].sigma_x_mm, rel=0.05)  # Fig 7b
 
 
-def test_the_table_says_what_was_found(rows: list[StudyRow]) -> None:
+def test_the_table_has_every_case_with_its_recipe(rows: list[StudyRow]) -> None:
     head, first, *_ = study_csv(rows).splitlines()
     found = "seat,d_mm,depth_ratio,stiffness_ratio,amplitude,sigma_x_mm,fit_rms,detectable,thickness_mm,head_radius_mm"
     assert head == f"{found},head,normalise,background,fit_radius_mm,noise"

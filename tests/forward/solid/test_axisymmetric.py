@@ -251,7 +251,7 @@ def test_nearly_incompressible_does_not_lock() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["centred", "shallow"])
-def test_two_more_orders_change_nothing(name: str) -> None:
+def test_two_more_fourier_orders_change_nothing(name: str) -> None:
     geometry = GEOMETRIES[name]
     more = condense_lump(geometry, orders=orders_needed(geometry) + 2)
     r = 0.7 * geometry.depth_mm

@@ -154,7 +154,7 @@ def test_four_small_squares_are_one_large_one() -> None:
     np.testing.assert_allclose(merged, coarse, rtol=2e-3)
 
 
-def test_stiffness_scales_out() -> None:
+def test_compliance_is_inversely_proportional_to_stiffness() -> None:
     harder = Layers(15.0, fat_kpa=15.0, poisson=NU)
     a, b = (taxel_compliance(body, rows=3, columns=4, pitch_mm=1.5) for body in (BREAST, harder))
     np.testing.assert_allclose(3 * b, a, rtol=1e-12)

@@ -109,7 +109,7 @@ def test_the_poses_say_how_deep_the_head_sank() -> None:
     np.testing.assert_allclose(in_plane[:, 2], depth, atol=1e-6)
 
 
-def test_the_counts_are_the_frames() -> None:
+def test_the_counts_are_the_models_frames_rounded() -> None:
     np.testing.assert_allclose(short_scan().scan.pressure_kpa(), short_frames()[0], atol=0.51 * 34 / 4095)
 
 
@@ -214,7 +214,7 @@ IMPOSSIBLE = [
 
 
 @pytest.mark.parametrize(("text", "words"), IMPOSSIBLE, ids=[row[0] for row in IMPOSSIBLE])
-def test_what_cannot_be_is_told_in_one_line(tmp_path: Path, text: str, words: str) -> None:
+def test_an_impossible_scene_is_one_line(tmp_path: Path, text: str, words: str) -> None:
     path = tmp_path / "scene.toml"
     path.write_text(text)
     with pytest.raises(BadDataError, match=words) as caught:

@@ -347,7 +347,7 @@ FAULTS: dict[str, tuple[dict[str, float], float, list[str]]] = {
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_what_cannot_be_is_refused(name: str) -> None:
+def test_an_impossible_study_is_refused(name: str) -> None:
     options, depth_ratio, words = FAULTS[name]
     with pytest.raises(BadDataError) as caught:
         _ = SolidSettings(**options).body(15.0, depth_ratio, seat=0.0).layers

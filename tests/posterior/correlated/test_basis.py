@@ -75,7 +75,7 @@ def test_a_strong_maps_bumps_are_few(monkeypatch: pytest.MonkeyPatch) -> None:
     assert basis(NEAR, {}) is None
 
 
-def test_dropping_more_would_show(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_coarser_basis_changes_the_density(monkeypatch: pytest.MonkeyPatch) -> None:
     """The negative control: a basis of what is above a thousandth is another density."""
     target = target_of(cells_of(noise(0, white=0.001)), scene=Scene("ellipse"))
     theta = points(target.scene, NEAR, {})

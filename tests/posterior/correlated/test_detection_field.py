@@ -46,7 +46,7 @@ def false_lumps(kind: str, *, maps: int) -> int:
 
 
 @pytest.mark.long
-def test_lump_free_maps_show_none() -> None:
+def test_maps_without_a_lump_are_given_none() -> None:
     """10 maps: at a true rate of 2 % more than two come in 1 run of 1,000."""
     assert sum(false_lumps(kind, maps=2) for kind in KINDS) <= 2
 
@@ -85,7 +85,7 @@ def test_a_depression_is_no_lump() -> None:
 
 
 @pytest.mark.long
-def test_the_simulated_scans(shared_data: Path) -> None:
+def test_the_shared_scans_have_a_lump_or_none_as_simulated(shared_data: Path) -> None:
     found = {}
     for name in ("s08_no_mass", "s01_sphere15_hd1_clean", "s07_rib_edge"):
         found[name[:3]] = probability(build_map([shared_scan(shared_data / "scans" / f"{name}.npz")]))

@@ -211,7 +211,7 @@ def test_a_bump_that_no_cell_shows_overflows_nothing() -> None:
     assert factor[0] < factor[1]
 
 
-def test_a_dent_has_no_density() -> None:
+def test_a_negative_amplitude_has_density_zero() -> None:
     target = target_of(cells_of(noise(3), amplitude=-0.3))
     assert target(START[None])[0] == -np.inf
 

@@ -71,7 +71,7 @@ def test_what_no_ellipse_is_like_is_irregular_and_the_report_says_so(form: str) 
 
 
 @pytest.mark.parametrize("form", ["round", "ellipse", "slightly oblique"])
-def test_an_ellipse_is_not(form: str) -> None:
+def test_an_ellipse_has_no_irregular_outline(form: str) -> None:
     """The negative control, three maps each; a false alarm in one map has a chance of a few percent at most."""
     answers = [estimated(form, seed) for seed in range(3)]
     assert not any(one.map_posterior.irregular for one in answers if one.map_posterior is not None)

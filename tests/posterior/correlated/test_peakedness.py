@@ -135,7 +135,7 @@ def test_a_bump_with_a_neighbour_is_not_asked() -> None:
     assert add_departure(found.scene) is found.scene
 
 
-def test_the_report_says_it_either_way() -> None:
+def test_the_report_says_whether_the_bump_departs_from_a_gaussian() -> None:
     told, plain = estimated(1.25), estimated(1.0)
     assert told.scene is not None
     assert plain.scene is not None

@@ -70,7 +70,7 @@ def test_what_the_tracker_was_given_is_found(tracker_mm: float, tracker_deg: flo
     assert found["frames_per_reading"] == pytest.approx(5 * 0.68 / (1 + 5 * 0.64) * 1.5**2, rel=0.01)
 
 
-def test_motion_is_no_noise() -> None:
+def test_the_motion_of_the_hand_is_not_taken_for_tracker_error() -> None:
     assert max(list(told(build_map(scan(0.0))).values())[:2]) < 0.01
 
 
@@ -121,7 +121,7 @@ def test_two_scans_tell_the_mean_of_their_variances() -> None:
     assert both == pytest.approx(np.sqrt((0.1**2 + 0.6**2) / 2 * 2 / 3), rel=0.12)
 
 
-def test_the_map_says_it() -> None:
+def test_the_maps_report_names_the_tracker_position_error() -> None:
     assert "frames' places" in map_text(build_map(scan(0.3)))
 
 

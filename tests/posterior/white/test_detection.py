@@ -52,7 +52,7 @@ KINDS = ("white", "tilt", "3 mm", "6 mm")
 
 
 @pytest.mark.long
-def test_lump_free_maps_show_none() -> None:
+def test_maps_without_a_lump_are_given_none() -> None:
     """A map of each kind: a true rate of 2 % gives one in 1 run of 12. Hundreds are below."""
     assert sum(false_lumps(kind, maps=1) for kind in KINDS) == 0
 
