@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 from tactile_bayes.campaigns.campaign import run_campaign
-from tactile_bayes.campaigns.exams import SCANS, Found, find_exams
+from tactile_bayes.campaigns.exams import SCANS, FolderExams, find_exams
 from tactile_bayes.campaigns.report import names_line
 from tactile_bayes.campaigns.steps import CampaignSettings
 from tactile_bayes.commands.options import make_settings
@@ -50,7 +50,7 @@ def campaign_init_action(folder: Path | str, output: Path, names: str | None, ad
     _print_table_summary(search, output, table.rows if table else None)
 
 
-def _print_table_summary(search: Found, output: Path, kept: Sequence[Mapping[str, str]] | None) -> None:
+def _print_table_summary(search: FolderExams, output: Path, kept: Sequence[Mapping[str, str]] | None) -> None:
     """Print the number of exams and patients, gaps and faults of the table, and the next command."""
     rows = [*(kept or ()), *search.rows]
     patients = {row["patient"].casefold() for row in rows} - {""}

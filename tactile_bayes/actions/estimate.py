@@ -22,7 +22,7 @@ from tactile_bayes.files.atomic import first_duplicate
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.files.reports import json_text
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.pooled import elsewhere, pooled_summary, pooled_text
+from tactile_bayes.report.pooled import maps_of_another_mass, pooled_summary, pooled_text
 from tactile_bayes.shell import progress_bar
 
 Answers = Sequence[Answer | Failure]
@@ -49,7 +49,7 @@ def _pool(
         return failures[0].exit_code
     exams = [one for one in answers if isinstance(one, Answer)]
     if settings.centre_mm is None:
-        for i, place in elsewhere([one.report for one in exams]).items():
+        for i, place in maps_of_another_mass([one.report for one in exams]).items():
             exams[i] = estimate_file(maps[i], replace(settings, centre_mm=place)).answer
     result = pool_answers(exams, settings, names=[str(path) for path in maps], files=maps)
     report = result.pooled_report.checked()

@@ -17,7 +17,7 @@ from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_fact
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.options import MapOptions
-from tactile_bayes.report.figure_file import named_exam
+from tactile_bayes.report.figure_file import exam_title
 from tactile_bayes.report.map import map_figure, map_summary, map_text
 from tactile_bayes.shell import progress_bar
 
@@ -51,7 +51,7 @@ def map_action(
     write_map(output, tactile_map, provenance=provenance, force=force)
     try:
         if figure:
-            title = f"Tactile map: {named_exam(output.stem, provenance.scans)}"
+            title = f"Tactile map: {exam_title(output.stem, provenance.scans)}"
             map_figure(tactile_map, figure, title=title, force=force)
         times.append(("write", time.perf_counter()))
     finally:  # a figure that cannot be written loses no text

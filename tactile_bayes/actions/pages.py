@@ -23,7 +23,7 @@ from tactile_bayes.options import CompareOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import compare_summary, compare_text
 from tactile_bayes.report.exam_page import exam_page
-from tactile_bayes.report.exam_words import Given, headline
+from tactile_bayes.report.exam_words import PageLabels, headline
 from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.shell import progress_bar
 
@@ -61,7 +61,7 @@ def compare_action(
     comparing.check_visits(len(visits))
     if pdf is not None and output is None:
         raise UsageError("--pdf prints the page that --output names; give -o GROWTH.html too")
-    Given(title, name)
+    PageLabels(title, name)
     page = None if output is None else PageFiles(output, pdf, force)
     if page is not None:
         page.check()
@@ -97,13 +97,13 @@ def report_action(
     **options: Any,
 ) -> None:
     """Write one page of an exam: the map, the size with its intervals, the place, and how good the exam was."""
-    labels, page = Given(title, name, day), PageFiles(output, pdf, force)
+    labels, page = PageLabels(title, name, day), PageFiles(output, pdf, force)
     page.check()
     typed = [name for name in options if name in typed_options()]
     exam = exam_from_files(
         files, lambda: make_settings(**options), typed=typed, notice=lambda line: click.echo(line, err=True)
     )
-    exam = replace(exam, given=labels)
+    exam = replace(exam, labels=labels)
     page.write(exam_page(exam))
     if exam.main.tactile_map is None:
         click.echo("note: without its map the page has no picture and no coverage; give MAP.nc too", err=True)

@@ -264,8 +264,8 @@ def head_design_action(*, head: str | None, figure: Path | None, as_json: bool, 
         best = paper.most_even(candidates)
         raise UsageError(
             f"no head keeps the pressure within {body.limit_percent:g} % of its mean: the most even one, "
-            f"{paper_head.named(best.head)}, reaches {100 * best.worst:.1f} %; give a larger --limit-percent, narrower "
-            "ranges or another --thickness-mm"
+            f"{paper_head.head_words(best.head)}, reaches {100 * best.worst:.1f} %; give a larger --limit-percent, "
+            "narrower ranges or another --thickness-mm"
         )
 
 

@@ -22,7 +22,7 @@ from tactile_bayes.inference.draws import Draws
 from tactile_bayes.options import GROWTH_SHARES, CompareOptions
 from tactile_bayes.presets import REGISTRATION_MM
 from tactile_bayes.report.compare import CompareReport, compare_report, compare_summary, compare_text
-from tactile_bayes.report.exam_words import Given
+from tactile_bayes.report.exam_words import PageLabels
 from tactile_bayes.report.growth_page import Course, DrawnMap, draw_comparison, growth_page
 from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.report.pooled import disagreement, fat_apart
@@ -146,7 +146,7 @@ class Comparison(TextResult, eq=False):
         """Write one page of the mass over time as HTML, as ``compare -o`` does, and with `pdf` also print it."""
         files = PageFiles(path_of(path), path_of(pdf), force)
         files.check()
-        Given(title, name)
+        PageLabels(title, name)
         files.write(self.page_text(title=title, name=name))
 
     def page_text(self, *, title: str, name: str) -> str:

@@ -15,7 +15,7 @@ from tactile_bayes.findings import finding_lines
 from tactile_bayes.inference.ensemble import convergence
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_figures import corner_figure, rank_figure, trace_figure
-from tactile_bayes.report.figure_file import named_exam
+from tactile_bayes.report.figure_file import exam_title
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -76,7 +76,7 @@ class Diagnosis(TextResult, eq=False):
         check_choice("kind", kind, tuple(_FIGURES))
         if kind == "rank" and self.chains < 2:
             raise UsageError(f"--rank compares chains and {self.path} has one; estimate with --method ensemble")
-        title = f"{named_exam(self.path.stem, self.posterior.scans)}, method {self.posterior.method}"
+        title = f"{exam_title(self.path.stem, self.posterior.scans)}, method {self.posterior.method}"
         return _FIGURES[kind](self.posterior.draws, path_of(path), title=title, force=force)
 
     def __repr__(self) -> str:

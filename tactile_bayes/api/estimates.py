@@ -33,7 +33,7 @@ from tactile_bayes.files.size_json import read_repeatability
 from tactile_bayes.options import IdentityOptions
 from tactile_bayes.report.estimate_document import side_of
 from tactile_bayes.report.exam_page import exam_page
-from tactile_bayes.report.exam_words import Exam, Given, exam_map, headline
+from tactile_bayes.report.exam_words import PageLabels, ShownExam, exam_map, headline
 from tactile_bayes.report.pages import PageFiles
 
 # --- One map estimate_each, and several of one mass pooled.
@@ -158,7 +158,7 @@ def as_list(given: Any) -> list[Any]:
 
 def exam_from_files(
     paths: Sequence[Path], given: Callable[[], Settings], *, typed: Collection[str], notice: Notice | None = None
-) -> Exam:
+) -> ShownExam:
     """Read maps, or an estimate and its map, in any order, and put a page's exam together.
 
     `paths`: maps of one mass; or an estimate, best with its map: what ``estimate`` printed with ``--json`` or wrote
@@ -190,15 +190,15 @@ def exam_from_files(
     return exam_from_estimates(found, settings, files=maps)
 
 
-def exam_from_estimates(found: Sequence[SizeEstimate], settings: Settings, *, files: Sequence[Path] = ()) -> Exam:
-    """Exam of maps that were estimate_each; several are pooled."""
+def exam_from_estimates(found: Sequence[SizeEstimate], settings: Settings, *, files: Sequence[Path] = ()) -> ShownExam:
+    """Exam of maps that were estimated; several are pooled."""
     if len(found) == 1:
         return found[0].exam()
     names = [f"map {number}" for number in range(1, len(found) + 1)]
     return pool_estimates(found, settings, names=names, files=files).exam()
 
 
-def _from_estimate(source: Path, path: Path | None) -> Exam:
+def _from_estimate(source: Path, path: Path | None) -> ShownExam:
     """Exam of an estimate, and of its map where that is given: the estimate must name it by its digest."""
     if source.suffix.lower() == ".json":
         document = load_json(source, way_out="give what `estimate --json` printed for one map")
@@ -210,7 +210,7 @@ def _from_estimate(source: Path, path: Path | None) -> Exam:
         if sha256(path) not in [one.sha256 for one in report.origin.inputs if one.role == "map"]:
             raise BadDataError(f"is not the estimate of {path}", way_out="give the map it names", path=str(source))
         tactile_map, scans = read_map_and_scans(path)
-    return Exam((exam_map(tactile_map, report, side=side_of(scans)),), None, scans)
+    return ShownExam((exam_map(tactile_map, report, side=side_of(scans)),), None, scans)
 
 
 # --- The page of an exam from Python.
@@ -257,12 +257,12 @@ def exam_report(
     BadDataError
         When a file is damaged or of another kind, or the maps are of different exams.
     """
-    page, words = PageFiles(path_of(path), path_of(pdf), force), Given(title, name, day)
+    page, words = PageFiles(path_of(path), path_of(pdf), force), PageLabels(title, name, day)
     page.check()
     given = as_list(files)
     if not given:
         raise UsageError("nothing was given to report; give maps, or an estimate")
-    exam: Exam
+    exam: ShownExam
     if all(isinstance(one, str | Path) for one in given):
         exam = exam_from_files([path_of(one) for one in given], lambda: settings_of(settings), typed=settings)
     elif len(given) == 1 and isinstance(given[0], PooledSize):
@@ -272,7 +272,7 @@ def exam_report(
         if len(given) > 1:
             refuse_checkpoint(used)
         exam = exam_from_estimates(estimate_each(given, settings), used)
-    exam = replace(exam, given=words)
+    exam = replace(exam, labels=words)
     page.write(exam_page(exam))
     return headline(exam)
 

@@ -21,7 +21,7 @@ from tactile_bayes.files.reports import EstimateReport, PooledReport
 from tactile_bayes.findings import by_severity
 from tactile_bayes.options import PRIORS
 from tactile_bayes.posterior.estimate import way_to_head
-from tactile_bayes.report.pooled import elsewhere, pooled_findings, pooled_report
+from tactile_bayes.report.pooled import maps_of_another_mass, pooled_findings, pooled_report
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import LEAST_PROBABILITY
 from tactile_bayes.size.pooling import DISAGREE, PooledEstimate, pool_maps
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 def reestimate_at_common_mass(found: Sequence[SizeEstimate]) -> tuple[SizeEstimate, ...]:
     """Estimates of the mass that most maps show; those of a place that somebody gave stay as they are."""
     same = list(found)
-    for i, place in elsewhere([one.answer.report for one in found]).items():
+    for i, place in maps_of_another_mass([one.answer.report for one in found]).items():
         one = found[i]
         if one.settings.centre_mm is None:
             settings, made = replace(one.settings, centre_mm=place), one.provenance

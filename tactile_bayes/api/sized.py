@@ -27,8 +27,8 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import estimate_report, patient_mm, side_of
 from tactile_bayes.report.estimate_figures import draw_fit, draw_map, draw_size
 from tactile_bayes.report.estimate_text import estimate_summary, estimate_text, exams_label
-from tactile_bayes.report.exam_words import Exam, Given, exam_map
-from tactile_bayes.report.figure_file import named_exam
+from tactile_bayes.report.exam_words import PageLabels, ShownExam, exam_map
+from tactile_bayes.report.figure_file import exam_title
 from tactile_bayes.report.pages import PageFiles
 from tactile_bayes.scans import HeadShape
 from tactile_bayes.size.draws import EXTREMES, SIZES, BetweenMaps, ShapeDraws, SizePosterior
@@ -238,19 +238,19 @@ class SizedExam(SizeResult, eq=False, dict=True, kw_only=True):
     @property
     def _title(self) -> str:
         """Name for the titles of figures: what the scans say of the exam, and the map's own."""
-        return named_exam(self.name, self.provenance.scans)
+        return exam_title(self.name, self.provenance.scans)
 
     def _draw_size(self, size: SizePosterior, path: Path | None, *, force: bool) -> Figure:
         shown: dict[str, Any] = {"name": self._title, "probability": self.probability, "findings": self.findings}
         return draw_size(size, path, **shown, force=force)
 
-    def exam(self) -> Exam:
+    def exam(self) -> ShownExam:
         """What a page of the exam shows: its map, or all maps and the size that was pooled from them."""
         scans = self.provenance.scans
         check_one_mass(scans)
         maps: Sequence[Any] = getattr(self, "maps", (self,))
         shown = tuple(exam_map(one.tactile_map, one.answer.report, side=side_of(scans)) for one in maps)
-        return Exam(shown, getattr(self, "pooled_report", None), scans)
+        return ShownExam(shown, getattr(self, "pooled_report", None), scans)
 
     @door
     def report(
@@ -266,9 +266,9 @@ class SizedExam(SizeResult, eq=False, dict=True, kw_only=True):
         """Write one page of the exam as HTML, repeat maps on it, and with `pdf` also print it; see `exam_report`."""
         from tactile_bayes.report.exam_page import exam_page  # a plain estimate has no page
 
-        page, given = PageFiles(path_of(path), path_of(pdf), force), Given(title, name, day)
+        page, labels = PageFiles(path_of(path), path_of(pdf), force), PageLabels(title, name, day)
         page.check()
-        page.write(exam_page(replace(self.exam(), given=given)))
+        page.write(exam_page(replace(self.exam(), labels=labels)))
 
 
 class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):

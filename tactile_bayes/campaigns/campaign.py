@@ -12,7 +12,7 @@ from tactile_bayes.api.estimates import settings_of
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import open_executor
 from tactile_bayes.campaigns import report
-from tactile_bayes.campaigns.inputs import open_campaign, tidy
+from tactile_bayes.campaigns.inputs import open_campaign, remove_stale_files
 from tactile_bayes.campaigns.run import FEW, Bar, Campaign, no_bar
 from tactile_bayes.campaigns.steps import CampaignSettings
 from tactile_bayes.declarations import names_of, replace
@@ -37,8 +37,8 @@ class CampaignResult(TextResult, eq=False):
     def text(self) -> str:
         """What ``campaign run`` prints."""
         lines = self._planned() if self.written is None else self._done(self.written)
-        told = "" if self.written is None else self.written.report  # which ends with the words of research
-        return "\n".join([*lines, told or f"{RESEARCH_USE}\n"])
+        report_text = "" if self.written is None else self.written.report  # which ends with the words of research
+        return "\n".join([*lines, report_text or f"{RESEARCH_USE}\n"])
 
     @property
     def failed(self) -> tuple[str, ...]:
@@ -49,26 +49,26 @@ class CampaignResult(TextResult, eq=False):
         return (*lines, *more)
 
     def _planned(self) -> Iterator[str]:
-        found = self.campaign
-        for step, todo in found.todo.items():
-            named = f" ({', '.join(found.names[step])})" if _few(found, step) and found.kept[step] else ""
-            yield f"{step}: {todo} to do{named}, {found.kept[step]} done"
-        for name, fault in list(found.faults.items())[:FEW]:
+        plan = self.campaign
+        for step, todo in plan.todo.items():
+            named = f" ({', '.join(plan.names[step])})" if _all_named(plan, step) and plan.kept[step] else ""
+            yield f"{step}: {todo} to do{named}, {plan.kept[step]} done"
+        for name, fault in list(plan.faults.items())[:FEW]:
             yield f"{name}: {fault.step} failed: {fault.reason}"
-        if len(found.faults) > FEW:
-            yield f"{len(found.faults) - FEW} more failed"
+        if len(plan.faults) > FEW:
+            yield f"{len(plan.faults) - FEW} more failed"
         yield "Nothing was run."
 
     def _done(self, written: report.Written) -> Iterator[str]:
-        found = self.campaign
-        yield f"{self.folder}: {len(found.exams)} exams: {written.counts}"
+        run = self.campaign
+        yield f"{self.folder}: {len(run.exams)} exams: {written.counts}"
         yield from written.masses
         yield f"to look at: {self.folder / report.INDEX}, a row for each mass with the pages of its exams"
-        yield f"{sum(found.todo.values())} steps run, {sum(found.kept.values())} kept from earlier runs"
-        for step, todo in found.todo.items():
-            more = "" if _few(found, step) else f" and {todo - len(found.names[step])} more"
-            if todo and any(found.kept.values()):
-                yield f"{step} run: {', '.join(found.names[step])}{more}"
+        yield f"{sum(run.todo.values())} steps run, {sum(run.kept.values())} kept from earlier runs"
+        for step, todo in run.todo.items():
+            more = "" if _all_named(run, step) else f" and {todo - len(run.names[step])} more"
+            if todo and any(run.kept.values()):
+                yield f"{step} run: {', '.join(run.names[step])}{more}"
         yield from written.doubts
 
     def __repr__(self) -> str:
@@ -109,13 +109,13 @@ def campaign(
     UsageError
         When settings contradict each other, or the folder is another's.
     """
-    given = {name: plain(options.pop(name)) for name in names_of(CampaignOptions) if name in options}
-    given |= {name: path_of(given[name]) for name in ("excision", "columns", "protocol") if name in given}
+    ours = {name: plain(options.pop(name)) for name in names_of(CampaignOptions) if name in options}
+    ours |= {name: path_of(ours[name]) for name in ("excision", "columns", "protocol") if name in ours}
     spread = {} if repeatability in (None, NONE) else {"repeatability": repeatability}
     return run_campaign(
         required_path(exams, "exams"),
         required_path(output, "output"),
-        CampaignSettings(**given, estimate=settings_of(options | spread), own_repeatability=repeatability is None),
+        CampaignSettings(**ours, estimate=settings_of(options | spread), own_repeatability=repeatability is None),
         read=[Path(one) for one in spread.values() if isinstance(one, str | os.PathLike)],
         bar=bar,
     )
@@ -130,7 +130,7 @@ def run_campaign(
     table = read_manifest(exams)
     _check_folder(table, output, settings)
     names = {settings.of(exam).calibration_name for exam in table} - {None}
-    used = [
+    inputs = [
         exams,
         settings.excision,
         settings.columns,
@@ -138,7 +138,7 @@ def run_campaign(
         *read,
         *map(size_calibration_path, map(str, names)),
     ]
-    refuse_same((output / name for name in report.WRITTEN), used)
+    refuse_same((output / name for name in report.WRITTEN), inputs)
     report.check_inputs(table, settings)
     with (
         open_campaign(output, dry=settings.dry_run) as store,
@@ -149,7 +149,7 @@ def run_campaign(
         run.run()
         if settings.dry_run:
             return CampaignResult(run, output, None)
-        left = tidy(place, table, run.files, unread=run.unread)
+        left = remove_stale_files(place, table, run.files, unread=run.unread)
         written = report.write_outputs(run, unlisted=left)
         for name in (*report.WRITTEN, JOURNAL):  # the journal last: with it the copy is whole
             if settings.copy_to and (place / name).exists():
@@ -170,6 +170,6 @@ def _check_folder(table: Sequence[Exam], output: Path, settings: CampaignSetting
         raise UsageError(f"{inside} lies in the output folder {output}; choose another folder")
 
 
-def _few(found: Campaign, step: str) -> bool:
+def _all_named(run: Campaign, step: str) -> bool:
     """Whether all exams or masses that need a step are known by name, and fit a line."""
-    return 0 < found.todo[step] == len(found.names[step])
+    return 0 < run.todo[step] == len(run.names[step])

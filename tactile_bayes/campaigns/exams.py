@@ -40,7 +40,7 @@ MAP: Final = ".nc"
 _ENDINGS: Final = (*SCANS, MAP)
 
 
-class Said(Record):
+class FileFacts(Record):
     """What a file says of its exam."""
 
     facts: Mapping[str, str] = field(default_factory=dict)  #: By the columns of the table of exams.
@@ -71,9 +71,9 @@ class NamePattern:
         if touching := re.search(r"\}(\{|\*)|\*\{", pattern):
             raise UsageError(f"{pattern!r} has nothing between two words ({touching[0]}); say what parts them")
         self._parts = 1 + pattern.count("/")
-        self._whole = pattern.lower().endswith(_ENDINGS)
-        found = re.split(r"(\{\w+\}|\*)", pattern)
-        self._names = re.compile("".join(map(self._part, ["", *found], found, [*found[1:], ""])))
+        self._with_ending = pattern.lower().endswith(_ENDINGS)
+        parts = re.split(r"(\{\w+\}|\*)", pattern)
+        self._names = re.compile("".join(map(self._part, ["", *parts], parts, [*parts[1:], ""])))
 
     def _part(self, before: str, part: str, following: str) -> str:
         if part == "{date}":
@@ -87,30 +87,30 @@ class NamePattern:
 
         A name that does not follow the pattern, or a word in it that is no side, date or number, is a `BadDataError`.
         """
-        parts = name.replace(os.sep, "/").split("/")
-        known = "/".join(parts[-self._parts :])
-        found = self._names.fullmatch(known if self._whole else known.rpartition(".")[0])
-        if found is None:
+        folders = name.replace(os.sep, "/").split("/")
+        tail = "/".join(folders[-self._parts :])
+        match = self._names.fullmatch(tail if self._with_ending else tail.rpartition(".")[0])
+        if match is None:
             raise BadDataError(f"its name does not follow {self.pattern}")
-        told = found.groupdict()
-        if "side" in told:
-            told["side"] = _SIDES.get(told["side"].lower(), "")
-            if not told["side"]:
-                raise BadDataError(f"its name has {found['side']!r} for the side; name it left, right, L or R")
-        if "date" in told:
+        facts = match.groupdict()
+        if "side" in facts:
+            facts["side"] = _SIDES.get(facts["side"].lower(), "")
+            if not facts["side"]:
+                raise BadDataError(f"its name has {match['side']!r} for the side; name it left, right, L or R")
+        if "date" in facts:
             try:
-                told["date"] = date.fromisoformat(told["date"]).isoformat()
+                facts["date"] = date.fromisoformat(facts["date"]).isoformat()
             except ValueError:
-                raise BadDataError(f"its name has {told['date']!r} for the date; name it 2026-03-01") from None
-        if "exam" in told:
-            number = told.pop("exam")
+                raise BadDataError(f"its name has {facts['date']!r} for the date; name it 2026-03-01") from None
+        if "exam" in facts:
+            number = facts.pop("exam")
             if not (number.isascii() and number.isdigit() and 0 < int(number) < 10**6):
                 raise BadDataError(f"its name has {number!r} for the exam; name it with a number from 1")
-            told["replicate"] = str(int(number))
-        return told
+            facts["replicate"] = str(int(number))
+        return facts
 
 
-def _told(path: Path, name: str, pattern: NamePattern | None) -> Said:
+def _read_facts(path: Path, name: str, pattern: NamePattern | None) -> FileFacts:
     """What a scan or a map says, as far as all scans of the file agree, and its name; arrays of a scan say nothing.
 
     Where file and name contradict each other that is an error.
@@ -123,21 +123,21 @@ def _told(path: Path, name: str, pattern: NamePattern | None) -> Said:
     elif not name.lower().endswith(ARRAYS):
         records = scan_records(path, keep=())
         sessions, made = [records.metadata.get("session", {})], provenance_of(records).get("inputs")
-    told = {column: {session.get(key) or "" for session in sessions} for column, key in SAME_IN_SCANS.items()}
-    facts = {column: min(values) for column, values in told.items() if len(values) == 1 and values != {""}}
+    values = {column: {session.get(key) or "" for session in sessions} for column, key in SAME_IN_SCANS.items()}
+    facts = {column: min(texts) for column, texts in values.items() if len(texts) == 1 and texts != {""}}
     named = {} if pattern is None else pattern.facts(name)
     for column, value in named.items():
         inside = facts.get(column, value)
         if inside.casefold() != value.casefold():
             raise BadDataError(f"its name says {column} {value}, the file says {inside}")
     inputs = [one for one in made if isinstance(one, dict)] if isinstance(made, list | tuple) else []
-    return Said({**named, **facts}, frozenset(str(one["sha256"]) for one in inputs if "sha256" in one))
+    return FileFacts({**named, **facts}, frozenset(str(one["sha256"]) for one in inputs if "sha256" in one))
 
 
 # --- Files of a folder that may be exams, and which of them are the same exam twice.
 
 
-class Found(Record):
+class FolderExams(Record):
     """Rows for exams.csv, and what somebody should know of the folder."""
 
     rows: list[dict[str, Any]] = field(default_factory=list)  #: Of files that the table does not list yet.
@@ -152,7 +152,7 @@ class Found(Record):
 _ASIDE: Final = (".", "~$")  #: Names of what systems and spreadsheets leave beside files begin so.
 
 
-def _files_of(folder: Path, table: Path, found: Found) -> dict[str, Path]:
+def _files_of(folder: Path, table: Path, listing: FolderExams) -> dict[str, Path]:
     """Files of a folder of this computer and of those below it that may be exams, in a fixed order.
 
     Folders that a campaign wrote are passed over, and names are paths from the table's folder, which must hold the
@@ -160,39 +160,41 @@ def _files_of(folder: Path, table: Path, found: Found) -> dict[str, Path]:
     """
     if not folder.is_dir():
         raise UsageError(f"{folder} is not a directory; give the folder of the scans")
-    base, own = Path(os.path.realpath(table.parent)), Path(os.path.realpath(table))
+    base, table_file = Path(os.path.realpath(table.parent)), Path(os.path.realpath(table))
     if not Path(os.path.realpath(folder)).is_relative_to(base):
         way_out = "write the table beside the scans"
         raise UsageError(f"{folder} is not inside {table.parent}, the table's folder; {way_out}")
     paths: dict[str, Path] = {}
-    for path in _walk(folder, found.skipped):
+    for path in _walk(folder, listing.skipped):
         if path.name.lower().endswith(_ENDINGS):
             paths[os.path.relpath(os.path.realpath(path.parent) + os.sep + path.name, base)] = path
-        elif Path(os.path.realpath(path)) != own:
-            found.others[path.suffix.lower() or "no ending"] += 1
+        elif Path(os.path.realpath(path)) != table_file:
+            listing.others[path.suffix.lower() or "no ending"] += 1
     return paths
 
 
-def _repeated(paths: Mapping[str, Path], said: Mapping[str, Said], listed: Collection[str]) -> dict[str, str]:
-    """Names of files that are no further exam, each with the reason; `said` are those that can be read.
+def _duplicates(
+    paths: Mapping[str, Path], facts_of: Mapping[str, FileFacts], listed: Collection[str]
+) -> dict[str, str]:
+    """Names of files that are no further exam, each with the reason; `facts_of` are those that can be read.
 
     Of files of the same bytes the one that is listed stays, else that of the shortest name. Of a scan and its map, and
     of a scan and the arrays that it was imported from, the scan stays, unless the other is listed.
     """
     digest_of = cache(lambda name: sha256(paths[name]))
     of_size, alike = defaultdict[int, list[str]](list), defaultdict[str, list[str]](list)
-    for name in said:
+    for name in facts_of:
         of_size[paths[name].stat().st_size].append(name)
     for name in (name for names in of_size.values() if len(names) > 1 for name in names):
         alike[digest_of(name)].append(name)
-    found: dict[str, str] = {}
+    reasons: dict[str, str] = {}
     for names in alike.values():
         first, *copies = sorted(names, key=lambda name: (name not in listed, len(name), name))
-        found |= {name: f"holds the same bytes as {first}" for name in copies if name not in listed}
-    left = {name: one.sources for name, one in said.items() if name not in found}
-    scans = [name for name in left if not name.lower().endswith(MAP)] if any(left.values()) else []
+        reasons |= {name: f"holds the same bytes as {first}" for name in copies if name not in listed}
+    sources_of = {name: one.sources for name, one in facts_of.items() if name not in reasons}
+    scans = [name for name in sources_of if not name.lower().endswith(MAP)] if any(sources_of.values()) else []
     by_digest = {digest_of(name): name for name in scans}
-    for made, sources in left.items():
+    for made, sources in sources_of.items():
         original = next((by_digest[digest] for digest in sorted(sources) if digest in by_digest), made)
         if original == made:
             continue
@@ -202,8 +204,8 @@ def _repeated(paths: Mapping[str, Path], said: Mapping[str, Said], listed: Colle
             first, second = second, first
         if second not in listed:
             words = "was made from" if second == made else "was made into"
-            found.setdefault(second, f"{words} {first}, which is an exam")
-    return found
+            reasons.setdefault(second, f"{words} {first}, which is an exam")
+    return reasons
 
 
 def _walk(folder: Path, closed: list[str]) -> Iterator[Path]:
@@ -231,37 +233,37 @@ _CODES: Final = ("patient", "visit", "mass")
 
 def find_exams(
     folder: Path | str, table: Path, *, listed: Sequence[Mapping[str, str]] = (), names: str | None = None
-) -> Found:
+) -> FolderExams:
     """Look through a folder and those below it for scans (.mcap), arrays of scans (`ARRAYS`) and maps (.nc).
 
     The folder may be an address in an object store, whose maps are passed over. `listed` are rows that the table has
     already; paths are written from the table's folder; `names`: see `NamePattern`.
     """
     known = {row["file"] if is_address(row["file"]) else os.path.normpath(row["file"]): row for row in listed}
-    pattern, found, said = None if names is None else NamePattern(names), Found(), dict[str, Said]()
-    paths = {} if isinstance(folder, str) else _files_of(folder, table, found)
+    pattern, listing, facts_of = None if names is None else NamePattern(names), FolderExams(), dict[str, FileFacts]()
+    paths = {} if isinstance(folder, str) else _files_of(folder, table, listing)
     stored = files_below(check_address(folder), *SCANS) if isinstance(folder, str) else ()
     for name in (*paths, *(one for one in stored if one not in known)):
         try:
             if name[0] in "=+@-" or name != name.strip() or not name.isprintable() or len(name) > 1000:
                 raise BadDataError("the table takes no such file name: rename it")
             with nullcontext(paths[name]) if name in paths else downloaded(name) as path:
-                said[name] = _told(path, name, None if name in known else pattern)
+                facts_of[name] = _read_facts(path, name, None if name in known else pattern)
         except BadDataError as error:
             if name not in known:
-                found.skipped.append(f"{name}: {error.what}")
-    repeated = _repeated(paths, said, known) if paths else {}
-    found.skipped.extend(f"{name}: {reason}" for name, reason in repeated.items())
-    new = (name for name in said if name not in repeated and name not in known)
-    found.rows.extend({"file": name, **_DEFAULTS, **said[name].facts} for name in new)
-    found.spelled.extend(_spell_as(listed, found.rows))
-    found.rows.sort(
+                listing.skipped.append(f"{name}: {error.what}")
+    repeated = _duplicates(paths, facts_of, known) if paths else {}
+    listing.skipped.extend(f"{name}: {reason}" for name, reason in repeated.items())
+    new = (name for name in facts_of if name not in repeated and name not in known)
+    listing.rows.extend({"file": name, **_DEFAULTS, **facts_of[name].facts} for name in new)
+    listing.spelled.extend(_spell_as(listed, listing.rows))
+    listing.rows.sort(
         key=lambda row: (natural_key(row["patient"].casefold()), natural_key(row["visit"]), row["mass"], row["file"])
     )
-    _number(found.rows, listed)
+    _number(listing.rows, listed)
     gone = (name for name in known if not is_address(name) and not os.path.lexists(table.parent / name))
-    found.gone.extend(known[name]["file"] for name in gone)
-    return found
+    listing.gone.extend(known[name]["file"] for name in gone)
+    return listing
 
 
 def _spell_as(listed: Iterable[Mapping[str, str]], rows: Sequence[dict[str, Any]]) -> Iterator[str]:
@@ -323,7 +325,7 @@ class Breasts:
         for exam in exams:
             self._exams[exam.patient, exam.side].append(exam)
 
-    def named(self, exam: Exam, of: Container[str] | None = None) -> list[Exam]:
+    def exams_with_places(self, exam: Exam, of: Container[str] | None = None) -> list[Exam]:
         """For an exam without a place those that name one: for each mass of the breast one, of its visit if possible.
 
         Empty where the exam has a place, or no exam names one of its mass; `of` holds the names of those that count.
@@ -331,14 +333,14 @@ class Breasts:
         if exam.centre_mm is not None:
             return []
         breast = [one for one in self._exams[exam.patient, exam.side] if of is None or one.name in of]
-        found: dict[str, Exam] = {}
+        by_mass: dict[str, Exam] = {}
         for one in sorted(breast, key=lambda one: (one.visit != exam.visit, natural_key(one.visit), one.replicate)):
             if one.centre_mm is not None:
-                found.setdefault(one.mass, one)
-        return list(found.values()) if exam.mass in found else []
+                by_mass.setdefault(one.mass, one)
+        return list(by_mass.values()) if exam.mass in by_mass else []
 
 
-def matched(path: Path, settings: Settings, match: Match) -> SizeEstimate:
+def estimate_matched(path: Path, settings: Settings, match: Match) -> SizeEstimate:
     """Estimate the mass of a map that lies nearest to where another exam has it.
 
     Without a mass there the estimate is of the place, and says why it has no size.
@@ -348,20 +350,20 @@ def matched(path: Path, settings: Settings, match: Match) -> SizeEstimate:
     mass, most_mm = match.mass, match.most_mm
     outcome = estimate_file(path, settings)
     tactile_map, masses = outcome.tactile_map, outcome.estimate.masses
-    wanted = places_on(tactile_map, path, match.named)
-    near = [one for one in masses if nearest(wanted, (one.x_mm, one.y_mm), most_mm) == mass]
+    places = places_on(tactile_map, path, match.named)
+    near = [one for one in masses if nearest_mass(places, (one.x_mm, one.y_mm), most_mm) == mass]
     if len(near) > 1:
-        told = " and ".join(f"({one.x_mm:.1f}, {one.y_mm:.1f}) mm" for one in near)
+        words = " and ".join(f"({one.x_mm:.1f}, {one.y_mm:.1f}) mm" for one in near)
         way_out = "give the row its centre_x_mm and centre_y_mm, or a smaller --match-mm"
-        raise BadDataError(f"shows masses at {told} within {most_mm:g} mm of mass {mass}'s place", way_out=way_out)
+        raise BadDataError(f"shows masses at {words} within {most_mm:g} mm of mass {mass}'s place", way_out=way_out)
     if near and near[0].reported:
         return outcome
     if near:
         return estimate_file(path, replace(settings, centre_mm=(near[0].x_mm, near[0].y_mm)))
-    place = wanted[mass]
+    place = places[mass]
     if not on_map(tactile_map, *place):
-        told = f"mass {mass} would lie at ({place[0]:.1f}, {place[1]:.1f}) mm, off the map"
-        raise BadDataError(told, way_out="check the landmarks, or give the row its centre_x_mm and centre_y_mm")
+        words = f"mass {mass} would lie at ({place[0]:.1f}, {place[1]:.1f}) mm, off the map"
+        raise BadDataError(words, way_out="check the landmarks, or give the row its centre_x_mm and centre_y_mm")
     looked = estimate_file(path, replace(settings, centre_mm=place))
     found = looked.estimate
     here = next((one for one in found.masses if one.reported), None)
@@ -387,38 +389,38 @@ def map_of_exam(path: Path, exam: Exam) -> TactileMap:
 
 def places_on(tactile_map: TactileMap, path: Path, named: Sequence[Exam]) -> dict[str, tuple[float, float]]:
     """Where masses lie on a map, by their code: x and y in patient axes are kept; as they are without landmarks."""
-    found, here = {}, tactile_map.patient_from_plane
+    places, from_plane = {}, tactile_map.patient_from_plane
     for one in named:
         assert one.centre_mm is not None
-        there = map_of_exam(path, one).patient_from_plane
-        found[one.mass] = one.centre_mm
-        if there is not None and here is not None:
-            x_y = (there @ np.array([*one.centre_mm, 0.0, 1.0]))[:2]
-            x, y = np.linalg.solve(here[:2, :2], x_y - here[:2, 3])
-            found[one.mass] = (float(x), float(y))
-    return found
+        other_from_plane = map_of_exam(path, one).patient_from_plane
+        places[one.mass] = one.centre_mm
+        if other_from_plane is not None and from_plane is not None:
+            patient_mm = (other_from_plane @ np.array([*one.centre_mm, 0.0, 1.0]))[:2]
+            x, y = np.linalg.solve(from_plane[:2, :2], patient_mm - from_plane[:2, 3])
+            places[one.mass] = (float(x), float(y))
+    return places
 
 
-def nearest(wanted: Mapping[str, tuple[float, float]], place: tuple[float, float], most_mm: float) -> str:
+def nearest_mass(places: Mapping[str, tuple[float, float]], place: tuple[float, float], most_mm: float) -> str:
     """Code of the mass whose place is nearest, and within the distance; empty where none is."""
-    away = {mass: float(np.hypot(x - place[0], y - place[1])) for mass, (x, y) in wanted.items()}
-    first = min(away, key=lambda mass: away[mass])
-    return first if away[first] <= most_mm else ""
+    distances_mm = {mass: float(np.hypot(x - place[0], y - place[1])) for mass, (x, y) in places.items()}
+    first = min(distances_mm, key=lambda mass: distances_mm[mass])
+    return first if distances_mm[first] <= most_mm else ""
 
 
 MassPlace = tuple[Place, bool]  #: Where a mass lies on its map, and whether it is the reported one.
 
 
-def unnamed(masses: Sequence[Sequence[MassPlace]]) -> list[Finding]:
+def unnamed_masses(masses: Sequence[Sequence[MassPlace]]) -> list[Finding]:
     """Masses of one scan that no row names; `masses` are those of each row of the scan."""
-    centres = [at for of_row in masses for at, reported in of_row if reported]
-    found: list[Place] = []
-    for at, _ in masses[0]:
-        if all(np.hypot(at.x - one.x, at.y - one.y) > SAME_MM for one in [*centres, *found]):
-            found.append(at)
-    return [
-        finding("unnamed_mass", f"a mass at ({at.x:.1f}, {at.y:.1f}) mm on the map is named by no row") for at in found
-    ]
+    known = [place for of_row in masses for place, reported in of_row if reported]
+    findings = []
+    for place, _ in masses[0]:
+        if all(np.hypot(place.x - one.x, place.y - one.y) > SAME_MM for one in known):
+            known.append(place)
+            text = f"a mass at ({place.x:.1f}, {place.y:.1f}) mm on the map is named by no row"
+            findings.append(finding("unnamed_mass", text))
+    return findings
 
 
 # --- Visits of a campaign's masses, which are compared for growth.
@@ -426,20 +428,20 @@ def unnamed(masses: Sequence[Sequence[MassPlace]]) -> list[Finding]:
 Visits = dict[str, list[Exam]]  #: Exams of one mass by the code of the visit, in order of time.
 
 
-def visits_of(exams: Sequence[Exam]) -> dict[str, Visits]:
+def visits_by_mass(exams: Sequence[Exam]) -> dict[str, Visits]:
     """Visits of each mass, by its name; `read_manifest` refuses visits whose order is not known."""
-    found: dict[str, Visits] = defaultdict(lambda: defaultdict(list))
+    by_mass: dict[str, Visits] = defaultdict(lambda: defaultdict(list))
     for exam in exams:
-        found[exam.of_visits][exam.visit].append(exam)
+        by_mass[exam.of_visits][exam.visit].append(exam)
     return {
         name: {visit: visits[visit] for visit in visits_in_order(visit_dates(visits)) or visits}
-        for name, visits in found.items()
+        for name, visits in by_mass.items()
     }
 
 
-def grown_masses(exams: Sequence[Exam]) -> dict[str, Visits]:
+def masses_with_visits(exams: Sequence[Exam]) -> dict[str, Visits]:
     """Masses with exams at several visits, by their names."""
-    return {name: visits for name, visits in visits_of(exams).items() if len(visits) > 1}
+    return {name: visits for name, visits in visits_by_mass(exams).items() if len(visits) > 1}
 
 
 def visit_dates(visits: Mapping[str, Sequence[Exam]]) -> dict[str, date | None]:

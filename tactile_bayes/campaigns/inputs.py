@@ -39,11 +39,11 @@ def open_campaign(folder: Path, *, dry: bool = False) -> Iterator[BatchStore | N
     """
     journal = folder / JOURNAL
     try:
-        begun, used = journal.exists(), folder.is_dir() and any(folder.iterdir())
+        has_journal, has_files = journal.exists(), folder.is_dir() and any(folder.iterdir())
     except OSError as error:
         raise UsageError(f"{folder} cannot be read ({error.strerror}); choose another folder") from None
-    if not begun:
-        if used:
+    if not has_journal:
+        if has_files:
             raise UsageError(f"{folder} holds files, and no campaign; choose a new folder")
         if dry:
             yield None
@@ -52,11 +52,11 @@ def open_campaign(folder: Path, *, dry: bool = False) -> Iterator[BatchStore | N
             folder.mkdir(mode=0o700, exist_ok=True)
         except OSError as error:
             raise unwritable(folder, error) from None
-    with open_store(journal, settings=_HEADER, encode=_taken, read_only=dry) as store:
+    with open_store(journal, settings=_HEADER, encode=_commit, read_only=dry) as store:
         yield store
 
 
-def _taken(result: Result) -> Result:
+def _commit(result: Result) -> Result:
     """Put a result's files in place for the journal; the campaign stops where the disk does not take them."""
     fault = result.get(UNWRITTEN)
     if fault is None:
@@ -81,7 +81,7 @@ def unchanged(folder: Path, result: Result) -> bool:
         return False
 
 
-def tidy(
+def remove_stale_files(
     folder: Path, exams: Sequence[Exam], files_of: Callable[[str, str], Collection[str]], *, unread: Collection[str]
 ) -> list[str]:
     """Remove files of earlier runs that this one would not make, and name the folders of exams no longer listed.
@@ -141,24 +141,24 @@ READ: Final = "read"  #: Step of the journal that holds a file's digest.
 _SETTLED_S: Final = 10.0  #: A file that was last changed so long ago has times that tell this content from a later one.
 
 
-def _key_of(exam: Exam) -> tuple[str, bool]:
+def _digest_key(exam: Exam) -> tuple[str, bool]:
     """Name that the digest of the exam's file has in the journal, and whether it tells the content from a later one.
 
     It does not where the file was changed a moment ago, or cannot be looked at; a store's tag needs no time.
     """
     try:
         if exam.address:
-            said, changed = version_of(exam.address), 0.0
+            version, changed = version_of(exam.address), 0.0
         else:
-            known = exam.path.stat()
-            said, changed = stamp(exam.path), max(known.st_mtime, known.st_ctime)
+            status = exam.path.stat()
+            version, changed = stamp(exam.path), max(status.st_mtime, status.st_ctime)
     except (OSError, BadDataError):
         return exam.file, False
-    key = f"{READ} {exam.file} {hashlib.sha256(said.encode()).hexdigest()[:32]}"
+    key = f"{READ} {exam.file} {hashlib.sha256(version.encode()).hexdigest()[:32]}"
     return key, changed < time.time() - _SETTLED_S
 
 
-def _read(file: tuple[str, Path, str]) -> dict[str, Any]:
+def _digest(file: tuple[str, Path, str]) -> dict[str, Any]:
     """The digest of a file (its key, its path, and its address in an object store), and how long it took."""
     _, path, address = file
     begun = time.perf_counter()
@@ -174,17 +174,17 @@ def read_sources(
     New digests go into the journal (`keep`), or else files in object stores that are not known are passed over. A lost
     cluster is a `TactileBayesError`.
     """
-    files = {exam.path: (exam, *_key_of(exam)) for exam in {exam.path: exam for exam in exams}.values()}
+    files = {exam.path: (exam, *_digest_key(exam)) for exam in {exam.path: exam for exam in exams}.values()}
     values: Mapping[str, Any] = {} if store is None else store
     known = {path: values[key]["sha256"] for path, (_, key, settled) in files.items() if settled and key in values}
     digests, faults = known, dict[Path, str]()
-    for settles, kept in ((True, store if keep else None), (False, None)):
+    for settled_ones, journal in ((True, store if keep else None), (False, None)):
         waiting = [
             (key, path, exam.address)
             for path, (exam, key, settled) in files.items()
-            if settled == settles and path not in known and (keep or not exam.address)
+            if settled == settled_ones and path not in known and (keep or not exam.address)
         ]
-        outcomes = run_batch(_read, waiting, key=itemgetter(0), executor=executor, store=kept, progress=progress)
+        outcomes = run_batch(_digest, waiting, key=itemgetter(0), executor=executor, store=journal, progress=progress)
         for (_, path, address), outcome in zip(waiting, outcomes, strict=True):
             if outcome.value is not None:
                 digests[path] = outcome.value["sha256"]
@@ -195,14 +195,14 @@ def read_sources(
     return digests, faults
 
 
-class Alike:
+class DuplicateExams:
     """Exams that share what only masses of one scan may share, told as they come.
 
     `what` is shared, for people: ``"bytes"`` or ``"recording"``.
     """
 
-    def __init__(self, breasts: Breasts, what: str) -> None:
-        self._breasts, self._what = breasts, what
+    def __init__(self, breasts: Breasts, shared: str) -> None:
+        self._breasts, self._shared = breasts, shared
         self._sharing: dict[str, list[Exam]] = defaultdict(list)
 
     def faults(self, marks: Mapping[Exam, Iterable[str]]) -> dict[str, str]:
@@ -218,11 +218,11 @@ class Alike:
 
     def _reasons(self, alike: Sequence[Exam]) -> Iterator[tuple[str, str]]:
         one_visit = len({(exam.patient, exam.visit, exam.side) for exam in alike}) == 1
-        placed = {one.mass for one in alike if one.centre_mm is not None or self._breasts.named(one)}
+        placed = {one.mass for one in alike if one.centre_mm is not None or self._breasts.exams_with_places(one)}
         if len(alike) == 1 or (one_visit and len(placed) == len(alike)):
             return
         for exam in alike:
             others = [other for other in alike if other is not exam]
             named = ", ".join(f"{other.name} ({other.file})" for other in others[:3])
             way_out = "give each exam its own file, or each mass of a breast its centre_x_mm and centre_y_mm"
-            yield exam.name, f"holds the same {self._what} as {named}; {way_out}"
+            yield exam.name, f"holds the same {self._shared} as {named}; {way_out}"

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from tactile_bayes import __version__
 from tactile_bayes.api.trials import analyse, load_trial, read_excision, settings_by
-from tactile_bayes.campaigns.exams import MassPlace, grown_masses, unnamed, visit_dates, visits_of
+from tactile_bayes.campaigns.exams import MassPlace, masses_with_visits, unnamed_masses, visit_dates, visits_by_mass
 from tactile_bayes.campaigns.run import FEW, Campaign
 from tactile_bayes.campaigns.steps import CampaignSettings
 from tactile_bayes.declarations import Record, replace
@@ -25,7 +25,7 @@ from tactile_bayes.files.reports import EstimateReport, PooledReport, centre_of
 from tactile_bayes.files.tables import Table
 from tactile_bayes.findings import Finding, by_severity, capitalised, finding_lines, verdict
 from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.report.campaign_page import ExamEntry, MassRow, VisitEntry, campaign_html, worst
+from tactile_bayes.report.campaign_page import ExamEntry, MassEntry, VisitEntry, campaign_html, worst
 from tactile_bayes.report.compare import CompareReport, growths
 from tactile_bayes.report.exam_words import reason_on_paper
 from tactile_bayes.report.pages import Growth, growth_line
@@ -48,7 +48,7 @@ _SIZES: Final = {
 Pooled = Mapping[str, PooledReport]  #: Each pooled mass, by its name.
 
 
-class Row(Record, eq=False):
+class ExamRow(Record, eq=False):
     """One exam as the tables and the index show it: of its report this alone stays in memory."""
 
     exam: Exam  #: Of exams.csv.
@@ -70,7 +70,7 @@ class Row(Record, eq=False):
     """What speaks against the exam: of its estimate, of the pooled size of its mass, of the table."""
 
     @classmethod
-    def of(cls, exam: Exam, report: EstimateReport, **facts: Any) -> Row:
+    def of(cls, exam: Exam, report: EstimateReport, **facts: Any) -> ExamRow:
         """An exam with its estimate, by the campaign's repeatability where it has one; `facts` are of its file."""
         size, smallest = report.max_size_mm, report.min_size_mm
         return cls(
@@ -96,22 +96,22 @@ def _status(report: EstimateReport | PooledReport) -> str:
     return "not_detected" if report.status == "no_estimate" and not silent else "not_done"
 
 
-def exam_rows(campaign: Campaign, pooled: Pooled) -> list[Row]:
+def exam_rows(campaign: Campaign, pooled: Pooled) -> list[ExamRow]:
     """Every exam of the table, in its order; `pooled` are the masses by their names."""
-    together, rows = _of_pooled(pooled.values()), [_row(campaign, exam) for exam in campaign.exams]
-    of_scan: dict[Path, list[Row]] = defaultdict(list)
+    pooled_of, rows = _pooled_findings(pooled.values()), [_exam_row(campaign, exam) for exam in campaign.exams]
+    of_scan: dict[Path, list[ExamRow]] = defaultdict(list)
     for row in rows:
         if not row.failed:
             of_scan[row.exam.path].append(row)
-    more = {path: unnamed([row.masses for row in some]) for path, some in of_scan.items()}
+    unnamed_of = {path: unnamed_masses([row.masses for row in some]) for path, some in of_scan.items()}
     for index, row in enumerate(rows):
         if not row.failed:
-            told = (*row.findings, *together.get(row.exam.name, ()), *more[row.exam.path])
-            rows[index] = replace(row, findings=by_severity(told))
+            findings = (*row.findings, *pooled_of.get(row.exam.name, ()), *unnamed_of[row.exam.path])
+            rows[index] = replace(row, findings=by_severity(findings))
     return rows
 
 
-def _of_pooled(pooled: Iterable[PooledReport]) -> dict[str, tuple[Finding, ...]]:
+def _pooled_findings(pooled: Iterable[PooledReport]) -> dict[str, tuple[Finding, ...]]:
     """What the pooled size of its mass says against each exam, such as that its lump lies elsewhere."""
     return {
         name: tuple(
@@ -125,16 +125,16 @@ def _of_pooled(pooled: Iterable[PooledReport]) -> dict[str, tuple[Finding, ...]]
     }
 
 
-def _row(campaign: Campaign, exam: Exam) -> Row:
+def _exam_row(campaign: Campaign, exam: Exam) -> ExamRow:
     fault = campaign.faults.get(exam.name)
     mapped = campaign.result("map", exam.name)
     facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "synthetic": mapped.get("synthetic")}
     if fault is not None and fault.step not in ("figures", "page"):
         reason = f"{fault.step} failed: {fault.reason}"
-        return Row(exam, "not_done", reason, reason, failed=True, **facts)
+        return ExamRow(exam, "not_done", reason, reason, failed=True, **facts)
     by_site = layout.SIZED in campaign.files("size", exam.name)
     place = campaign.folder / layout.EXAMS / exam.name / (layout.SIZED if by_site else layout.ESTIMATE)
-    return Row.of(exam, read_record(place, EstimateReport), **facts)
+    return ExamRow.of(exam, read_record(place, EstimateReport), **facts)
 
 
 def pooled_reports(campaign: Campaign) -> Pooled:
@@ -143,16 +143,16 @@ def pooled_reports(campaign: Campaign) -> Pooled:
     return {name: read_record(folder / name / layout.POOLED, PooledReport) for name in campaign.keys["pool"]}
 
 
-def done_line(row: Row) -> dict[str, object]:
+def done_line(row: ExamRow) -> dict[str, object]:
     """An exam in ``exams_done.csv``: with an estimate, or with the reason for none."""
     x_mm, y_mm = row.centre_mm or (None, None)
     return {
-        **_names(row.exam),
+        **_exam_cells(row.exam),
         "folder": f"{layout.EXAMS}/{row.exam.name}",
         "scan_sha256": " ".join(scan["sha256"] for scan in row.scans if "sha256" in scan) or None,
         "status": row.status,
         "reason": row.reason or None,
-        **_figures(row.size, _SIZES),
+        **_quantity_cells(row.size, _SIZES),
         "smallest_mm": row.smallest_mm,
         "detected_probability": row.detected_probability,
         "centre_x_mm": x_mm,
@@ -163,29 +163,29 @@ def done_line(row: Row) -> dict[str, object]:
     }
 
 
-def _names(exam: Exam) -> dict[str, object]:
+def _exam_cells(exam: Exam) -> dict[str, object]:
     """What the tables repeat of an exam, by their columns."""
     return {name: getattr(exam, name) for name in ("patient", "visit", "mass", "replicate", "side", "reader", "file")}
 
 
-def _figures(quantity: Quantity | None, names: Mapping[str, str]) -> dict[str, object]:
+def _quantity_cells(quantity: Quantity | None, names: Mapping[str, str]) -> dict[str, object]:
     """Figures of a quantity by their columns; none without one."""
     return {} if quantity is None else {column: getattr(quantity, name) for column, name in names.items()}
 
 
-def failure_lines(campaign: Campaign, rows: Sequence[Row]) -> list[dict[str, object]]:
+def failure_lines(campaign: Campaign, rows: Sequence[ExamRow]) -> list[dict[str, object]]:
     """``failures.csv``: exams, and masses that could not be pooled or compared, with the step and the reason."""
-    failed = {row.exam.name: _names(row.exam) for row in rows}
-    failed |= {row.exam.of_mass: {**_names(row.exam), "replicate": None, "file": None} for row in rows}
+    cells = {row.exam.name: _exam_cells(row.exam) for row in rows}
+    cells |= {row.exam.of_mass: {**_exam_cells(row.exam), "replicate": None, "file": None} for row in rows}
     blank = {"visit": None, "replicate": None, "file": None}
-    failed |= {row.exam.of_visits: {**_names(row.exam), **blank} for row in rows}
-    found = campaign.faults
-    return [failed[name] | {"step": found[name].step, "reason": found[name].reason} for name in failed if name in found]
+    cells |= {row.exam.of_visits: {**_exam_cells(row.exam), **blank} for row in rows}
+    faults = ((name, campaign.faults[name]) for name in cells if name in campaign.faults)
+    return [cells[name] | {"step": fault.step, "reason": fault.reason} for name, fault in faults]
 
 
 def trial_lines(
     campaign: Campaign,
-    rows: Sequence[Row],
+    rows: Sequence[ExamRow],
     pooled: Pooled,
     masses: Collection[tuple[str, str]] | None,
 ) -> list[dict[str, object]]:
@@ -193,13 +193,13 @@ def trial_lines(
 
     `masses` have a size after excision: the others are left out. None takes all. Numbers run over the visits of a mass.
     """
-    taken = [row for row in rows if masses is None or (row.exam.patient, row.exam.mass) in masses]
-    readings = [_reading(row, TACTILE, reader=row.exam.reader) for row in taken]
-    visits: dict[str, list[Row]] = defaultdict(list)
-    for row in taken if pooled else ():
+    in_trial = [row for row in rows if masses is None or (row.exam.patient, row.exam.mass) in masses]
+    readings = [_trial_reading(row, TACTILE, reader=row.exam.reader) for row in in_trial]
+    visits: dict[str, list[ExamRow]] = defaultdict(list)
+    for row in in_trial if pooled else ():
         visits[row.exam.of_mass].append(row)
     readings += [
-        _reading(_together(campaign, some, pooled.get(name)), POOLED_MODALITY) for name, some in visits.items()
+        _trial_reading(_pooled_row(campaign, some, pooled.get(name)), POOLED_MODALITY) for name, some in visits.items()
     ]
     count: Counter[tuple[object, ...]] = Counter()
     for one in readings:
@@ -209,26 +209,26 @@ def trial_lines(
     return readings
 
 
-def _together(campaign: Campaign, rows: Sequence[Row], report: PooledReport | None) -> Row:
+def _pooled_row(campaign: Campaign, rows: Sequence[ExamRow], report: PooledReport | None) -> ExamRow:
     """A mass at a visit, by all of its exams."""
     exam = rows[-1].exam
-    told = [row.synthetic for row in rows if row.synthetic is not None]  # a failed exam does not say
-    synthetic = any(told) if told else None
+    known = [row.synthetic for row in rows if row.synthetic is not None]  # a failed exam does not say
+    synthetic = any(known) if known else None
     if report is None:
         fault = campaign.faults.get(exam.of_mass)
         reason = "every exam failed" if fault is None else f"{fault.step} failed: {fault.reason}"
-        return Row(exam, "not_done", reason, synthetic=synthetic)
+        return ExamRow(exam, "not_done", reason, synthetic=synthetic)
     silent = all(row.status == "not_done" for row in rows)
     status = "not_done" if silent and report.max_size_mm is None else _status(report)
-    return Row(exam, status, report.reason, size=report.max_size_mm, synthetic=synthetic)
+    return ExamRow(exam, status, report.reason, size=report.max_size_mm, synthetic=synthetic)
 
 
-def _reading(row: Row, modality: str, *, reader: str | None = None) -> dict[str, object]:
+def _trial_reading(row: ExamRow, modality: str, *, reader: str | None = None) -> dict[str, object]:
     return {
-        **_names(row.exam),
+        **_exam_cells(row.exam),
         "modality": modality,
         "status": row.status,
-        **_figures(row.size, _SIZES),
+        **_quantity_cells(row.size, _SIZES),
         "reader": reader,
         "date": row.exam.day,
         "reason": (row.reason or None) if row.status != "detected" else None,
@@ -239,7 +239,7 @@ def _reading(row: Row, modality: str, *, reader: str | None = None) -> dict[str,
 def growth_rows(campaign: Campaign) -> list[Growth]:
     """What `compare` says of each mass with several visits, in order of the masses."""
     compared, rows = campaign.keys["compare"], []
-    for name, visits in grown_masses(campaign.exams).items():
+    for name, visits in masses_with_visits(campaign.exams).items():
         codes, exam = [*visits], next(iter(visits.values()))[0]
         place = f"{layout.GROWTH}/{name}"
         if name in compared:
@@ -268,7 +268,7 @@ def grown_line(row: Growth) -> dict[str, object]:
         "reason": row.reason or None,
         "earlier_mm": first,
         "later_mm": later,
-        **_figures(row.percent, names),
+        **_quantity_cells(row.percent, names),
         "verdict": row.verdict or None,
         "findings": " ".join(finding_lines(row.findings)) or None,
     }
@@ -318,14 +318,14 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
     links |= {layout.REPEATABILITY: layout.REPEATABILITY} if campaign.repeatability else {}
     sized, failed = sum(row.size is not None for row in rows), sum(row.failed for row in rows)
     counts = f"{sized} sized, {len(rows) - sized - failed} without a size, {failed} failed"
-    write_text(folder / INDEX, _page(campaign, rows, pooled, growth, counts=counts, links=links), force=True)
+    write_text(folder / INDEX, _index_html(campaign, rows, pooled, growth, counts=counts, links=links), force=True)
     left_out = set() if masses is None else {(row.exam.patient, row.exam.mass) for row in rows} - masses
     together = f"no mass pooled: {campaign.not_pooled}" if campaign.not_pooled else ""
     together = f"{len(pooled)} masses pooled, each at one visit" if pooled else together
     doubts = {
         "no size after excision, left out of trial.csv": [" ".join(mass) for mass in sorted(left_out)],
-        "masses whose exams disagree, without a pooled size": _with(rows, "maps_disagree", "of_mass"),
-        "exams with a mass that no row names, see their findings": _with(rows, "unnamed_mass", "name"),
+        "masses whose exams disagree, without a pooled size": _names_with_finding(rows, "maps_disagree", "of_mass"),
+        "exams with a mass that no row names, see their findings": _names_with_finding(rows, "unnamed_mass", "name"),
         "folders of exams that the table does not list": unlisted,
     }
     doubtful = [line for words, names in doubts.items() for line in names_line(words, names)]
@@ -337,7 +337,7 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
     )
 
 
-def _with(rows: Sequence[Row], kind: str, name: str) -> list[str]:
+def _names_with_finding(rows: Sequence[ExamRow], kind: str, name: str) -> list[str]:
     """Names of the exams, or of their masses, that a finding of the kind speaks against, each once."""
     return list(dict.fromkeys(getattr(row.exam, name) for row in rows if any(one.kind == kind for one in row.findings)))
 
@@ -355,12 +355,12 @@ def check_inputs(exams: Sequence[Exam], settings: CampaignSettings) -> None:
     that was excised before every exam is refused.
     """
     if settings.excision is None:
-        for option, what in (
+        for option, purpose in (
             ("columns", "is the layout of the excision table"),
             ("protocol", "is for the trial's report"),
         ):
             if getattr(settings, option) is not None:
-                raise UsageError(f"--{option} {what}; give --excision too")
+                raise UsageError(f"--{option} {purpose}; give --excision too")
     table = _excised(settings)
     if table is not None:
         _check_spelling(table, exams)
@@ -388,31 +388,31 @@ def _check_spelling(table: Table, exams: Iterable[Exam]) -> None:
             continue
         for column, code, spelled in (("patient", patient, exam.patient), ("mass", mass, exam.mass)):
             if code != spelled:
-                what = f"{code!r} is {spelled!r} in the table of exams (line {exam.line})"
-                raise table.error(row, column, what, way_out="write it one way in both tables")
+                words = f"{code!r} is {spelled!r} in the table of exams (line {exam.line})"
+                raise table.error(row, column, words, way_out="write it one way in both tables")
 
 
-def _fault_of_exam(exams: Sequence[Exam], row: int, column: str, what: str, /, *, way_out: str) -> BadDataError:
-    return BadDataError(f"table of exams, line {exams[row].line}, column {column}: {what}", way_out=way_out)
+def _fault_of_exam(exams: Sequence[Exam], row: int, column: str, words: str, /, *, way_out: str) -> BadDataError:
+    return BadDataError(f"table of exams, line {exams[row].line}, column {column}: {words}", way_out=way_out)
 
 
-def _write_report(folder: Path, asked: CampaignSettings, growth: Sequence[Growth]) -> tuple[str, str]:
+def _write_report(folder: Path, settings: CampaignSettings, growth: Sequence[Growth]) -> tuple[str, str]:
     """Write what `validate` writes for the trial table; returns its text, or why there is none."""
-    title, settings = settings_by(asked.protocol)
-    assert asked.excision is not None
+    title, trial_settings = settings_by(settings.protocol)
+    assert settings.excision is not None
     try:
-        inputs = load_trial(folder / layout.TRIAL, asked.excision, asked.columns, tidy_trial=True)
-        found = analyse(inputs, settings, protocol=asked.protocol, title=title)
+        inputs = load_trial(folder / layout.TRIAL, settings.excision, settings.columns, tidy_trial=True)
+        analysis = analyse(inputs, trial_settings, protocol=settings.protocol, title=title)
     except BadDataError as error:
         return "", error.what
-    found.write_json(folder / REPORT, force=True)
-    found.write_html(folder / PAGE, growth=growth, force=True)
-    return found.told(methods=False), ""
+    analysis.write_json(folder / REPORT, force=True)
+    analysis.write_html(folder / PAGE, growth=growth, force=True)
+    return analysis.told(methods=False), ""
 
 
-def _page(
+def _index_html(
     campaign: Campaign,
-    rows: Sequence[Row],
+    rows: Sequence[ExamRow],
     pooled: Pooled,
     growth: Sequence[Growth],
     *,
@@ -422,15 +422,15 @@ def _page(
     """The index: a row for each mass, in the order of the table."""
     changes = {(one.patient, one.mass): one for one in growth}  # the last one of each mass: to its last visit
     row_of, masses = {row.exam.name: row for row in rows}, []
-    for visits in visits_of(campaign.exams).values():
+    for visits in visits_by_mass(campaign.exams).values():
         dates, entries = visit_dates(visits), []
         for code, of_visit in visits.items():
             some = [row_of[exam.name] for exam in of_visit]
-            exams = tuple(_exam(campaign, row, inline=len(rows) <= _MOST_INLINE) for row in some)
-            entries.append(_visit(dates[code], some, exams, pooled.get(of_visit[0].of_mass)))
+            exams = tuple(_exam_entry(campaign, row, inline=len(rows) <= _MOST_INLINE) for row in some)
+            entries.append(_visit_entry(dates[code], some, exams, pooled.get(of_visit[0].of_mass)))
         first = next(iter(visits.values()))[0]
         change = changes.get((first.patient, first.mass))
-        masses.append(MassRow(first.patient, first.mass, tuple(entries), first.side or "", change))
+        masses.append(MassEntry(first.patient, first.mass, tuple(entries), first.side or "", change))
     shown = worst(masses, _MOST_ROWS)
     patients = len({row.patient for row in masses})
     lines = [f"{len(masses)} masses of {patients} patients; {len(rows)} exams: {counts}."]
@@ -442,22 +442,22 @@ def _page(
     return campaign_html(shown, lines=lines, links=links, version=__version__)
 
 
-def _visit(
-    day: date | None, rows: Sequence[Row], exams: tuple[ExamEntry, ...], report: PooledReport | None
+def _visit_entry(
+    day: date | None, rows: Sequence[ExamRow], exams: tuple[ExamEntry, ...], report: PooledReport | None
 ) -> VisitEntry:
     """A visit with its size: the pooled one where there is one, else that of its one exam."""
     code = rows[0].exam.visit
     words = code if day is None or day.isoformat() == code else f"{code}, {day.isoformat()}"
     if report is not None:
         size = report.leading.max_size_mm
-        used = sum(one.status == "estimate" for one in report.maps)
-        return VisitEntry(words, exams, size, used if len(rows) > 1 else 0, "" if size else report.reason)
+        estimated = sum(one.status == "estimate" for one in report.maps)
+        return VisitEntry(words, exams, size, estimated if len(rows) > 1 else 0, "" if size else report.reason)
     size = exams[0].size if len(exams) == 1 else None
     reasons = dict.fromkeys(row.on_paper for row in rows)
     return VisitEntry(words, exams, size, why="" if size else "; ".join(filter(None, reasons)) or "not pooled")
 
 
-def _exam(campaign: Campaign, row: Row, *, inline: bool) -> ExamEntry:
+def _exam_entry(campaign: Campaign, row: ExamRow, *, inline: bool) -> ExamEntry:
     exam, folder = row.exam, f"{layout.EXAMS}/{row.exam.name}"
     made = {
         name
@@ -483,8 +483,8 @@ def _exam(campaign: Campaign, row: Row, *, inline: bool) -> ExamEntry:
 
 def repeatability_words(campaign: Campaign) -> str:
     """What the repeats say of the site, and that the sizes are by it; why they do not where they might have."""
-    found = campaign.repeatability
-    if found is None:
+    repeatability = campaign.repeatability
+    if repeatability is None:
         return f"spread between exams not learned: {campaign.not_learned}" if campaign.not_learned else ""
-    words = found.words()
+    words = repeatability.words()
     return f"{capitalised(words)}; every size is by this spread, learned from the repeats ({layout.REPEATABILITY})."

@@ -27,8 +27,8 @@ from tactile_bayes.api.repeatability import ExamFolder
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, BatchStore, Outcome, run_batch
 from tactile_bayes.campaigns import steps
-from tactile_bayes.campaigns.exams import Breasts, Match, Visits, grown_masses, visit_dates
-from tactile_bayes.campaigns.inputs import READ, SITE, Alike, read_sources, unchanged
+from tactile_bayes.campaigns.exams import Breasts, Match, Visits, masses_with_visits, visit_dates
+from tactile_bayes.campaigns.inputs import READ, SITE, DuplicateExams, read_sources, unchanged
 from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.atomic import sha256
@@ -99,7 +99,7 @@ class Campaign:
     def __post_init__(self) -> None:
         self._block = max(_BLOCK, _AHEAD_IN_BLOCK * int(getattr(self.executor, "ahead", 0)))
         self._breasts = Breasts(self.exams)
-        self._recordings = Alike(self._breasts, "recording")
+        self._recordings = DuplicateExams(self._breasts, "recording")
 
     def result(self, step: str, name: str) -> steps.Result:
         """Result of a step of an exam or mass, read from the journal; empty where there is none."""
@@ -119,12 +119,12 @@ class Campaign:
         """
         self._read_sources()
         sound = [exam for exam in self.exams if exam.name not in self.faults]
-        self.not_pooled = self.not_compared = self._not_over_bodies()
+        self.not_pooled = self.not_compared = self._unpoolable()
         if len({exam.of_mass for exam in self.exams}) == len(self.exams):
             self.not_pooled = "no mass has several exams at one visit"
         masses = 0 if self.not_pooled else len({exam.of_mass for exam in sound})
-        learns = steps.taught_by(sound, self.settings) >= steps.FEWEST_MASSES
-        grown = 0 if self.not_compared else len(grown_masses(sound))
+        learns = steps.count_repeated_masses(sound, self.settings) >= steps.FEWEST_MASSES
+        grown = 0 if self.not_compared else len(masses_with_visits(sound))
         self._needed.update(self._steps(len(sound), masses, learns=learns, compared=grown))
         with self.bar("steps") as self._tell:
             for block in _blocks_of_patients(sound, self._block):
@@ -137,8 +137,8 @@ class Campaign:
                 self._needed.subtract(self._steps(0, spared))
                 self._pool(sound)
             if grown:
-                growing = grown_masses(self._estimated(sound))
-                self._of_masses("compare", growing, self._compare_task, masses=len(grown_masses(sound)))
+                growing = masses_with_visits(self._with_estimate(sound))
+                self._run_masses("compare", growing, self._compare_task, masses=len(masses_with_visits(sound)))
 
     def _steps(self, exams: int, masses: int, *, learns: bool = False, compared: int = 0) -> dict[str, int]:
         """Steps that so many exams and masses take, done or not.
@@ -208,7 +208,7 @@ class Campaign:
                 self.faults[exam.name] = Fault(READ, faults[exam.path])
                 self.unread.add(exam.name)
         bytes_of = {exam: [self._digests[exam.path]] for exam in self.exams if exam.path in self._digests}
-        for name, reason in Alike(self._breasts, "bytes").faults(bytes_of).items():
+        for name, reason in DuplicateExams(self._breasts, "bytes").faults(bytes_of).items():
             self.faults[name] = Fault(READ, reason)
 
     def _size(self, exams: Sequence[Exam]) -> None:
@@ -217,14 +217,14 @@ class Campaign:
         self._run("map", [self._map_task(exam) for exam in known], of=len(exams))
         exams = self._recorded_once(exams)
         mapped = [exam for exam in exams if exam.name in self.keys["map"]]
-        mapped = mapped if self.dry else self._placed(mapped)
+        mapped = mapped if self.dry else self._with_known_place(mapped)
         self._run("estimate", [self._estimate_task(exam, "estimate") for exam in mapped], of=len(exams))
         if self.settings.figures:
-            tasks = [self._estimate_task(exam, "figures") for exam in self._estimated(mapped)]
+            tasks = [self._estimate_task(exam, "figures") for exam in self._with_estimate(mapped)]
             self._run("figures", tasks, of=len(exams))
         self._copy(EXAMS, [exam.name for exam in exams], made_by=("map", "estimate", "figures"))
 
-    def _estimated(self, exams: Sequence[Exam]) -> list[Exam]:
+    def _with_estimate(self, exams: Sequence[Exam]) -> list[Exam]:
         """Those that have an estimate."""
         return [exam for exam in exams if exam.name in self.keys["estimate"]]
 
@@ -260,46 +260,47 @@ class Campaign:
         return steps.Task(step, name, folder, steps.digest_of(key), make)
 
     def _map_task(self, exam: Exam) -> steps.Task:
-        given: dict[str, Any] = {"expected": self._expected(exam), "normalise": self.settings.normalise}
+        arguments: dict[str, Any] = {"expected": self._expected(exam), "normalise": self.settings.normalise}
         digest = self._digests[exam.path]
-        make = partial(steps.make_map, exam.path, source_sha256=digest, address=exam.address, **given)
-        return self._task("map", exam.name, {"scan": digest, **given}, make)
+        make = partial(steps.make_map, exam.path, source_sha256=digest, address=exam.address, **arguments)
+        return self._task("map", exam.name, {"scan": digest, **arguments}, make)
 
     def _estimate_task(self, exam: Exam, step: str) -> steps.Task:
         """Task of the estimate, or of its figures."""
         settings = self.settings.of(exam)
         key = {"map": self._file("map", exam.name, MAP), **self._settings_key(settings, self._normalise(exam))}
-        named, match = self._named(exam), None
+        named, match = self._exams_with_places(exam), None
         if named:
             match = Match(exam.mass, tuple(named), self.settings.match_mm)
-            told = [[one.mass, one.name, self._file("map", one.name, MAP), one.centre_mm] for one in named]
-            key["match"] = {"mass": exam.mass, "most_mm": match.most_mm, "places": told}
+            places = [[one.mass, one.name, self._file("map", one.name, MAP), one.centre_mm] for one in named]
+            key["match"] = {"mass": exam.mass, "most_mm": match.most_mm, "places": places}
         make = steps.make_estimate if step == "estimate" else steps.make_figures
         return self._task(step, exam.name, key, partial(make, self._folder_of(exam), settings, match))
 
-    def _placed(self, mapped: Sequence[Exam]) -> list[Exam]:
+    def _with_known_place(self, mapped: Sequence[Exam]) -> list[Exam]:
         """The exams without those whose mass is named by a place on a map that could not be made."""
-        lost = [exam for exam in mapped if self._breasts.named(exam) and not self._named(exam)]
+        lost = [exam for exam in mapped if self._breasts.exams_with_places(exam) and not self._exams_with_places(exam)]
         for exam in lost:
-            named = ", ".join(one.name for one in self._breasts.named(exam) if one.mass == exam.mass)
+            named = ", ".join(one.name for one in self._breasts.exams_with_places(exam) if one.mass == exam.mass)
             reason = f"the place of its mass is on the map of {named}, which was not made"
             self.faults[exam.name] = Fault("estimate", reason)
         return [exam for exam in mapped if exam not in lost]
 
-    def _named(self, exam: Exam) -> list[Exam]:
+    def _exams_with_places(self, exam: Exam) -> list[Exam]:
         """Exams with a map that name the places of the breast's masses, where this one names none."""
-        return self._breasts.named(exam, of=self.keys["map"])
+        return self._breasts.exams_with_places(exam, of=self.keys["map"])
 
     def _settings_key(self, settings: Settings, normalise: str) -> dict[str, Any]:
         """All that an estimate depends on besides its map: settings, and the digests of the files that they name."""
         plain = {name: getattr(settings, name) for name in names_of(settings)}
         name = str(plain.pop("size_calibration") or default_for(normalise))
-        file = plain.pop("settings_file")
+        settings_file = plain.pop("settings_file")
         repeatability = plain.pop("repeatability")
         if repeatability is not None:
             plain["repeatability"] = repeatability.sha256 or repr(repeatability)
-        used = {"settings_sha256": None if file is None else self._file_digest(file), "calibration": name}
-        return {**plain, **used, "calibration_sha256": self._calibration_digest(name)}
+        digest = None if settings_file is None else self._file_digest(settings_file)
+        calibration = {"calibration": name, "calibration_sha256": self._calibration_digest(name)}
+        return {**plain, "settings_sha256": digest, **calibration}
 
     def _calibration_digest(self, name: str) -> str:
         path = size_calibration_path(name)
@@ -313,8 +314,8 @@ class Campaign:
 
     def _learn_repeatability(self, sound: Sequence[Exam]) -> None:
         """Learn the spread between exams from the repeats, and size every exam by it from what its estimate left."""
-        estimated, needed = self._estimated(sound), self._needed
-        masses = steps.taught_by(sound if self.dry else estimated, self.settings)
+        estimated, needed = self._with_estimate(sound), self._needed
+        masses = steps.count_repeated_masses(sound if self.dry else estimated, self.settings)
         if masses < steps.FEWEST_MASSES:
             if masses:
                 have = "mass has" if masses == 1 else "masses have"
@@ -345,17 +346,17 @@ class Campaign:
     def _make_pages(self, sound: Sequence[Exam]) -> None:
         """The page of every exam that was estimated, with its size by the repeatability where it has one."""
         for block in _blocks(sound, self._block):
-            known = [] if self._sizes_unknown else self._estimated(block)
+            known = [] if self._sizes_unknown else self._with_estimate(block)
             self._run("page", [self._page_task(exam) for exam in known], of=len(block))
             self._copy(EXAMS, [exam.name for exam in block], made_by=("size", "page"))
 
     def _page_task(self, exam: Exam) -> steps.Task:
         sized = self._file("size", exam.name, SIZED)
         day = "" if exam.day is None else exam.day.isoformat()
-        told = self._expected(exam) | {"replicate": str(exam.replicate), "date": day}
+        facts = self._expected(exam) | {"replicate": str(exam.replicate), "date": day}
         size = sized or self._file("estimate", exam.name, ESTIMATE)
-        key = {"map": self._file("map", exam.name, MAP), "size": size, "told": told}
-        make = partial(steps.make_page, self._folder_of(exam), told, report=ESTIMATE if sized is None else SIZED)
+        key = {"map": self._file("map", exam.name, MAP), "size": size, "told": facts}
+        make = partial(steps.make_page, self._folder_of(exam), facts, report=ESTIMATE if sized is None else SIZED)
         return self._task("page", exam.name, key, make)
 
     def _expected(self, exam: Exam) -> dict[str, str]:
@@ -384,32 +385,32 @@ class Campaign:
 
     def _by_repeatability(self, settings: Settings, normalise: str) -> Settings:
         """Settings with the learned repeatability, where it is for the calibration that they lead to."""
-        found = self.repeatability
-        if found is None or self._calibration_digest(settings.calibration_name or default_for(normalise)) != (
-            found.calibration_sha256
+        learned = self.repeatability
+        if learned is None or self._calibration_digest(settings.calibration_name or default_for(normalise)) != (
+            learned.calibration_sha256
         ):
             return settings
-        return replace(settings, repeatability=found)
+        return replace(settings, repeatability=learned)
 
     def _pool(self, sound: Sequence[Exam]) -> None:
         """Pool every mass at every visit from the exams that were estimated."""
         groups: dict[str, list[Exam]] = defaultdict(list)
-        for exam in self._estimated(sound):
+        for exam in self._with_estimate(sound):
             groups[exam.of_mass].append(exam)
-        self._of_masses("pool", groups, self._pool_task, masses=len({exam.of_mass for exam in sound}))
+        self._run_masses("pool", groups, self._pool_task, masses=len({exam.of_mass for exam in sound}))
 
-    def _of_masses(
-        self, step: str, found: Mapping[str, _Any], task_of: Callable[[str, _Any], steps.Task], *, masses: int
+    def _run_masses(
+        self, step: str, inputs: Mapping[str, _Any], task_of: Callable[[str, _Any], steps.Task], *, masses: int
     ) -> None:
         """Run a step for the masses that have what it needs, out of so many."""
-        known = {} if self._sizes_unknown else found
+        known = {} if self._sizes_unknown else inputs
         for names in _blocks(list(known), self._block):
             self._run(step, [task_of(name, known[name]) for name in names], of=len(names))
             self._copy(_KINDS[step], names, made_by=(step,))
         for one in (step, "copy") if self.settings.copy_to else (step,):
             self._run(one, [], of=masses - len(known))
 
-    def _not_over_bodies(self) -> str:
+    def _unpoolable(self) -> str:
         """Which calibration cannot size several maps together; empty for none."""
         for name in {self.settings.of(exam).size_calibration for exam in self.exams} - {None}:
             path = size_calibration_path(str(name))
@@ -418,11 +419,11 @@ class Campaign:
         return ""
 
     def _pool_task(self, name: str, exams: Sequence[Exam]) -> steps.Task:
-        settings, key = self._of_one_mass(exams)
+        settings, key = self._shared_settings(exams)
         make = partial(steps.make_pool, self.folder / EXAMS, [exam.name for exam in exams], settings)
         return self._task("pool", name, key, make)
 
-    def _of_one_mass(self, exams: Sequence[Exam]) -> tuple[Settings, dict[str, Any]]:
+    def _shared_settings(self, exams: Sequence[Exam]) -> tuple[Settings, dict[str, Any]]:
         """Settings by which exams are sized together, and all that the result depends on."""
         normalise = self._normalise(exams[0])
         settings = replace(self.settings.of(exams[0]), centre_mm=self.settings.estimate.centre_mm)
@@ -431,7 +432,7 @@ class Campaign:
         return settings, {"exams": files, **self._settings_key(settings, normalise)}
 
     def _compare_task(self, name: str, visits: Visits) -> steps.Task:
-        settings, key = self._of_one_mass([exam for exams in visits.values() for exam in exams])
+        settings, key = self._shared_settings([exam for exams in visits.values() for exam in exams])
         dates = tuple("" if day is None else day.isoformat() for day in visit_dates(visits).values())
         first = next(iter(visits.values()))[0]
         course = Course("", "", first.patient, first.side or "", first.mass, tuple(visits), dates if any(dates) else ())

@@ -21,7 +21,7 @@ from tactile_bayes.api.pooled import pool_answers
 from tactile_bayes.api.repeatability import ExamFolder, learn_from_exams
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
-from tactile_bayes.campaigns.exams import ARRAYS, OWN_AXES, Match, map_of_exam, matched
+from tactile_bayes.campaigns.exams import ARRAYS, OWN_AXES, Match, estimate_matched, map_of_exam
 from tactile_bayes.declarations import EXACT, Record, field, from_plain, replace, rounded, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files import manifest_csv as layout
@@ -42,8 +42,7 @@ from tactile_bayes.options import CampaignOptions, CompareOptions, MapOptions
 from tactile_bayes.report.estimate_document import side_of, size_diagnostics
 from tactile_bayes.report.estimate_figures import draw_map, draw_size
 from tactile_bayes.report.exam_page import exam_page
-from tactile_bayes.report.exam_words import Exam as ShownExam
-from tactile_bayes.report.exam_words import Given, exam_map
+from tactile_bayes.report.exam_words import PageLabels, ShownExam, exam_map
 from tactile_bayes.report.growth_page import Course, DrawnMap, draw_comparison, growth_page
 from tactile_bayes.report.svg import thumbnail_svg
 from tactile_bayes.size.bodies import BodyCalibration
@@ -75,12 +74,12 @@ class CampaignSettings(CampaignOptions, kw_only=True):
 
     def of(self, exam: Exam) -> Settings:
         """Settings of one exam's estimate."""
-        given: dict[str, Any] = {
+        of_row: dict[str, Any] = {
             "centre_mm": exam.centre_mm,
             "size_calibration": exam.calibration,
             "known": exam.known or None,
         }
-        return replace(self.estimate, **{name: value for name, value in given.items() if value is not None})
+        return replace(self.estimate, **{name: value for name, value in of_row.items() if value is not None})
 
 
 # --- The way of a step's files to their place: a worker writes them beside it, and the command puts them there.
@@ -182,17 +181,17 @@ def run_step(task: Task) -> Result:
     """
     begun, begun_cpu = time.perf_counter(), time.thread_time()
     try:
-        found, writes = task.make()
+        facts, writes = task.make()
     except BadDataError as error:
         raise BadDataError(error.what, way_out=error.way_out) from None
-    if UNWRITTEN in found:
-        return found
+    if UNWRITTEN in facts:
+        return facts
     try:
-        made = _write_staged(task, writes)
+        staged = _write_staged(task, writes)
     except (UsageError, OSError) as error:
         return {UNWRITTEN: str(error)}
     spent = {"seconds": time.perf_counter() - begun, "cpu_seconds": time.thread_time() - begun_cpu}
-    return {**made, **{name: round(one, 3) for name, one in spent.items()}, **found}
+    return {**staged, **{name: round(one, 3) for name, one in spent.items()}, **facts}
 
 
 def make_map(
@@ -210,7 +209,7 @@ def make_map(
         raise BadDataError("changed while the campaign ran", way_out="run the campaign again")
     kind, arrays = kind_of(source), source.suffix.lower() in ARRAYS
     if kind == _A_MAP and not arrays:
-        return _given_map(source, expected)
+        return _copy_map(source, expected)
     writes: Writes = {}
     if kind == _ARRAYS or arrays:
         scan = read_arrays(source)
@@ -228,14 +227,14 @@ def make_map(
     return {"scans": [facts], "synthetic": simulated, "normalise": normalise}, writes
 
 
-def _given_map(source: Path, expected: Mapping[str, str]) -> Made:
+def _copy_map(source: Path, expected: Mapping[str, str]) -> Made:
     """A map that was made before, byte for byte."""
     tactile_map, scans = read_map_and_scans(source)
     for facts in scans:
         check_facts(expected, facts)
     data = read_bytes(source, most=NETCDF_BYTES)
-    found = {"scans": list(scans), "synthetic": None, "normalise": tactile_map.recipe.normalise}
-    return found, {layout.MAP: lambda path: write_bytes(path, data, force=True)}
+    result = {"scans": list(scans), "synthetic": None, "normalise": tactile_map.recipe.normalise}
+    return result, {layout.MAP: lambda path: write_bytes(path, data, force=True)}
 
 
 def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
@@ -250,46 +249,46 @@ def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
     if not differs:
         return
     shown = list(dict.fromkeys([*(name for name in ("patient", "side") if name in both), *differs]))
-    here, there = (", ".join(f"{name} {one[name]}" for name in shown) for one in (expected, both))
+    in_table, in_file = (", ".join(f"{name} {one[name]}" for name in shown) for one in (expected, both))
     way_out = "is it another exam's file? correct the row or the file"
-    raise BadDataError(f"the table says {here}; the file says {there}", way_out=way_out)
+    raise BadDataError(f"the table says {in_table}; the file says {in_file}", way_out=way_out)
 
 
 def make_estimate(folder: Path, settings: Settings, match: Match | None) -> Made:
     """The estimate, the draws of its size and what pools and sizes by the site start from."""
-    found = _estimated(folder, settings, match)
-    answer = found.answer
+    estimate = _estimate_exam(folder, settings, match)
+    answer = estimate.answer
     report, shape = answer.report.checked(), answer.shape
     writes: Writes = {layout.ESTIMATE: lambda path: write_text(path, json_text(report), force=True)}
-    if found.status == "estimate":
-        writes[layout.POSTERIOR] = lambda path: found.write(path, force=True)
+    if estimate.status == "estimate":
+        writes[layout.POSTERIOR] = lambda path: estimate.write(path, force=True)
     if shape is not None:
         writes[layout.SHAPE] = lambda path: write_shape(path, shape, force=True)
     return {"exit_code": answer.exit_code}, writes
 
 
-def _estimated(folder: Path, settings: Settings, match: Match | None) -> SizeEstimate:
+def _estimate_exam(folder: Path, settings: Settings, match: Match | None) -> SizeEstimate:
     """The exam's estimate: of the mass that its row names, where other exams have it."""
     if match is None:
         return estimate_file(folder / layout.MAP, settings)
-    found = matched(folder / layout.MAP, settings, match)
-    maps = (found.tactile_map, *(map_of_exam(folder / layout.MAP, one) for one in match.named))
-    if all(one.patient_from_plane is not None for one in maps):
-        return found
-    findings = by_severity((*found.estimate.findings, OWN_AXES))
-    return replace(found, estimate=replace(found.estimate, findings=findings))
+    estimate = estimate_matched(folder / layout.MAP, settings, match)
+    tactile_maps = (estimate.tactile_map, *(map_of_exam(folder / layout.MAP, one) for one in match.named))
+    if all(one.patient_from_plane is not None for one in tactile_maps):
+        return estimate
+    findings = by_severity((*estimate.estimate.findings, OWN_AXES))
+    return replace(estimate, estimate=replace(estimate.estimate, findings=findings))
 
 
 def make_figures(folder: Path, settings: Settings, match: Match | None) -> Made:
     """The figures of `estimate`; the estimate is made again, for it is not stored whole."""
-    found = _estimated(folder, settings, match)
-    tactile_map, estimate, report = found.tactile_map, found.estimate, found.answer.report
+    sized = _estimate_exam(folder, settings, match)
+    tactile_map, estimate, report = sized.tactile_map, sized.estimate, sized.answer.report
     name, size, writes = folder.name, estimate.size, Writes()
     if tactile_map.covered.any():
         writes[layout.MAP_FIGURE] = lambda path: draw_map(tactile_map, report, path, name=name, force=True)
     if size is not None:
-        given: dict[str, Any] = {"probability": found.probability, "findings": estimate.findings}
-        writes[layout.SIZE_FIGURE] = lambda path: draw_size(size, path, name=name, force=True, **given)
+        looks: dict[str, Any] = {"probability": sized.probability, "findings": estimate.findings}
+        writes[layout.SIZE_FIGURE] = lambda path: draw_size(size, path, name=name, force=True, **looks)
     return {}, writes
 
 
@@ -299,11 +298,11 @@ def make_page(folder: Path, expected: Mapping[str, str], *, report: str) -> Made
     The table tells what the scans do not.
     """
     tactile_map, scans = read_map_and_scans(folder / layout.MAP)
-    told = {layout.SAME_IN_SCANS[name]: text for name, text in expected.items() if name in layout.SAME_IN_SCANS}
-    facts = [told | scan for scan in scans or [{}]]
+    from_table = {layout.SAME_IN_SCANS[name]: text for name, text in expected.items() if name in layout.SAME_IN_SCANS}
+    facts = [from_table | scan for scan in scans or [{}]]
     shown = exam_map(tactile_map, read_record(folder / report, EstimateReport), side=side_of(facts))
     title = f"Tactile exam {expected['replicate']}"
-    page = exam_page(ShownExam((shown,), None, facts, Given(title, day=expected.get("date", ""))))
+    page = exam_page(ShownExam((shown,), None, facts, PageLabels(title, day=expected.get("date", ""))))
     writes: Writes = {layout.EXAM_PAGE: lambda path: write_text(path, page, force=True)}
     if tactile_map.covered.any():
         picture = thumbnail_svg(shown, label=f"Map of {folder.name}")
@@ -314,11 +313,11 @@ def make_page(folder: Path, expected: Mapping[str, str], *, report: str) -> Made
 def make_pool(folder: Path, names: Sequence[str], settings: Settings) -> Made:
     """Pool exams of a mass as `estimate --pool` does, from what their estimates left in their folders below this."""
     answers = [_answer(folder / name) for name in names]
-    found = pool_answers(answers, settings, names=names, files=[folder / name / layout.MAP for name in names])
-    report = found.pooled_report.checked()
+    pooled = pool_answers(answers, settings, names=names, files=[folder / name / layout.MAP for name in names])
+    report = pooled.pooled_report.checked()
     writes: Writes = {layout.POOLED: lambda path: write_text(path, json_text(report), force=True)}
-    if found.pooled.size is not None:
-        writes[layout.POOLED_DRAWS] = lambda path: found.write(path, force=True)
+    if pooled.pooled.size is not None:
+        writes[layout.POOLED_DRAWS] = lambda path: pooled.write(path, force=True)
     return {}, writes
 
 
@@ -331,26 +330,26 @@ def make_growth(
     them.
     """
     answers = [[_answer(folder / name) for name in names] for names in visits]
-    found = [one for maps in answers for one in maps if one.shape is not None]
-    placed = all(one.report.centre_patient_mm is not None for one in found)
+    with_draws = [one for maps in answers for one in maps if one.shape is not None]
+    placed = all(one.report.centre_patient_mm is not None for one in with_draws)
     files = [[folder / name / layout.MAP for name in names] for names in visits]
     dates = [date.fromisoformat(day) for day in course.dates if day]
     days = tuple(float((day - dates[0]).days) for day in dates) if len(dates) == len(visits) else None
     comparing = CompareOptions(days=days, same_mass=not placed)
     compared = compare_answers(answers, settings, comparing, names=visits, files=files)
     report = compared.report.checked()
-    drawn = [
+    drawn_maps = [
         [DrawnMap(read_map(path), one.report) for path, one in zip(paths, maps, strict=True)]
         for paths, maps in zip(files, answers, strict=True)
     ]
-    page = growth_page(compared.compared, report, drawn, course)
+    page = growth_page(compared.compared, report, drawn_maps, course)
     writes: Writes = {
         layout.COMPARED: lambda path: write_text(path, json_text(report), force=True),
         layout.GROWTH_PAGE: lambda path: write_text(path, page, force=True),
     }
     if figures and compared.compared.joint is not None:
         writes[layout.COMPARED_FIGURE] = lambda path: draw_comparison(
-            compared.compared, report, drawn, path, force=True
+            compared.compared, report, drawn_maps, path, force=True
         )
     return {}, writes
 
@@ -386,10 +385,10 @@ NOT_LEARNED: Final = "not_learned"  #: Key of the reason in the result of a step
 _ANOTHER_STREAM: Final = 1  #: Of random numbers: the sizes' points must not be those that drew the map's posterior.
 
 
-def taught_by(exams: Iterable[Exam], settings: CampaignSettings) -> int:
+def count_repeated_masses(exams: Iterable[Exam], settings: CampaignSettings) -> int:
     """Count the masses with several exams at one visit, which may teach the spread; 0 where none is wanted."""
-    given = settings.estimate
-    if not settings.own_repeatability or given.repeatability or given.between_map_sd is not None:
+    estimate = settings.estimate
+    if not settings.own_repeatability or estimate.repeatability or estimate.between_map_sd is not None:
         return 0
     count = Counter((exam.patient, exam.mass, exam.of_mass) for exam in exams)
     return len({(patient, mass) for (patient, mass, _), number in count.items() if number > 1})
@@ -418,33 +417,33 @@ def make_size(folder: Path, settings: Settings, *, figures: bool) -> Made:
     shape = replace(read_shape(folder / layout.SHAPE), turn_rad=0.0)
     rng = np.random.default_rng([settings.seed, tactile_map.fingerprint, _ANOTHER_STREAM])
     size = size_alone(shape, calibration=calibration, priors=size_priors(settings), rng=rng)
-    sized = _resized(report, size, settings).checked()
+    sized = _with_sizes(report, size, settings).checked()
     writes: Writes = {layout.SIZED: lambda path: write_text(path, json_text(sized), force=True)}
     if figures:
-        given: dict[str, Any] = {"probability": settings.interval, "findings": sized.findings}
-        writes[layout.SIZED_FIGURE] = lambda path: draw_size(size, path, name=folder.name, force=True, **given)
+        looks: dict[str, Any] = {"probability": settings.interval, "findings": sized.findings}
+        writes[layout.SIZED_FIGURE] = lambda path: draw_size(size, path, name=folder.name, force=True, **looks)
     return {}, writes
 
 
-def _resized(report: EstimateReport, size: SizePosterior, settings: Settings) -> EstimateReport:
+def _with_sizes(report: EstimateReport, size: SizePosterior, settings: Settings) -> EstimateReport:
     """The estimate with the sizes, their sources and their provenance replaced."""
-    found = settings.repeatability
-    assert found is not None
-    own: dict[str, Any] = {name: size.summarise(name, probability=settings.interval).rounded for name in SIZES}
-    own["another_exam"] = None
-    diagnostics = {**report.diagnostics, **size_diagnostics(size), "repeatability": found.words()}
+    repeatability = settings.repeatability
+    assert repeatability is not None
+    replaced: dict[str, Any] = {name: size.summarise(name, probability=settings.interval).rounded for name in SIZES}
+    replaced["another_exam"] = None
+    diagnostics = {**report.diagnostics, **size_diagnostics(size), "repeatability": repeatability.words()}
     diagnostics["convergence"] = {
         name: value for name, value in diagnostics.get("convergence", {}).items() if name not in SIZES
     }
     if not diagnostics["convergence"]:
         del diagnostics["convergence"]
     provenance = dict(report.provenance)
-    provenance["settings"] = {**provenance["settings"], "repeatability": found.as_dict()}
-    provenance["inputs"] = [*provenance["inputs"], {"role": "repeatability", "sha256": found.sha256}]
+    provenance["settings"] = {**provenance["settings"], "repeatability": repeatability.as_dict()}
+    provenance["inputs"] = [*provenance["inputs"], {"role": "repeatability", "sha256": repeatability.sha256}]
     return replace(
         report,
-        **own,
-        masses=tuple(replace(one, **own) if one.reported else one for one in report.masses),
+        **replaced,
+        masses=tuple(replace(one, **replaced) if one.reported else one for one in report.masses),
         variance_share=rounded(dict(size.variance_share)),
         diagnostics=diagnostics,
         provenance=provenance,

@@ -73,7 +73,7 @@ def repeatability_text(site: RepeatabilityFile) -> str:
         if one.name in site.outlying
     ]
     lead = "CAUTION: exams lie further apart than the other masses lead one to expect; look at the maps of"
-    lines = _names(lead, apart)
+    lines = _names_lines(lead, apart)
     if site.masses < FEW:
         lines.append(f"CAUTION: {site.masses} masses are few; the interval of the spread is wide.")
     lines += [
@@ -86,12 +86,12 @@ def repeatability_text(site: RepeatabilityFile) -> str:
     if (half := site.half_width) is not None:
         ends = f"about +-{100 * half.with_it:.0f} % of the size with it, +-{100 * half.as_estimated:.0f} %"
         lines.append(f"The 95 % interval of one exam: {ends} as estimated.")
-    lines += _names("Took no part", site.left_out)
+    lines += _names_lines("Took no part", site.left_out)
     lines.append("Use it: tactile-bayes estimate MAP.nc --repeatability SITE.json")
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
-def _names(lead: str, texts: Sequence[str]) -> list[str]:
+def _names_lines(lead: str, texts: Sequence[str]) -> list[str]:
     more = f" and {len(texts) - _MOST_NAMED} more" if len(texts) > _MOST_NAMED else ""
     return [f"{lead}: {'; '.join(texts[:_MOST_NAMED])}{more}."] if texts else []
 
@@ -222,9 +222,9 @@ def calibration_text(calibration: SizeCalibration, *, not_left_out: str = "", ot
     `not_left_out`: why the table's geometries could not be left out in turn, where that is so; `other_fit`: what the
     other of the two fits makes of the same rows.
     """
-    how = "two-stage fit as printed +- SD of a bootstrap" if calibration.in_two_stages else "posterior mean +- SD"
-    lines = [] if calibration.left_out is None else _left_out(calibration.left_out)
-    lines.append(f"Eq 6: d = m sigma / (e a^f) + b, {how}")
+    method = "two-stage fit as printed +- SD of a bootstrap" if calibration.in_two_stages else "posterior mean +- SD"
+    lines = [] if calibration.left_out is None else _left_out_lines(calibration.left_out)
+    lines.append(f"Eq 6: d = m sigma / (e a^f) + b, {method}")
     both = calibration.axes == ("both",)
     axes = [("both axes", calibration.x)] if both else [("across, x", calibration.x), ("along, y", calibration.y)]
     columns = [[name, *_column(axis)] for name, axis in axes]
@@ -245,23 +245,23 @@ def calibration_text(calibration: SizeCalibration, *, not_left_out: str = "", ot
     if calibration.left_out is None and not_left_out:
         lines.append(f"leave one geometry out: not known, {not_left_out}")
     recipe = calibration.recipe
-    how = "declared" if recipe.declared else "as the maps were made here"
-    lines.append(f"recipe ({how}): {recipe}")
+    method = "declared" if recipe.declared else "as the maps were made here"
+    lines.append(f"recipe ({method}): {recipe}")
     lines.append(f"for maps made with {recipe.map_command}, on which `estimate` fits by this recipe itself")
     lines += [f"CAUTION: {text}" for text in calibration.cautions]
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
-def _left_out(errors: LeftOutErrors) -> list[str]:
+def _left_out_lines(errors: LeftOutErrors) -> list[str]:
     """Cross-validated mean absolute error of both forms, by both widths and by each."""
     names = {"both": "", "x": "by the width across alone, ", "y": "by the width along alone, "}
-    said = [
+    parts = [
         f"{words}Eq 6 {100 * errors.eq6[widths]:.1f} %, log-quadratic {100 * errors.log_quadratic[widths]:.1f} %"
         for widths, words in names.items()
         if widths in errors.eq6
     ]
     which = f"{errors.cases} cases of E2/E1 >= {errors.least_stiffness_ratio:g}"
-    return [f"leave one geometry out: {said[0]} of d ({errors.geometries} geometries, {which})", *said[1:]]
+    return [f"leave one geometry out: {parts[0]} of d ({errors.geometries} geometries, {which})", *parts[1:]]
 
 
 def _column(axis: AxisCalibration) -> Iterator[str]:

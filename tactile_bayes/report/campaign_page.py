@@ -64,7 +64,7 @@ class VisitEntry(Record, eq=False):
     why: str = ""  #: Why there is no size; empty where there is one.
 
 
-class MassRow(Record, eq=False):
+class MassEntry(Record, eq=False):
     """One mass of a patient."""
 
     patient: str
@@ -96,7 +96,7 @@ class MassRow(Record, eq=False):
         return FAILED if all(exam.failed for exam in self.last.exams) else UNSIZED
 
     @property
-    def told(self) -> Iterator[tuple[str, str]]:
+    def remarks(self) -> Iterator[tuple[str, str]]:
         """Severity and text of each finding, once, with the exams that it is of where it is not of all.
 
         What speaks against the comparison of the visits comes after what speaks against exams, and not again.
@@ -142,12 +142,12 @@ WORST_FIRST: Final = (
 )
 
 
-def worst(rows: Iterable[MassRow], most: int) -> list[MassRow]:
+def worst(rows: Iterable[MassEntry], most: int) -> list[MassEntry]:
     """Up to `most` rows, those to be looked at first before the others; see `WORST_FIRST`."""
     return heapq.nsmallest(most, rows, key=lambda row: (row.badness, row.name))
 
 
-def campaign_html(rows: Sequence[MassRow], *, lines: Sequence[str], links: Mapping[str, str], version: str) -> str:
+def campaign_html(rows: Sequence[MassEntry], *, lines: Sequence[str], links: Mapping[str, str], version: str) -> str:
     """Full page; nothing is loaded but thumbnails beside it, and the only script is its filter and its order.
 
     `rows` are in the order in which they are shown, `lines` the summary in sentences, `links` the files beside the page

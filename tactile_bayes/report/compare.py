@@ -161,7 +161,9 @@ class CompareReport(Report, kw_only=True):
     provenance: dict[str, Any]
 
 
-_ALIKE_ONLY: Final = "if exams repeat as simulated ones do; if they differ as those of patients did, no change is shown"
+_IF_EXAMS_REPEAT: Final = (
+    "if exams repeat as simulated ones do; if they differ as those of patients did, no change is shown"
+)
 """What a verdict rests on where the site has not learned how its own exams repeat."""
 
 
@@ -173,7 +175,7 @@ def growths(patient: str, mass: str, visits: Sequence[str], report: CompareRepor
     return [
         Growth(
             patient, mass, visits[0], visits[change.later - 1], "compared",
-            _ALIKE_ONLY if change.for_alike_exams_only else "", days=report.visits[change.later - 1].day,
+            _IF_EXAMS_REPEAT if change.for_alike_exams_only else "", days=report.visits[change.later - 1].day,
             sizes_mm=(sizes[0], sizes[change.later - 1]), percent=change.percent,
             verdict=change.verdict, findings=report.findings, link=link,
         )
@@ -183,7 +185,7 @@ def growths(patient: str, mass: str, visits: Sequence[str], report: CompareRepor
 
 # --- The report of a comparison made.
 
-SHOWN: Final = 0.95
+VERDICT_PROBABILITY: Final = 0.95
 """Probability of the interval that leaves out no change where a growth, or a shrinkage, is called one."""
 
 
@@ -227,8 +229,8 @@ def compare_report(
             else VisitPlace(visit, one.distance_mm, one.sd_mm, one.shift_mm, one.probability)
             for visit, one in enumerate(compared.shifts, start=2)
         ),
-        changes=tuple(_change(compared, number, comparing, probability) for number in later),
-        trend=None if joint is None or days is None or len(visits) < 3 else _trend(joint, days, probability),
+        changes=tuple(_change_report(compared, number, comparing, probability) for number in later),
+        trend=None if joint is None or days is None or len(visits) < 3 else _trend_report(joint, days, probability),
         between_map_sd=None if joint is None else joint.between_map_sd,
         repeatability=UNSET if repeatability is None else repeatability.words(),
         left_out=() if joint is None else tuple(joint.calibrations[0].omissions()),
@@ -237,15 +239,17 @@ def compare_report(
     ).rounded
 
 
-def _change(compared: VisitComparison, later: int, comparing: CompareOptions, probability: float) -> ChangeReport:
+def _change_report(
+    compared: VisitComparison, later: int, comparing: CompareOptions, probability: float
+) -> ChangeReport:
     """Change from the first visit to a later one, and if exams of one mass differ as the paper's maps do."""
     joint, another, days = compared.joint, compared.another, comparing.days
     assert joint is not None
-    change, told, rate = joint.change(0, later), None, None
-    growth, shrinkage = change.smallest_detectable(SHOWN)
+    change, another_change, rate = joint.change(0, later), None, None
+    growth, shrinkage = change.smallest_detectable(VERDICT_PROBABILITY)
     if another is not None:
         other = another.change(0, later)
-        told = AnotherChange(another.between_map_sd, other.percent(probability), other.probability_above(0.0))
+        another_change = AnotherChange(another.between_map_sd, other.percent(probability), other.probability_above(0.0))
     if days is not None:
         q, apart = change.log_summary(probability), days[later] - days[0]
         rate = GrowthRate(
@@ -261,13 +265,13 @@ def _change(compared: VisitComparison, later: int, comparing: CompareOptions, pr
         grown_by=tuple(GrownBy(100.0 * share, change.probability_above(share)) for share in comparing.grown_by),
         smallest_detectable_percent=Detectable(100.0 * growth, 100.0 * shrinkage),
         growth_rate=rate,
-        another_exam=told,
+        another_exam=another_change,
     )
 
 
 def verdict(change: Change) -> Literal["grown", "shrunk", "no_change_shown"]:
     """``"grown"`` or ``"shrunk"`` where the 95 % interval leaves out no change, else ``"no_change_shown"``."""
-    q = change.log_summary(SHOWN)
+    q = change.log_summary(VERDICT_PROBABILITY)
     if q.low > 0.0:
         return "grown"
     return "shrunk" if q.high < 0.0 else "no_change_shown"
@@ -280,7 +284,7 @@ def growth_rates(growth: Sequence[float], probability: float) -> tuple[Rate, Dou
     return Rate(median, low, high, probability), times
 
 
-def _trend(joint: JointSizes, days: Sequence[float], probability: float) -> TrendReport:
+def _trend_report(joint: JointSizes, days: Sequence[float], probability: float) -> TrendReport:
     line = straight_line(*joint.moments, days)
     half = float(ndtri(0.5 + probability / 2)) * line.sd
     rates = growth_rates([VOLUME * (line.per_day + one) for one in (0.0, -half, half)], probability)
@@ -311,11 +315,11 @@ def compare_text(report: CompareReport) -> str:
     for change in report.changes:
         lines += [_verdict_line(change), *_change_lines(change), *_rate_lines(change), ""]
     lines += [] if report.trend is None else [*_trend_lines(report.trend), ""]
-    for one in report.visits:
-        lines.append(_visit_line(one))
-        for found in one.maps:
-            told = "lump found" if found.status == "estimate" else f"no estimate ({found.reason})"
-            lines.append(f"  {found.map}: {told}")
+    for visit in report.visits:
+        lines.append(_visit_line(visit))
+        for visit_map in visit.maps:
+            outcome = "lump found" if visit_map.status == "estimate" else f"no estimate ({visit_map.reason})"
+            lines.append(f"  {visit_map.map}: {outcome}")
     for place in report.places:
         lines += _place_line(place, name=len(report.places) > 1)
     lines += finding_lines(report.findings, "check")
@@ -358,8 +362,8 @@ def _refusal(report: CompareReport) -> str:
 
 
 def _visit_line(visit: Visit) -> str:
-    found = sum(one.status == "estimate" for one in visit.maps)
-    maps = f"{found} of {len(visit.maps)} maps" if len(visit.maps) > 1 else "1 map"
+    estimates = sum(one.status == "estimate" for one in visit.maps)
+    maps = f"{estimates} of {len(visit.maps)} maps" if len(visit.maps) > 1 else "1 map"
     day = "" if visit.day is None or visit.visit == 1 else f", day {visit.day:g}"
     head = f"Visit {visit.visit} ({maps}{day})"
     q = visit.max_size_mm
@@ -400,7 +404,7 @@ def _direction(grown: float) -> str:
 
 def _verdict_line(change: ChangeReport) -> str:
     if change.verdict != "no_change_shown":
-        return f"The mass has {change.verdict}{f', {_ALIKE_ONLY}' if change.for_alike_exams_only else ''}."
+        return f"The mass has {change.verdict}{f', {_IF_EXAMS_REPEAT}' if change.for_alike_exams_only else ''}."
     least = change.smallest_detectable_percent
     growth, shrinkage = f"{least.growth:.0f} %", f"{least.shrinkage:.0f} %"
     return f"No change shown; a growth of less than {growth} or a shrinkage of less than {shrinkage} can stay unseen."
@@ -437,6 +441,6 @@ def _site_line(report: CompareReport) -> list[str]:
 def _model_line(report: CompareReport) -> str:
     spread = "" if report.between_map_sd is None else f"exams of a visit differ by {100 * report.between_map_sd:.0f} %"
     known = [one.fat_mm for one in report.visits if one.fat_mm is not None]
-    told = len(known) == len(report.visits)
-    depth = f"; fat under the head {', '.join(f'{one:.1f}' for one in known)} mm deep by visit" if told else ""
+    all_known = len(known) == len(report.visits)
+    depth = f"; fat under the head {', '.join(f'{one:.1f}' for one in known)} mm deep by visit" if all_known else ""
     return f"Model: one body, whose hidden properties cancel in the change; {spread}{depth}."

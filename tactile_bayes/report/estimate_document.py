@@ -45,14 +45,14 @@ def estimate_quantities(estimate: Estimate, tactile_map: TactileMap, *, probabil
         draws |= {"centre_patient_mm.x": in_patient[..., 0], "centre_patient_mm.y": in_patient[..., 1]}
     if estimate.diagnostics.get("rotated"):
         draws["angle_deg"] = np.degrees(posterior.angle_rad)
-    labels, worth = estimate.draws.labels, estimate.draws.effective_draws
-    found = {
-        name: summarise(d, probability=probability, effective_draws=worth, replicates=labels)
+    labels, effective = estimate.draws.labels, estimate.draws.effective_draws
+    quantities = {
+        name: summarise(d, probability=probability, effective_draws=effective, replicates=labels)
         for name, d in draws.items()
     }
     if estimate.size is not None:
-        found |= {name: estimate.size.summarise(name, probability=probability) for name in SIZES}
-    return found
+        quantities |= {name: estimate.size.summarise(name, probability=probability) for name in SIZES}
+    return quantities
 
 
 def another_exam(size: SizePosterior | None, *, probability: float) -> reports.AnotherExam | None:
@@ -140,16 +140,16 @@ def touching_masses(masses: Sequence[SizedMass]) -> tuple[reports.Touching, ...]
     Both lie in one body, so their errors go together: ends of the length are made of the same ends of both sizes. A
     pair touches where the upper ends of its radii reach over the distance of the centres.
     """
-    found = []
-    for (one, here, size), (other, there, beside) in combinations(masses, 2):
-        apart = float(np.hypot(here[0] - there[0], here[1] - there[1]))
-        if apart <= (size.high + beside.high) / 2:
-            ends = zip((size.median, size.low, size.high), (beside.median, beside.low, beside.high), strict=True)
+    pairs = []
+    for (first, centre, size), (second, beside, other) in combinations(masses, 2):
+        distance = float(np.hypot(centre[0] - beside[0], centre[1] - beside[1]))
+        if distance <= (size.high + other.high) / 2:
+            ends = zip((size.median, size.low, size.high), (other.median, other.low, other.high), strict=True)
             # one may lie within the other's outline
-            median, low, high = (max(apart + (a + b) / 2, a, b) for a, b in ends)
+            median, low, high = (max(distance + (a + b) / 2, a, b) for a, b in ends)
             length = reports.Interval(median, low, high, size.probability)
-            found.append(reports.Touching((one, other), apart, length))
-    return tuple(found)
+            pairs.append(reports.Touching((first, second), distance, length))
+    return tuple(pairs)
 
 
 def together_words(pair: reports.Touching) -> str:
@@ -168,7 +168,7 @@ def touching_findings(pairs: Sequence[reports.Touching]) -> list[Finding]:
 
 # --- The scene in the fit window.
 
-ASKED = {
+STRUCTURE_WORDS = {
     "ellipse": "an ellipse, not a circle",
     "rotated": "a rotated ellipse",
     "tilt": "a sloping level",
@@ -176,7 +176,7 @@ ASKED = {
     "rib": "a rib in this window",
     "departure": "a departure from a Gaussian",
 }
-BUMP = {"round": "a round bump", "ellipse": "an ellipse along the head's axes", "rotated": "a rotated ellipse"}
+SHAPE_WORDS = {"round": "a round bump", "ellipse": "an ellipse along the head's axes", "rotated": "a rotated ellipse"}
 LEAST_SHIFT_SD = 0.005  #: A shift by a wider prior below this is not given in figures.
 LEAST_CHANGE_SD = 0.05  #: A change of a width by one more structure below this rounds to none.
 
@@ -185,29 +185,29 @@ def scene_lines(choice: SceneChoice) -> list[str]:
     """Scene of the fit window with odds: structures supported, other structures kept, and those left out."""
 
     def odds(one: Structure) -> str:
-        return f"(odds {odds_text(one)}){_change(one, 'without' if one.used else 'with')}"
+        return f"(odds {odds_text(one)}){_width_changes(one, 'without' if one.used else 'with')}"
 
-    used = _named(choice)
-    names = [BUMP[choice.supported], *(f"{ASKED[one.name]} {one.place}".rstrip() for one in used)]
+    named = _named_structures(choice)
+    names = [SHAPE_WORDS[choice.supported], *(f"{STRUCTURE_WORDS[one.name]} {one.place}".rstrip() for one in named)]
     window = f"the fit window of {choice.fit.target.problem.radius_mm:g} mm about the lump"
     lines = [f"Scene in {window}: {' and '.join(names)}, the simplest that the map supports."]
-    lines += [f"{capitalised(ASKED[one.name])} is in the model {odds(one)}." for one in used]
-    kept = [one for one in choice.structures if one.used and not one.supported and not one.place]
-    lines += [f"Also in the model: {ASKED[one.name]} {odds(one)}." for one in kept]
-    out = [f"{ASKED[one.name]} {odds(one)}" for one in choice.structures if not one.used]
+    lines += [f"{capitalised(STRUCTURE_WORDS[one.name])} is in the model {odds(one)}." for one in named]
+    unnamed = [one for one in choice.structures if one.used and not one.supported and not one.place]
+    lines += [f"Also in the model: {STRUCTURE_WORDS[one.name]} {odds(one)}." for one in unnamed]
+    out = [f"{STRUCTURE_WORDS[one.name]} {odds(one)}" for one in choice.structures if not one.used]
     return [*lines, f"Not in the model: {'; '.join(out)}."] if out else lines
 
 
 def scene_line(choice: SceneChoice) -> str:
     """Scene of the fit window in one line: structures supported, and those not needed."""
-    used = _named(choice)
-    names = [BUMP[choice.supported], *(ASKED[one.name] for one in used)]
+    named = _named_structures(choice)
+    names = [SHAPE_WORDS[choice.supported], *(STRUCTURE_WORDS[one.name] for one in named)]
     near = f" within {choice.fit.target.problem.radius_mm:g} mm"
-    out = [ASKED[one.name].replace(" in this window", near) for one in choice.structures if not one.used]
+    out = [STRUCTURE_WORDS[one.name].replace(" in this window", near) for one in choice.structures if not one.used]
     return f"The map supports {' and '.join(names)}" + (f"; not needed: {', '.join(out)}." if out else ".")
 
 
-def _named(choice: SceneChoice) -> list[Structure]:
+def _named_structures(choice: SceneChoice) -> list[Structure]:
     """Structures to name beside the bump: in the model because the map supports them."""
     return [one for one in choice.structures if one.used and (one.place or (one.name == "tilt" and one.supported))]
 
@@ -221,21 +221,21 @@ def odds_text(one: Structure) -> str:
     return f"{'at most ' if one.bound else ''}{one.odds:.2g} to 1"
 
 
-def _change(one: Structure, word: str) -> str:
+def _width_changes(one: Structure, word: str) -> str:
     if one.change_x_sd is None or one.change_y_sd is None:
         return ""
     changes = {"sigma_x": one.change_x_sd, "sigma_y": one.change_y_sd}
-    told = [f"{name} would change by {by:+.1f} SD" for name, by in changes.items() if abs(by) >= LEAST_CHANGE_SD]
-    return f": {word} it {' and '.join(told) or 'the widths would not change'}"
+    parts = [f"{name} would change by {by:+.1f} SD" for name, by in changes.items() if abs(by) >= LEAST_CHANGE_SD]
+    return f": {word} it {' and '.join(parts) or 'the widths would not change'}"
 
 
-def sensitivity_line(found: Sensitivity) -> str:
+def sensitivity_line(sensitivity: Sensitivity) -> str:
     """Sensitivity of the result to the prior of the widths."""
     names = {"max_size_mm": "the largest size", "sigma_x_mm": "sigma_x", "sigma_y_mm": "sigma_y"}
-    name = next((name for name in names if name in found.median), None)
+    name = next((name for name in names if name in sensitivity.median), None)
     if name is None:
         return ""
-    median, ends = found.median[name], found.ends[name]
+    median, ends = sensitivity.median[name], sensitivity.ends[name]
     if max(abs(median), abs(ends)) < LEAST_SHIFT_SD:
         return f"A width prior twice as wide would move {names[name]} by less than {LEAST_SHIFT_SD:g} SD."
     return (
@@ -288,7 +288,7 @@ def _if_finite(value: float | None) -> float | None:
 # --- How large a lump would be if it were soft, hard, centred on the gland's surface or resting on it: data and text.
 
 LEAST_CHANGE = 0.02  #: Of the size, from which a pair of suppositions is worth a line.
-PAIRS = (
+SUPPOSED_PAIRS = (
     ("the lump soft", "soft", "hard", " ({:g} times as stiff as fat)", " ({:g} times)"),
     ("it centred on the gland's surface", "centred", "resting", "", " on the gland"),
 )
@@ -310,14 +310,14 @@ def suppositions(size: SizePosterior | None, largest: Quantity | None) -> dict[s
 
 def supposed_lines(supposed: Suppositions | None, median_mm: float, *, places: int) -> list[str]:
     """A line for each pair of suppositions that moves the largest size."""
-    found = []
-    for words, first, second, *follow in PAIRS:
-        pair = _pair(supposed, median_mm, (first, second))
+    lines = []
+    for words, first, second, *follow in SUPPOSED_PAIRS:
+        pair = _moving_pair(supposed, median_mm, (first, second))
         if pair:
             values = [after.format(one.value) for after, one in zip(follow, pair, strict=True)]
             sizes = [size_words(one.max_size_mm, places) for one in pair]
-            found.append(f"Were {words}{values[0]}: {sizes[0]}; {second}{values[1]}: {sizes[1]}.")
-    return found
+            lines.append(f"Were {words}{values[0]}: {sizes[0]}; {second}{values[1]}: {sizes[1]}.")
+    return lines
 
 
 def supposed_line(supposed: Suppositions | None, median_mm: float, *, places: int) -> list[str]:
@@ -325,7 +325,7 @@ def supposed_line(supposed: Suppositions | None, median_mm: float, *, places: in
 
     A lump softer than the calibration's may lie above the interval, and nothing on its map says so: the line does.
     """
-    pair = _pair(supposed, median_mm, ("soft", "hard"))
+    pair = _moving_pair(supposed, median_mm, ("soft", "hard"))
     if not pair:
         return []
     (soft, soft_ratio), (hard, hard_ratio) = ((one.max_size_mm.median, one.value) for one in pair)
@@ -336,7 +336,7 @@ def supposed_line(supposed: Suppositions | None, median_mm: float, *, places: in
     return [f"{words}; softer still, larger." if soft > hard else f"{words}."]
 
 
-def _pair(supposed: Suppositions | None, median_mm: float, names: tuple[str, str]) -> list[reports.Supposed]:
+def _moving_pair(supposed: Suppositions | None, median_mm: float, names: tuple[str, str]) -> list[reports.Supposed]:
     """Two suppositions, where one of them at least moves the largest size; empty otherwise."""
     pair = [] if supposed is None else [supposed[name] for name in names if name in supposed]
     moves = any(abs(one.max_size_mm.median / median_mm - 1) >= LEAST_CHANGE for one in pair)
@@ -365,20 +365,21 @@ def _mass_reports(
     scans: Sequence[Mapping[str, str]],
 ) -> tuple[MassReport, ...]:
     """A map's masses, numbered in their order; `quantities` are those of the reported mass."""
-    found = []
+    mass_reports = []
     for number, mass in enumerate(estimate.masses, start=1):
-        own = quantities if mass.reported else estimate_quantities(mass.estimate, tactile_map, probability=probability)
+        alone = mass.estimate
+        summaries = quantities if mass.reported else estimate_quantities(alone, tactile_map, probability=probability)
         place = lump_place(mass.estimate.map_posterior, tactile_map, scans)
         patient = patient_mm(tactile_map, mass.x_mm, mass.y_mm)
         why = estimate.reason if mass.reported else mass.estimate.reason
-        found.append(
+        mass_reports.append(
             MassReport(
                 number=number,
                 reported=mass.reported,
                 centre_mm=reports.Place(mass.x_mm, mass.y_mm),
                 centre_patient_mm=None if patient is None else reports.Place(*patient),
                 detected_probability=mass.probability,
-                **{name: own.get(name) for name in ("amplitude", *SIZES, "angle_deg")},
+                **{name: summaries.get(name) for name in ("amplitude", *SIZES, "angle_deg")},
                 another_exam=another_exam(mass.estimate.size, probability=probability),
                 reason=why if mass.estimate.size is None else "",
                 reason_code=cast("reports.ReasonCode", mass.estimate.code),
@@ -386,7 +387,7 @@ def _mass_reports(
                 position=None if place is None else place.told(probability),
             )
         )
-    return tuple(found)
+    return tuple(mass_reports)
 
 
 def patient_mm(tactile_map: TactileMap, x_mm: float, y_mm: float) -> tuple[float, float] | None:
@@ -397,42 +398,42 @@ def patient_mm(tactile_map: TactileMap, x_mm: float, y_mm: float) -> tuple[float
     return float(x), float(y)
 
 
-def others(masses: Sequence[MassReport]) -> list[MassReport]:
+def other_masses(masses: Sequence[MassReport]) -> list[MassReport]:
     """The masses besides the reported one."""
     return [one for one in masses if not one.reported]
 
 
 def mass_lines(masses: Sequence[MassReport]) -> list[str]:
     """One line per mass besides the reported one: place, size or why there is none, probability."""
-    here = next((one for one in masses if one.reported), None)
-    return [f"Mass {one.number} {mass_words(one, here)}." for one in others(masses)]
+    reported = next((one for one in masses if one.reported), None)
+    return [f"Mass {one.number} {mass_words(one, reported)}." for one in other_masses(masses)]
 
 
-def mass_words(mass: MassReport, here: MassReport | None) -> str:
+def mass_words(mass: MassReport, reported: MassReport | None) -> str:
     """A mass's place, its distance from the reported one, its size or why it has none, and its probability."""
     x, y = mass.centre_mm.x, mass.centre_mm.y
     place = at_place(x, y)
-    if here is not None:
-        away = np.hypot(x - here.centre_mm.x, y - here.centre_mm.y)
-        place += f", {away:.0f} mm from mass {here.number}"
+    if reported is not None:
+        away = np.hypot(x - reported.centre_mm.x, y - reported.centre_mm.y)
+        place += f", {away:.0f} mm from mass {reported.number}"
     if mass.position is not None:
         place += f" ({mass.position.text})"
     size = mass.leading.max_size_mm
     if size is None:
-        told = f"no size: {mass.reason}"
+        outcome = f"no size: {mass.reason}"
     else:
         ends = f"{share_words(size)} interval {size.low:.1f} to {size.high:.1f} mm"
-        told = f"largest size {size.median:.1f} mm ({ends})"
-    if here is not None:
-        for pair in touching_masses(sized_masses([here, mass])):
-            told += f"; may be one lump with mass {here.number}, {together_words(pair)}"
-    return f"{place}: {told}; probability of a lump {chance_text(mass.detected_probability)}"
+        outcome = f"largest size {size.median:.1f} mm ({ends})"
+    if reported is not None:
+        for pair in touching_masses(sized_masses([reported, mass])):
+            outcome += f"; may be one lump with mass {reported.number}, {together_words(pair)}"
+    return f"{place}: {outcome}; probability of a lump {chance_text(mass.detected_probability)}"
 
 
-def numbered(masses: Sequence[MassReport]) -> str:
+def reported_number_words(masses: Sequence[MassReport]) -> str:
     """Which of the masses is reported, in words; empty where it is the only one."""
-    here = next((one for one in masses if one.reported), None)
-    return "" if here is None or len(masses) == 1 else f"Mass {here.number} of {len(masses)}"
+    reported = next((one for one in masses if one.reported), None)
+    return "" if reported is None or len(masses) == 1 else f"Mass {reported.number} of {len(masses)}"
 
 
 # --- The report of a map: what `estimate --json` prints.
@@ -487,7 +488,7 @@ def estimate_report(
     ).rounded
 
 
-def smallest_lump(found: SmallestLumps) -> reports.SmallestLump:
+def smallest_lump(smallest: SmallestLumps) -> reports.SmallestLump:
     """What a map without a lump would have shown, as files have it."""
 
     def row(diameters: FloatArray) -> Any:
@@ -495,11 +496,11 @@ def smallest_lump(found: SmallestLumps) -> reports.SmallestLump:
 
     places = [
         reports.SmallestAt(round(float(x), 3), round(float(y), 3), row(d))
-        for (x, y), d in zip(found.places_mm, found.d_mm, strict=True)
+        for (x, y), d in zip(smallest.places_mm, smallest.d_mm, strict=True)
     ]
-    depths: Any = tuple(round(float(depth), 1) for depth in found.depths_mm)
-    best, worst = row(found.d_mm.min(axis=0)), row(found.d_mm.max(axis=0))
-    return reports.SmallestLump(PROBABILITY, depths, best, worst, round(found.spacing_mm, 3), tuple(places))
+    depths: Any = tuple(round(float(depth), 1) for depth in smallest.depths_mm)
+    best, worst = row(smallest.d_mm.min(axis=0)), row(smallest.d_mm.max(axis=0))
+    return reports.SmallestLump(PROBABILITY, depths, best, worst, round(smallest.spacing_mm, 3), tuple(places))
 
 
 def size_diagnostics(size: SizePosterior) -> dict[str, Any]:
@@ -507,8 +508,8 @@ def size_diagnostics(size: SizePosterior) -> dict[str, Any]:
     return _finite({"invalid_draws": size.invalid, **size.figures})
 
 
-def _finite(found: Mapping[str, Any]) -> dict[str, Any]:
+def _finite(values: Mapping[str, Any]) -> dict[str, Any]:
     return {
         name: (rounded(value) if math.isfinite(value) else None) if isinstance(value, float) else value
-        for name, value in found.items()
+        for name, value in values.items()
     }

@@ -44,28 +44,28 @@ def draw_fit(tactile_map: TactileMap, estimate: Estimate, path: Path | None, *, 
     """
     fitted = fitted_cells(estimate)
     assert fitted is not None
-    two = fitted.shared is not None
-    given = [fitted.cells.value, fitted.fit, *([] if fitted.shared is None else [fitted.shared]), fitted.residual]
-    window, (value, fit, *left) = _window(tactile_map, fitted.cells, given)
+    has_shared = fitted.shared is not None
+    layers = [fitted.cells.value, fitted.fit, *([] if fitted.shared is None else [fitted.shared]), fitted.residual]
+    window, (value, fit, *left) = _window(tactile_map, fitted.cells, layers)
     low, high = (float(end) for end in np.nanquantile(np.stack([value, fit]), _ENDS))
-    most = max(float(np.nanquantile(np.abs(left), _ENDS[1])), 1e-12)
+    limit = max(float(np.nanquantile(np.abs(left), _ENDS[1])), 1e-12)
     rest = fitted.residual
     words = f"Rest, SD {rest.std():.2g}, {100 * np.mean(rest > 0):.0f} % of cells above 0"
-    size_in, foot = ((10.0, 7.9), _SHARED) if two else ((12.8, 4.1), _ALONE)
+    size_in, foot = ((10.0, 7.9), _SHARED) if has_shared else ((12.8, 4.1), _ALONE)
     with figure_file(path, size_in=size_in, foot=foot, force=force, findings=estimate.findings) as figure:
-        panels = figure.subplots(*((2, 2) if two else (1, 3))).ravel()
+        panels = figure.subplots(*((2, 2) if has_shared else (1, 3))).ravel()
         for axes, values, title in ((panels[0], value, "Data"), (panels[1], fit, "Fit")):
             looks = {"label": tactile_map.recipe.value_words, "title": title, "cmap": "viridis"}
             draw_panel(axes, values, window, **looks, vmin=low, vmax=high)
-        titles = [*(["Shared by neighbours"] if two else []), words]
+        titles = [*(["Shared by neighbours"] if has_shared else []), words]
         for axes, values, title in zip(panels[2:], left, titles, strict=True):
-            draw_panel(axes, values, window, label="data less fit", title=title, cmap="RdBu_r", vmin=-most, vmax=most)
+            draw_panel(axes, values, window, label="data less fit", title=title, cmap="RdBu_r", vmin=-limit, vmax=limit)
         figure.suptitle(f"Fit: {name}", x=0.01, ha="left", fontsize=11)
     return figure
 
 
 def _window(
-    tactile_map: TactileMap, cells: FitCells, given: Sequence[FloatArray]
+    tactile_map: TactileMap, cells: FitCells, layers: Sequence[FloatArray]
 ) -> tuple[TactileMap, list[FloatArray]]:
     """The map cut to the window, and values of the window's cells on its grid, NaN outside the window."""
     rows, columns = cells.row, cells.column
@@ -78,7 +78,7 @@ def _window(
         x_mm=tactile_map.x_mm[part[1]],
         y_mm=tactile_map.y_mm[part[0]],
     )
-    inside, *grids = cells.on_grid(np.stack([np.ones(len(cells)), *given]))
+    inside, *grids = cells.on_grid(np.stack([np.ones(len(cells)), *layers]))
     return cut, [np.where(inside > 0, grid, np.nan) for grid in grids]
 
 

@@ -23,7 +23,7 @@ from tactile_bayes.size.draws import EXTREMES, SIZES
 def smallest_text(smallest: SmallestLump) -> str:
     """What would have shown, by depth, where the map is best and where it is worst; without a full stop."""
     ends = zip(smallest.depths_mm, smallest.best_mm, smallest.worst_mm, strict=True)
-    told = []
+    ranges = []
     for depth, best, worst in ends:
         if best is None:
             across = "more than 30 mm"
@@ -31,11 +31,11 @@ def smallest_text(smallest: SmallestLump) -> str:
             across = f"{best:.3g} to more than 30 mm"
         else:
             across = f"{best:.3g} mm" if best == worst else f"{best:.3g} to {worst:.3g} mm"
-        told.append(f"{across} at a depth of {depth:g} mm")
+        ranges.append(f"{across} at a depth of {depth:g} mm")
     of_100 = f"{100 * smallest.probability:g} times of 100"
     return (
         f"In this map a round lump would have been seen ({of_100}) from these diameters on, by where it lies: "
-        f"{'; '.join(told)} (of its middle)"
+        f"{'; '.join(ranges)} (of its middle)"
     )
 
 
@@ -174,19 +174,23 @@ LEAST_SHARE = 0.005  #: Of the width variance, below which the tracker's share i
 def estimate_text(estimate: Estimate, report: EstimateReport) -> str:
     """Full report of one map: sizes with intervals, sources of uncertainty, omissions; `report` is the estimate's."""
     if estimate.status == "no_estimate":
-        lines = [*finding_lines(report.findings), *_no_estimate(report), *estimate_document.mass_lines(report.masses)]
-        return "\n".join([*lines, *passed_over(estimate), RESEARCH_USE]) + "\n"
-    lines = [*finding_lines(report.findings, "caution"), *size_table(report), "", *_no_size(report)]
+        lines = [
+            *finding_lines(report.findings),
+            *_no_estimate_lines(report),
+            *estimate_document.mass_lines(report.masses),
+        ]
+        return "\n".join([*lines, *passed_over_lines(estimate), RESEARCH_USE]) + "\n"
+    lines = [*finding_lines(report.findings, "caution"), *size_table(report), "", *_no_size_lines(report)]
     if report.position is not None:
         lines.append(estimate_document.place_line(report.position))
-    lines += _findings(estimate, report)
+    lines += _detail_lines(estimate, report)
     if estimate.scene is not None:
         lines += estimate_document.scene_lines(estimate.scene)
-        if beside := " and ".join(str(one.number) for one in estimate_document.others(report.masses)):
+        if beside := " and ".join(str(one.number) for one in estimate_document.other_masses(report.masses)):
             lines.append(f"These odds are of this window alone: mass {beside} of the map is above.")
     if estimate.sensitivity is not None and (by_prior := estimate_document.sensitivity_line(estimate.sensitivity)):
         lines.append(by_prior)
-    lines += [*finding_lines(report.findings, "check"), *passed_over(estimate)]
+    lines += [*finding_lines(report.findings, "check"), *passed_over_lines(estimate)]
     lines += [f"Left out: {'; '.join(report.left_out)}."] if report.left_out else []
     lines.append(estimate_document.prior_line(from_plain(BumpPrior, report.prior), field=estimate.scene is not None))
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
@@ -194,11 +198,11 @@ def estimate_text(estimate: Estimate, report: EstimateReport) -> str:
 
 def no_estimate_line(reason: str) -> str:
     """First line of a report without an estimate."""
-    told = reason.startswith(("no lump found", "the data cannot show"))
-    return f"{capitalised(reason)}." if told else f"No estimate: {reason}."
+    whole_sentence = reason.startswith(("no lump found", "the data cannot show"))
+    return f"{capitalised(reason)}." if whole_sentence else f"No estimate: {reason}."
 
 
-def _no_estimate(report: EstimateReport) -> list[str]:
+def _no_estimate_lines(report: EstimateReport) -> list[str]:
     """Why there is no estimate, what a map without a lump would have shown, and what would help.
 
     Where a finding is the reason, its own line above has it and its remedy.
@@ -207,15 +211,15 @@ def _no_estimate(report: EstimateReport) -> list[str]:
     for one in report.findings:
         if report.reason.endswith(f": {one.text}"):
             return [no_estimate_line(report.reason.removesuffix(f": {one.text}")), *smallest]
-    return [no_estimate_line(report.reason), *smallest, *_advice(report)]
+    return [no_estimate_line(report.reason), *smallest, *_advice_lines(report)]
 
 
-def _no_size(report: EstimateReport) -> list[str]:
+def _no_size_lines(report: EstimateReport) -> list[str]:
     """Why there is no size, and what would help; empty where there is one."""
-    return [f"No size: {report.reason}.", *_advice(report)] if report.reason else []
+    return [f"No size: {report.reason}.", *_advice_lines(report)] if report.reason else []
 
 
-def _advice(report: EstimateReport) -> list[str]:
+def _advice_lines(report: EstimateReport) -> list[str]:
     return [f"What would help: {report.advice}."] if report.advice else []
 
 
@@ -240,27 +244,27 @@ def size_table(report: EstimateReport | PooledReport, shown: Collection[str] = _
     Where sizes have two intervals that for exams of patients leads, and the narrower one of the largest size follows,
     with the spread of the exams that it is for.
     """
-    found = {name: quantity for name, quantity in _quantities(report).items() if name in shown}
-    probability = next(iter(found.values())).probability
+    quantities = {name: quantity for name, quantity in _quantities(report).items() if name in shown}
+    probability = next(iter(quantities.values())).probability
     rows = [f"{'':28}{'median':>9}   {100 * probability:g} % interval (equal-tailed)"]
-    of_sizes = size_decimals([found[name] for name in SIZES if name in found])
+    of_sizes = size_decimals([quantities[name] for name in SIZES if name in quantities])
     for name, label, unit in ROWS:
-        if name not in found or (name == "min_size_mm" and ANOTHER_SMALLEST in found):
+        if name not in quantities or (name == "min_size_mm" and ANOTHER_SMALLEST in quantities):
             continue
-        if name == "max_size_mm" and ANOTHER_LARGEST in found:
+        if name == "max_size_mm" and ANOTHER_LARGEST in quantities:
             label = exams_label(report.figures.get("between_map_sd"))
-        q = found[name]
+        q = quantities[name]
         places = of_sizes if name in (*SIZES, ANOTHER_LARGEST, ANOTHER_SMALLEST) else decimals(q.mc_error)
         interval = f"{q.low:.{places}f} to {q.high:.{places}f} {unit}".rstrip()
         rows.append(f"{label:28}{q.median:>9.{places}f}   {interval}")
     return rows
 
 
-def _findings(estimate: Estimate, report: EstimateReport) -> list[str]:
+def _detail_lines(estimate: Estimate, report: EstimateReport) -> list[str]:
     lines, figures, largest, draws = [], report.diagnostics, report.max_size_mm, estimate.draws
     assert draws is not None  # as with every estimate
     if report.detected_probability is not None:
-        which = f"{number}. " if (number := estimate_document.numbered(report.masses)) else ""
+        which = f"{number}. " if (number := estimate_document.reported_number_words(report.masses)) else ""
         prior = f"where {100 * SHARE_WITH_LUMP:g} % of exams hold one"
         lines.append(f"{which}Probability of a lump: {chance_text(report.detected_probability)}, {prior}.")
     lines += estimate_document.mass_lines(report.masses)
@@ -303,10 +307,10 @@ def tracker_share(diagnostics: Mapping[str, Any]) -> str:
 def method_line(draws: ParameterDraws, quantities: Mapping[str, Quantity]) -> str:
     """Method, Monte-Carlo error of the printed interval ends, and the method's diagnostics."""
     parts = []
-    for what, names in (("sizes", EXTREMES), ("widths", WIDTHS)):
+    for kind, names in (("sizes", EXTREMES), ("widths", WIDTHS)):
         if names[0] in quantities:
             worst = max((quantities[name] for name in names), key=lambda one: one.mc_error)
-            parts.append(ends_text(what, worst.mc_error, worst.sd))
+            parts.append(ends_text(kind, worst.mc_error, worst.sd))
     ends = "Monte-Carlo error of the interval ends: " + ", ".join(parts)
     measure = convergence_text(draws) or f"{len(draws.flat)} independent draws"
     if draws.method == "ensemble":
@@ -321,7 +325,7 @@ def convergence_text(draws: ParameterDraws) -> str:
     return f"Pareto shape {draws.diagnostics['pareto_k']:.2f}" if draws.method == "importance" else ""
 
 
-def passed_over(estimate: Estimate) -> list[str]:
+def passed_over_lines(estimate: Estimate) -> list[str]:
     """Places passed over, with reasons; long lists are shortened."""
     faulty = [candidate for candidate in estimate.candidates if candidate.fault]
     lines = [f"Passed over near ({c.centre_mm[0]:.0f}, {c.centre_mm[1]:.0f}) mm: {c.fault}." for c in faulty]
@@ -342,9 +346,9 @@ def estimate_summary(estimate: Estimate, report: EstimateReport) -> str:
     body = finding_summary(report.findings, "caution", most=MOST_CAUTIONS)
     checks = finding_summary(report.findings, "check", most=MOST_CHECKS)
     if estimate.status == "no_estimate":
-        body += [*_no_estimate(report), *_masses(report.masses, room=MOST_MASSES), *checks]
+        body += [*_no_estimate_lines(report), *_mass_lines(report.masses, room=MOST_MASSES), *checks]
     else:
-        body = _something(estimate, report, body, checks)
+        body = _estimate_lines(estimate, report, body, checks)
     if estimate.scene is not None:
         model = [estimate_document.scene_line(estimate.scene)]
     else:
@@ -352,16 +356,16 @@ def estimate_summary(estimate: Estimate, report: EstimateReport) -> str:
     return "\n".join([*body, " ".join([*model, MORE]), RESEARCH_USE]) + "\n"
 
 
-def _something(estimate: Estimate, report: EstimateReport, cautions: list[str], checks: list[str]) -> list[str]:
+def _estimate_lines(estimate: Estimate, report: EstimateReport, cautions: list[str], checks: list[str]) -> list[str]:
     """The body of a report with an estimate; what makes the interval wide gives way to masses."""
     quantities, largest = _quantities(report), report.max_size_mm
     shown = EXTREMES if largest is not None else WIDTHS
     lines = cautions + size_table(report, (*shown, ANOTHER_LARGEST, ANOTHER_SMALLEST))
-    lines += _lump(report)
-    after = _no_size(report)
-    last = _quality(estimate, report, [quantities[name] for name in shown]) + checks
+    lines += _lump_line(report)
+    after = _no_size_lines(report)
+    last = _quality_line(estimate, report, [quantities[name] for name in shown]) + checks
     room = MOST_LINES - 2 - len(lines) - len(after) - len(last)
-    beside = _masses(report.masses, room=min(MOST_MASSES, room))
+    beside = _mass_lines(report.masses, room=min(MOST_MASSES, room))
     widths = width_lines(report.leading.variance_share or {})
     lines = [*lines, *beside, *after, *widths[: max(room - len(beside), 0)], *last]
     if largest is None or len(lines) >= MOST_LINES - 2:
@@ -369,9 +373,9 @@ def _something(estimate: Estimate, report: EstimateReport, cautions: list[str], 
     return [*lines, *estimate_document.supposed_line(report.supposing, largest.median, places=size_decimals([largest]))]
 
 
-def _lump(report: EstimateReport) -> list[str]:
+def _lump_line(report: EstimateReport) -> list[str]:
     """Probability of a lump, and its place; of several masses, which one it is."""
-    chance, number = report.detected_probability, estimate_document.numbered(report.masses)
+    chance, number = report.detected_probability, estimate_document.reported_number_words(report.masses)
     parts = [] if chance is None else [f"Probability of a lump {chance_text(chance)}"]
     if report.amplitude is not None:
         parts.append(f"amplitude {report.amplitude.median:.2g}")
@@ -385,7 +389,7 @@ def _lump(report: EstimateReport) -> list[str]:
     return [f"{number}: {text[0].lower()}{text[1:]}." if number else f"{text}."] if parts else []
 
 
-def _masses(masses: Sequence[MassReport], *, room: int) -> list[str]:
+def _mass_lines(masses: Sequence[MassReport], *, room: int) -> list[str]:
     """At most `room` lines on the masses besides the reported one, at least one; the last counts those left out."""
     lines = estimate_document.mass_lines(masses)
     shown = lines[: max(room, 1)]
@@ -394,7 +398,7 @@ def _masses(masses: Sequence[MassReport], *, room: int) -> list[str]:
     return shown
 
 
-def _quality(estimate: Estimate, report: EstimateReport, shown: Sequence[Quantity]) -> list[str]:
+def _quality_line(estimate: Estimate, report: EstimateReport, shown: Sequence[Quantity]) -> list[str]:
     """Monte-Carlo error of the interval ends, convergence measure, tracker's share, draws without a size."""
     draws = estimate.draws
     assert draws is not None  # as with every estimate

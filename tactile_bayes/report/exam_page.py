@@ -11,7 +11,7 @@ from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.report import exam_words, svg
 from tactile_bayes.report.estimate_document import size_words
 from tactile_bayes.report.estimate_text import width_lines
-from tactile_bayes.report.exam_words import Exam, headline
+from tactile_bayes.report.exam_words import ShownExam, headline
 from tactile_bayes.report.pages import cut, foot, page
 
 # --- An exam as one self-contained page that prints to one side of A4: no script, nothing loaded, every text escaped.
@@ -26,7 +26,7 @@ _LOWER_MM: Final = 54.0
 _REPEAT_MM: Final = (30.0, 19.0)
 
 
-def exam_page(exam: Exam) -> str:
+def exam_page(exam: ShownExam) -> str:
     """Full HTML page of an exam; equal exams give equal text."""
     crowded = len(exam.maps) > 1 and len(exam.main.masses) > 1
     most, longest = _FINDINGS[crowded]
@@ -34,27 +34,27 @@ def exam_page(exam: Exam) -> str:
     drawn, report, least = exam.main.tactile_map, exam.main.report, exam.main.report.smallest_lump
     height_mm = _LOWER_MM if crowded else _PICTURE_MM[1]
     frame = None if drawn is None else svg.Frame.within(drawn, width_mm=_PICTURE_MM[0], height_mm=height_mm)
-    seed, told = report.provenance.get("seed"), finding_lines(exam.report.findings, paper=True)
-    if len(told) > most:
-        told = [*told[:most], f"And {len(told) - most} more, which the full report tells."]
+    seed, findings = report.provenance.get("seed"), finding_lines(exam.report.findings, paper=True)
+    if len(findings) > most:
+        findings = [*findings[:most], f"And {len(findings) - most} more, which the full report tells."]
     masses = sorted(exam.main.masses, key=lambda one: one.number)
     made = f"method {report.origin.settings.get('method', 'unknown')}"
     shown = exam.maps[:MOST_REPEATS] if several else ()
     alone = ["no size" if (q := one.report.max_size_mm) is None else size_words(q) for one in shown]
     return page(
         "exam",
-        title=cut(exam.given.title, 60) or TITLE,
+        title=cut(exam.labels.title, 60) or TITLE,
         crowded=crowded,
         facts=list(exam_words.facts(exam)),
         research_use=RESEARCH_USE,
         headline=headline(exam),
-        findings=told,
+        findings=findings,
         longest_finding=longest,
         exam=exam,
         frame=frame,
         picture=frame and svg.exam_picture(exam.drawn, frame, label=f"Map: {headline(exam)}"),
         colours=frame and svg.colour_bar(exam.main),
-        marked=frame and svg.marked(exam.main),
+        marked=frame and svg.marked_place(exam.main),
         smallest=[] if least is None or drawn is None else list(svg.smallest_pictures(drawn, least)),
         of_mass=f" of mass {exam.main.masses[0].number}" if len(masses) > 1 else "",
         place=_place(exam) if masses else None,
@@ -72,14 +72,14 @@ def exam_page(exam: Exam) -> str:
     )
 
 
-def _place(exam: Exam) -> dict[str, Any]:
+def _place(exam: ShownExam) -> dict[str, Any]:
     """Where the lump lies, beside a clock face of the breast."""
     mass = exam.main.masses[0]
     sentences = [exam_words.place_sentence(mass, INTERVAL if exam.largest is None else exam.largest.probability)]
     if mass.probability is not None:
         which = f"map {exam.main_number}" if len(exam.maps) > 1 else "this map"
-        told = f"Probability that it is a lump, by {which}: {chance_text(mass.probability)}"
-        sentences.append(f"{told}, if one such exam in {1 / SHARE_WITH_LUMP:g} shows one.")
+        chance = f"Probability that it is a lump, by {which}: {chance_text(mass.probability)}"
+        sentences.append(f"{chance}, if one such exam in {1 / SHARE_WITH_LUMP:g} shows one.")
     return {
         "dial": svg.breast_dial(exam.main.masses),
         "sentences": sentences,
@@ -87,7 +87,7 @@ def _place(exam: Exam) -> dict[str, Any]:
     }
 
 
-def _intervals(exam: Exam, size: Quantity) -> list[tuple[str, Quantity]]:
+def _intervals(exam: ShownExam, size: Quantity) -> list[tuple[str, Quantity]]:
     """Both intervals of the largest size, with what they suppose."""
     another, alike = exam.report.another_exam, exam.report.figures.get("between_map_sd")
     narrow_size = exam.report.max_size_mm

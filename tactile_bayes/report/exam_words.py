@@ -20,7 +20,7 @@ from tactile_bayes.mapping.clock import ClockPosition, clock_position, clock_tex
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
 from tactile_bayes.mapping.plausibility import WHY_NOT
 from tactile_bayes.posterior.verdict import chance_text
-from tactile_bayes.report.estimate_document import from_xiphoid, others, patient_mm, share_words, size_words
+from tactile_bayes.report.estimate_document import from_xiphoid, other_masses, patient_mm, share_words, size_words
 from tactile_bayes.report.estimate_text import shape_text, smallest_text
 from tactile_bayes.report.map import ellipse_of
 from tactile_bayes.size.pooling import DISAGREE
@@ -53,7 +53,7 @@ class ExamMap(Record, eq=False):
     masses: tuple[ExamMass, ...]
 
 
-class Given(Record):
+class PageLabels(Record):
     """What was given for the page besides maps: title, name and date, empty where they were not."""
 
     title: str = ""
@@ -66,8 +66,8 @@ class Given(Record):
             if not isinstance(value, str):
                 raise UsageError(f"{option} is {value!r}; give a text")
             if not value.isprintable() or len(value) > longest:
-                what = f"{option} is of {len(value)} letters or not printable"
-                raise UsageError(f"{what}; give up to {longest} letters")
+                fault = f"{option} is of {len(value)} letters or not printable"
+                raise UsageError(f"{fault}; give up to {longest} letters")
         day, is_date = str(self.day), False
         with suppress(ValueError):
             is_date = bool(_DATE.fullmatch(day) and date.fromisoformat(day))
@@ -75,13 +75,13 @@ class Given(Record):
             raise UsageError(f"date {day[:40]!r} is no date; give it as YEAR-MONTH-DAY, such as 2026-03-01")
 
 
-class Exam(Record, eq=False):
+class ShownExam(Record, eq=False):
     """What one page shows."""
 
     maps: tuple[ExamMap, ...]  #: Several are repeats of one mass.
     pooled: PooledReport | None = None  #: The size from all maps; None with one map.
     scans: Sequence[Mapping[str, str]] = ()  #: The scans at the beginning, as `Provenance.scans` has them.
-    given: Given = Given()
+    labels: PageLabels = PageLabels()
 
     @property
     def main_number(self) -> int:
@@ -125,16 +125,16 @@ def exam_map(tactile_map: TactileMap | None, report: EstimateReport, *, side: st
     """A map with its masses, from its estimate; `side` is the breast, as the scans have it."""
     number = next((one.number for one in report.masses if one.reported), 1)
     masses = [] if report.centre_mm is None else [_mass(number, report, report.centre_mm, tactile_map, side)]
-    masses += [_mass(one.number, one, one.centre_mm, tactile_map, side) for one in others(report.masses)]
+    masses += [_mass(one.number, one, one.centre_mm, tactile_map, side) for one in other_masses(report.masses)]
     return ExamMap(tactile_map, report, tuple(masses))
 
 
 def _mass(
-    number: int, told: EstimateReport | MassReport, centre: Point | Place, tactile_map: TactileMap | None, side: str
+    number: int, report: EstimateReport | MassReport, centre: Point | Place, tactile_map: TactileMap | None, side: str
 ) -> ExamMass:
-    """A mass with its place: by the map, or as its estimate has `told` it where that is all there is."""
+    """A mass with its place: by the map, or as its estimate has `report` it where that is all there is."""
     if tactile_map is None:
-        place, patient = ClockPosition.of(told.position), centre_of(told.centre_patient_mm)
+        place, patient = ClockPosition.of(report.position), centre_of(report.centre_patient_mm)
     else:
         variances = (centre.x.sd**2, centre.y.sd**2) if isinstance(centre, Point) else (0.0, 0.0)
         place = clock_position(tactile_map, centre.median, side=side, covariance_mm2=np.diag(variances))
@@ -142,12 +142,12 @@ def _mass(
     return ExamMass(
         number,
         centre.median,
-        *ellipse_of(told),
-        largest=told.leading.max_size_mm,
-        probability=told.detected_probability,
+        *ellipse_of(report),
+        largest=report.leading.max_size_mm,
+        probability=report.detected_probability,
         place=place,
         patient_mm=patient,
-        why="" if told.max_size_mm is not None else told.reason,
+        why="" if report.max_size_mm is not None else report.reason,
     )
 
 
@@ -159,13 +159,13 @@ _LEFT_OUT: Final = WHY_NOT | {
 }
 
 
-def headline(exam: Exam) -> str:
+def headline(exam: ShownExam) -> str:
     """The finding in a few words."""
     size, masses = exam.largest, exam.main.masses
     if size is not None:
-        what = "Lump of" if len(masses) < 2 else f"{len(masses)} masses, mass {masses[0].number}"
+        lead = "Lump of" if len(masses) < 2 else f"{len(masses)} masses, mass {masses[0].number}"
         interval = f"{share_words(size)} interval {size.low:.1f} to {size.high:.1f} mm"
-        return f"{what} about {size.median:.1f} mm, {interval}"
+        return f"{lead} about {size.median:.1f} mm, {interval}"
     if exam.disagrees:
         return capitalised(exam.report.reason)
     if masses:
@@ -181,7 +181,7 @@ def reason_on_paper(report: EstimateReport) -> str:
     return "no lump found: what rises is long like a rib, not round like a lump" if rib else report.reason
 
 
-def size_sentences(exam: Exam) -> Iterator[str]:
+def size_sentences(exam: ShownExam) -> Iterator[str]:
     """The largest size with both intervals and the smallest size."""
     report, size = exam.report, exam.largest
     if size is None:
@@ -205,7 +205,7 @@ def size_sentences(exam: Exam) -> Iterator[str]:
         yield shape_text(report.figures)
 
 
-def _supposed(exam: Exam) -> str:
+def _supposed(exam: ShownExam) -> str:
     """What the size's interval supposes of the spread between exams, and where that is from."""
     report, spread = exam.report, exam.report.figures.get("between_map_sd")
     if report.another_exam is not None:
@@ -228,7 +228,7 @@ def _supposed(exam: Exam) -> str:
     return f", if exams of a lump differ by {100 * spread:.0f} %, as those of simulated bodies do"
 
 
-def nothing_sentences(exam: Exam) -> Iterator[str]:
+def nothing_sentences(exam: ShownExam) -> Iterator[str]:
     """Why there is no size, what could have been missed, and what would help."""
     if exam.disagrees:
         yield "No common size is given: look at each map."
@@ -273,7 +273,7 @@ def short_place(mass: ExamMass) -> str:
     return "At ({:.0f}, {:.0f}) mm on the map".format(*mass.centre_mm)
 
 
-def why_no_clock(exam: Exam) -> str:
+def why_no_clock(exam: ShownExam) -> str:
     """Why the page tells no place by the clock, where a patient was scanned; empty where it does."""
     tactile_map = exam.main.tactile_map
     if (
@@ -287,7 +287,7 @@ def why_no_clock(exam: Exam) -> str:
     return f"No clock position: the scan names no {' and no '.join(lacks)}." if lacks else ""
 
 
-def quality_rows(exam: Exam) -> Iterator[tuple[str, str]]:
+def quality_rows(exam: ShownExam) -> Iterator[tuple[str, str]]:
     """Rows of the table on how good the exam was."""
     if exam.main.tactile_map is not None:
         yield from _scan_rows(exam.main.tactile_map)
@@ -308,13 +308,13 @@ def _scan_rows(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
         yield "reaches", reach
     if "mean_pressure_kpa" in quality:
         window = tactile_map.recipe.pressure_window_kpa
-        asked = "" if window is None else f" (wanted {window[0]:g} to {window[1]:g} kPa)"
+        wanted_range = "" if window is None else f" (wanted {window[0]:g} to {window[1]:g} kPa)"
         ends = f"{quality['level_p05_kpa']:.1f} to {quality['level_p95_kpa']:.1f} kPa"
-        yield "pressure", f"mean {quality['mean_pressure_kpa']:.1f} kPa, nine frames in ten {ends}{asked}"
+        yield "pressure", f"mean {quality['mean_pressure_kpa']:.1f} kPa, nine frames in ten {ends}{wanted_range}"
     if "frames_total" in quality:
-        used = f"{quality['frames_used']:.0f} of {quality['frames_total']:.0f} used"
+        frames = f"{quality['frames_used']:.0f} of {quality['frames_total']:.0f} used"
         out = [f"{quality[name]:.0f} {words}" for name, words in _LEFT_OUT.items() if quality.get(name)]
-        yield "sensor frames", f"{used}{'; left out: ' if out else ''}{', '.join(out)}"
+        yield "sensor frames", f"{frames}{'; left out: ' if out else ''}{', '.join(out)}"
     if tactile_map.masked_taxels:
         yield "sensor points", f"{len(tactile_map.masked_taxels)} left out as faulty"
     named = "none touched"
@@ -373,14 +373,14 @@ def mass_row(mass: ExamMass) -> tuple[str, str, str]:
     return str(mass.number), size, short_place(mass)
 
 
-def facts(exam: Exam) -> Iterator[tuple[str, str]]:
+def facts(exam: ShownExam) -> Iterator[tuple[str, str]]:
     """What the scans say of the exam, with what was given for the page."""
-    if exam.given.name:
-        yield "Name", exam.given.name
+    if exam.labels.name:
+        yield "Name", exam.labels.name
     for key in ("subject", "side", "mass", "visit", "posture", "examiner"):
         values = list(dict.fromkeys(scan[key] for scan in exam.scans if scan.get(key)))
         if values:
             more = f" and {len(values) - 2} more" if len(values) > 2 else ""
             yield key.capitalize(), ", ".join(value[:24] for value in values[:2]) + more
-    if exam.given.day:
-        yield "Date", exam.given.day
+    if exam.labels.day:
+        yield "Date", exam.labels.day

@@ -26,21 +26,21 @@ _CODE: Final = re.compile(r"[A-Za-z0-9_.-]{1,32}")
 _TITLED: Final = ("subject", "side", "mass", "visit")
 
 
-def named_exam(name: str, scans: Sequence[Mapping[str, str]]) -> str:
+def exam_title(name: str, scans: Sequence[Mapping[str, str]]) -> str:
     """Such as ``"P07, left, mass 1, visit 2 (exam)"``; what is no code is left out, and `$` starts no formula.
 
     `name`: of the map; may be empty; `scans`: as `Provenance.scans` has them. Of a fact on which they differ each value
     is named.
     """
-    told = []
+    facts = []
     for fact in _TITLED:
         codes = dict.fromkeys(code for one in scans if _CODE.fullmatch(code := one.get(fact, "")))
         words = f"{fact}{'s' * (len(codes) > 1)} " if fact in ("mass", "visit") else ""
-        told += [words + " and ".join(codes)] if codes else []
+        facts += [words + " and ".join(codes)] if codes else []
     plain = name.replace("$", r"\$")
-    if not told:
+    if not facts:
         return plain
-    return f"{', '.join(told)} ({plain})" if plain else ", ".join(told)
+    return f"{', '.join(facts)} ({plain})" if plain else ", ".join(facts)
 
 
 # --- Figure files: PNG, PDF or SVG by suffix; with the same libraries, equal input gives equal bytes.
@@ -105,15 +105,15 @@ def figure_file(
         refuse_existing(path, force=force)
     with plain_matplotlib() as library:
         width_in, height_in = size_in
-        told = [part for line in finding_lines(findings, paper=True) for part in wrap(line, round(13 * width_in))]
-        figure = library.figure.Figure(figsize=(width_in, height_in + 0.17 * len(told)), dpi=DPI, layout="constrained")
+        above = [part for line in finding_lines(findings, paper=True) for part in wrap(line, round(13 * width_in))]
+        figure = library.figure.Figure(figsize=(width_in, height_in + 0.17 * len(above)), dpi=DPI, layout="constrained")
         figure.get_layout_engine().set(rect=(0.0, 0.04, 1.0, 0.96))
         yield figure
         if foot is not None:
             figure.text(0.01, 0.01, f"{foot}  {RESEARCH_USE}".strip(), fontsize=7.5, color="0.3")
-        if told:
+        if above:
             title = figure.get_suptitle()
-            figure.suptitle("\n".join([*told, *([title] if title else [])]), x=0.01, ha="left", fontsize=9.5)
+            figure.suptitle("\n".join([*above, *([title] if title else [])]), x=0.01, ha="left", fontsize=9.5)
         if trim:
             figure.draw_without_rendering()
             lowest = min(axes.get_tightbbox().y0 for axes in figure.axes) / figure.dpi

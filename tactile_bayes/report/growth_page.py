@@ -25,7 +25,7 @@ from tactile_bayes.report.compare import (
     rate_sentences,
     verdict_sentence,
 )
-from tactile_bayes.report.figure_file import figure_file, named_exam
+from tactile_bayes.report.figure_file import exam_title, figure_file
 from tactile_bayes.report.map import draw_cells, draw_edges, ellipse_of
 from tactile_bayes.report.pages import cut, foot, page
 from tactile_bayes.size.visits import VisitComparison, straight_line
@@ -77,11 +77,11 @@ def on_common_axes(
             first = maps[0].tactile_map
             x, y = (float(axis[0] + axis[-1]) / 2 for axis in (first.x_mm, first.y_mm))
             maps, centres = maps[:1], [(x, y)]
-        laid.append(_laid(maps, centres, size, view))
+        laid.append(_average_visit(maps, centres, size, view))
     return laid, view
 
 
-def _laid(
+def _average_visit(
     maps: Sequence[DrawnMap], centres: Sequence[tuple[float, float] | None], size: Quantity | None, view: Orientation
 ) -> LaidMap:
     """Mean of a visit's maps about its mass, on the screen's axes."""
@@ -100,7 +100,7 @@ def _laid(
             rotation = one.patient_from_plane[:2, :2]
             places.append((rotation @ centre + one.patient_from_plane[:2, 3]) * [-1.0, 1.0])
         x, y = np.tensordot(np.linalg.inv(rotation), about, axes=1) + np.reshape(centre, (2, 1, 1))
-        values.append(_nearest(one, x, y))
+        values.append(_values_at(one, x, y))
         if ring is None and size is not None and axes_mm is not None:
             shape = svg.ellipse_mm(axes_mm, angle_deg) * size.median / max(axes_mm)  # as its map has it
             ring = signs[:, None] * (rotation @ shape)
@@ -113,7 +113,7 @@ def _laid(
     return LaidMap(mean, np.mean(places, axis=0) if places else np.zeros(2), ring)
 
 
-def _nearest(tactile_map: TactileMap, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+def _values_at(tactile_map: TactileMap, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     """Values of the nearest cells; NaN outside and in cells without data or with few readings."""
     cell = tactile_map.recipe.cell_mm
     column = np.rint((x_mm - tactile_map.x_mm[0]) / cell).astype(int)
@@ -121,11 +121,11 @@ def _nearest(tactile_map: TactileMap, x_mm: FloatArray, y_mm: FloatArray) -> Flo
     ny, nx = tactile_map.mean.shape
     inside = (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
     filled = np.where(tactile_map.covered & ~tactile_map.few, tactile_map.mean, np.nan)
-    found = filled[np.clip(row, 0, ny - 1), np.clip(column, 0, nx - 1)]
-    return np.where(inside, found, np.nan)
+    values = filled[np.clip(row, 0, ny - 1), np.clip(column, 0, nx - 1)]
+    return np.where(inside, values, np.nan)
 
 
-def _shown(laid: Sequence[LaidMap]) -> list[int]:
+def _drawn_visits(laid: Sequence[LaidMap]) -> list[int]:
     """The visits whose maps are drawn: the first and the last ones."""
     return [0, *range(max(1, len(laid) - _MOST_VISITS + 1), len(laid))]
 
@@ -167,7 +167,7 @@ def growth_page(
     """Full HTML page of a comparison; equal comparisons give equal text."""
     laid, view = on_common_axes(report, visits, middle=True)
     limits, words = common_limits(laid), visits[0][0].tactile_map.recipe.value_words
-    shown = _shown(laid)
+    shown = _drawn_visits(laid)
     facts = (("Name", course.name), ("Patient", course.patient), ("Side", course.side), ("Mass", course.mass))
     return page(
         "growth",
@@ -228,7 +228,7 @@ _ROOM_MM: Final = (17.0, 8.0)
 """Visits nearer than the first have their dates in two rows, nearer than the second none, and no numbers."""
 
 
-class _Point(Record):
+class _VisitPoint(Record):
     """One visit on the chart."""
 
     x: float  #: mm from the left.
@@ -250,7 +250,7 @@ def _chart(compared: VisitComparison, report: CompareReport, course: Course) -> 
         size = visit.max_size_mm
         assert size is not None
         wide = None if compared.another is None else compared.another.size_mm(visit.visit - 1, size.probability)
-        points.append(_Point(_LEFT_MM + _INSET_MM + run * (time - times[0]), course.of(visit), size, wide))
+        points.append(_VisitPoint(_LEFT_MM + _INSET_MM + run * (time - times[0]), course.of(visit), size, wide))
     top = 1.08 * max(q.high for one in points for q in (one.size, one.wide or one.size))
     scale = (height - _ABOVE_MM - _BELOW_MM) / top
     parts = [*_size_axis(top, scale)]
@@ -283,7 +283,7 @@ def _size_axis(top_mm: float, scale: float) -> Iterator[str]:
     yield svg.text(_LEFT_MM + 1, _ABOVE_MM + 1, "mm", anchor="start")
 
 
-def _mark(one: _Point, scale: float, *, row: int, named: bool) -> Iterator[str]:
+def _mark(one: _VisitPoint, scale: float, *, row: int, named: bool) -> Iterator[str]:
     """Median and intervals of a visit above its code and its date."""
     for q, thick in ((one.wide, 0.25), (one.size, 0.9)):
         if q is not None:
@@ -316,10 +316,10 @@ def draw_comparison(
     visit's place, and later visits are moved so that the mass lies on itself. Without, they are the plane's.
     """
     laid, view = on_common_axes(report, visits)
-    shown = _shown(laid)
+    shown = _drawn_visits(laid)
     foot = f"{view.words}; later visits are moved so that the mass lies on itself; maps of a visit are averaged."
     with figure_file(path, size_in=(4.0 * (len(shown) + 1), 7.4), foot=foot, force=force) as figure:
-        exam = named_exam("", report.provenance.get("scans", ()))
+        exam = exam_title("", report.provenance.get("scans", ()))
         figure.suptitle(f"Comparison: {exam}" if exam else "Comparison", x=0.01, ha="left", fontsize=11)
         grid = figure.add_gridspec(2, len(shown) + 1, height_ratios=(1.35, 1.0))
         panels = [figure.add_subplot(grid[0, i]) for i in range(len(shown) + 1)]
@@ -345,8 +345,8 @@ def _draw_maps(panels: Sequence[Axes], visits: Sequence[tuple[str, LaidMap]], *,
     pictures = [(name, one.values, {"cmap": "viridis", "vmin": low, "vmax": high}) for name, one in visits]
     pictures.append(("Last minus first", difference, {"cmap": "RdBu_r", "vmin": -most, "vmax": most}))
     drawn = []
-    for axes, (name, values, how) in zip(panels, pictures, strict=True):
-        drawn.append(draw_cells(axes, np.ma.masked_invalid(values), extent, **how))
+    for axes, (name, values, colours) in zip(panels, pictures, strict=True):
+        drawn.append(draw_cells(axes, np.ma.masked_invalid(values), extent, **colours))
         axes.set_title(name, loc="left", fontsize=11)
         _name_axes(axes, first.origin_mm, view)
     for axes, (_, one) in zip(panels, visits, strict=False):

@@ -17,7 +17,7 @@ from tactile_bayes.forward.plane import RANGE, outside_range
 from tactile_bayes.options import FieldCosines
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file, finish
-from tactile_bayes.report.paper_head import named
+from tactile_bayes.report.paper_head import head_words
 from tactile_bayes.report.study import COLOURS
 from tactile_bayes.studies import model_comparison, sbc
 
@@ -58,10 +58,10 @@ def verdict(test: sbc.RankTest) -> str:
     if test.inside:
         return "ok"
     off = (test.mean_rank - 0.5) * np.sqrt(12.0 * test.n)
-    found = ["too narrow"] * (test.spread > NARROW) + ["too wide"] * (test.spread < 1.0 / NARROW)
+    faults = ["too narrow"] * (test.spread > NARROW) + ["too wide"] * (test.spread < 1.0 / NARROW)
     if abs(off) > SHIFT:
-        found.append("too low" if off > 0 else "too high")
-    return "FAILS: " + (", ".join(found) or "ranks are not uniform")
+        faults.append("too low" if off > 0 else "too high")
+    return "FAILS: " + (", ".join(faults) or "ranks are not uniform")
 
 
 def sbc_text(document: dict[str, Any]) -> str:
@@ -91,8 +91,8 @@ def _lines(document: dict[str, Any]) -> Iterator[str]:
     yield f"{'parameter':<11}{'chi2 p':>7}{'ECDF p':>8}  {'50 % holds':<16}{'90 % holds':<16}verdict"
     for one in tests:
         held = "".join(f"{100 * c['covered']:.1f} +- {100 * c['error']:.1f} %".ljust(16) for c in one["coverage"])
-        told = one["verdict"].removeprefix("FAILS: ").removeprefix("ranks are ")
-        yield f"{one['name']:<11}{one['chi2_p']:>7.3f}{one['ecdf_p']:>8.3f}  {held}{told}"
+        fault = one["verdict"].removeprefix("FAILS: ").removeprefix("ranks are ")
+        yield f"{one['name']:<11}{one['chi2_p']:>7.3f}{one['ecdf_p']:>8.3f}  {held}{fault}"
     yield "+- is one binomial standard error of a calibrated interval."
 
 
@@ -120,10 +120,10 @@ def table_text(maps: Sequence[sbc.MapRanks]) -> str:
 
 def sbc_figure(maps: Sequence[sbc.MapRanks], path: Path, *, force: bool = False) -> None:
     """Draw the ECDF of each parameter's ranks minus the uniform one, with the simultaneous band, as PNG."""
-    found = [one.ranks for one in maps if one.ranks is not None]
-    names = sbc.RANKED[: len(found[0])] if found else sbc.RANKED
-    ranks = np.array(found).reshape(-1, len(names))
-    n, at = len(ranks), np.arange(1, sbc.DRAWS + 1) / (sbc.DRAWS + 1)
+    ranked = [one.ranks for one in maps if one.ranks is not None]
+    names = sbc.RANKED[: len(ranked[0])] if ranked else sbc.RANKED
+    ranks = np.array(ranked).reshape(-1, len(names))
+    n, uniform = len(ranks), np.arange(1, sbc.DRAWS + 1) / (sbc.DRAWS + 1)
     inside = {test.name: test.inside for test in sbc.rank_tests(list(maps))}
     foot = f"{n} maps with an estimate of {len(maps)}; grey: {100 * sbc.BAND:g} % band of the whole path."
     with figure_file(path, size_in=(2.2 * len(names), 2.9), foot=foot, force=force) as figure:
@@ -131,8 +131,8 @@ def sbc_figure(maps: Sequence[sbc.MapRanks], path: Path, *, force: bool = False)
             if n:
                 low, high = sbc.ecdf_band(n, sbc.DRAWS)
                 share = sbc.ecdf_counts(ranks[None, :, i], sbc.DRAWS)[0] / n
-                axes.fill_between(at, low - at, high - at, step="mid", color="0.85", linewidth=0)
-                axes.step(at, share - at, where="mid", color=COLOURS[0 if inside[name] else 1], linewidth=1.2)
+                axes.fill_between(uniform, low - uniform, high - uniform, step="mid", color="0.85", linewidth=0)
+                axes.step(uniform, share - uniform, where="mid", color=COLOURS[0 if inside[name] else 1], linewidth=1.2)
             axes.axhline(0.0, color="0.5", linewidth=0.6)
             axes.set_xticks([0.0, 0.5, 1.0])
             finish(axes, name, "rank / (draws + 1)", "" if i else "ECDF of ranks - uniform")
@@ -146,38 +146,38 @@ _PRINTED = {"centred_frame": model_comparison.PRINTED_FRAMES, "map": model_compa
 
 
 def tables_text(
-    found: Rows, phantoms: Rows, *, head: Head, nearest: Head | None = None, beside: Rows | None = None
+    cases: Rows, phantoms: Rows, *, head: Head, nearest: Head | None = None, beside: Rows | None = None
 ) -> str:
     """Both tables, the widths and amplitudes of the ten lumps, and the phantoms, under `head`.
 
     `nearest` is the head nearest to the printed tables, `beside` its ten lumps; None where there is none, or it is
     `head`.
     """
-    heads = [found] if beside is None else [found, beside]
-    lines = [f"mean MSD: {_answer(heads)}", "", model_comparison.DEFINITION, "", f"head: {named(head)}"]
+    heads = [cases] if beside is None else [cases, beside]
+    lines = [f"mean MSD: {_mean_msd_words(heads)}", "", model_comparison.DEFINITION, "", f"head: {head_words(head)}"]
     if nearest is not None and beside is not None:
-        lines.append(f"after the slash the head nearest to the print: {named(nearest)}")
+        lines.append(f"after the slash the head nearest to the print: {head_words(nearest)}")
     lines += ["in brackets the printed figure", ""]
     lines += _table("Table 1: frame centred on the lump, MSD %", "centred_frame", heads)
     lines += _table("The same of frames divided by their means, MSD %", "normalised_frame", heads)
     lines += _table("All frames of the map, MSD % (printed average 4.3)", "all_frames", heads)
     lines += _table("Table 2: map, MSD %", "map", heads)
     lines += _table("Map, strict MSD %", "map_strict", heads)
-    lines += _others(found)
+    lines += _other_definitions(cases)
     lines += ["Eq 5 fitted to both maps (background 1); the elastic model first:"]
     lines += [f"{'lump':<22}{'a':>13}{'sigma, mm':>14}{'frame %':>11}{'map %':>9}{'strict %':>11}"]
-    for one in [*found, *phantoms]:
+    for one in [*cases, *phantoms]:
         amplitudes = f"{one.elastic.amplitude:.3f} {one.empirical.amplitude:.3f}"
         widths = f"{one.elastic.widths_mm[0]:.2f} {one.empirical.widths_mm[0]:.2f}"
         shares = f"{100 * one.centred_frame:>11.1f}{100 * one.map:>9.1f}{100 * one.map_strict:>11.1f}"
         lines.append(f"{one.scene.name:<22}{amplitudes:>13}{widths:>14}{shares}")
-    outside = [one.scene.name for one in [*found, *phantoms] if outside_range(one.scene.d_mm, one.scene.depth_ratio)]
+    outside = [one.scene.name for one in [*cases, *phantoms] if outside_range(one.scene.d_mm, one.scene.depth_ratio)]
     lines.append(f"the empirical model: {RANGE}; outside:")
     lines += wrap("; ".join(outside), width=78, initial_indent="  ", subsequent_indent="  ")
     return "\n".join(lines)
 
 
-def heads_text(found: ByHead) -> str:
+def heads_text(by_head: ByHead) -> str:
     """The tables' means and ranges under each head, nearest first."""
     lines = [
         "",
@@ -185,9 +185,9 @@ def heads_text(found: ByHead) -> str:
         "off: distance from the 20 printed cells, percentage points; shoulders outside or inside",
         f"{'head':<26}{'Table 1 (4.1)':>18}{'all (4.3)':>11}{'Table 2 (2.4)':>18}{'off':>7}",
     ]
-    for head, rows in sorted(found.items(), key=lambda item: model_comparison.table_distance(item[1])):
+    for head, rows in sorted(by_head.items(), key=lambda item: model_comparison.table_distance(item[1])):
         frames, maps = (_span([getattr(one, name) for one in rows]) for name in ("centred_frame", "map"))
-        every, name = f"{_mean(rows, 'all_frames'):.1f}", named(head).replace("shoulders-", "")
+        every, name = f"{_mean(rows, 'all_frames'):.1f}", head_words(head).replace("shoulders-", "")
         lines.append(f"{name:<26}{frames:>18}{every:>11}{maps:>18}{model_comparison.table_distance(rows):>7.2f}")
     return "\n".join(lines)
 
@@ -198,29 +198,29 @@ def _span(shares: Sequence[float], to: str = " to ") -> str:
     return f"{sum(percent) / len(percent):.1f} ({low}{to}{high})"
 
 
-def _mean(found: Rows, name: str) -> float:
+def _mean(cases: Rows, name: str) -> float:
     """In percent."""
-    return float(sum(100 * getattr(one, name) for one in found) / len(found))
+    return float(sum(100 * getattr(one, name) for one in cases) / len(cases))
 
 
-def _answer(heads: Sequence[Rows]) -> str:
+def _mean_msd_words(heads: Sequence[Rows]) -> str:
     """How near both tables come to the print."""
-    told = []
+    parts = []
     for words, name in (("frames", "centred_frame"), ("maps", "map")):
         nearest = "".join(f"nearest head {_mean(beside, name):.1f}, " for beside in heads[1:])
         printed = np.mean([*_PRINTED[name].values()])
-        told.append(f"{words} {_mean(heads[0], name):.1f} % ({nearest}printed {printed:.1f})")
-    return ", ".join(told)
+        parts.append(f"{words} {_mean(heads[0], name):.1f} % ({nearest}printed {printed:.1f})")
+    return ", ".join(parts)
 
 
-def _others(found: Rows) -> list[str]:
+def _other_definitions(cases: Rows) -> list[str]:
     """Results of other definitions: means over the cases with the least and the largest."""
     lines = [
         "Other definitions, %: mean (least-largest); printed 4.0-4.3, 2.2-2.7",
         f"{'':<32}{'frame':>16}{'frame / mean':>16}{'map':>16}",
     ]
     for i, name in enumerate(model_comparison.OTHER_DEFINITIONS):
-        cells = (_span(shares, "-") for shares in zip(*(one.others[i] for one in found), strict=True))
+        cells = (_span(shares, "-") for shares in zip(*(one.others[i] for one in cases), strict=True))
         lines.append(f"{name.replace('root mean square', 'RMS'):<32}" + "".join(f"{cell:>16}" for cell in cells))
     return [*lines, ""]
 
@@ -239,9 +239,9 @@ def _table(title: str, name: str, heads: Sequence[Rows]) -> list[str]:
     return [*lines, f"mean {' / '.join(f'{_mean(rows, name):.1f}' for rows in heads)}{print_mean}", ""]
 
 
-def tables_document(found: ByHead, phantoms: ByHead, *, seat: float) -> dict[str, Any]:
+def tables_document(by_head: ByHead, phantoms: ByHead, *, seat: float) -> dict[str, Any]:
     """The same as plain data, shares instead of percent; the head that was asked for first."""
-    first = next(iter(found))
+    first = next(iter(by_head))
     return {
         "schema": "tactile-bayes/tables/1",
         "definition": model_comparison.DEFINITION,
@@ -252,8 +252,8 @@ def tables_document(found: ByHead, phantoms: ByHead, *, seat: float) -> dict[str
             "frames": {f"{h:g}": list(row) for h, row in model_comparison.PRINTED_FRAMES.items()},
             "maps": {f"{h:g}": list(row) for h, row in model_comparison.PRINTED_MAPS.items()},
         },
-        "cases": list(map(_figures, found[first])),
-        "phantoms": list(map(_figures, phantoms[first])),
+        "cases": list(map(_case_document, by_head[first])),
+        "phantoms": list(map(_case_document, phantoms[first])),
         "heads": [
             {
                 **as_dict(head),
@@ -262,16 +262,16 @@ def tables_document(found: ByHead, phantoms: ByHead, *, seat: float) -> dict[str
                 "all_frames": [one.all_frames for one in rows],
                 "maps": [one.map for one in rows],
             }
-            for head, rows in found.items()
+            for head, rows in by_head.items()
         ],
     }
 
 
-def _figures(one: model_comparison.Agreement) -> dict[str, Any]:
+def _case_document(one: model_comparison.Agreement) -> dict[str, Any]:
     """A lump's figures; a line's fit has one width."""
     fits = {"elastic": one.elastic, "empirical": one.empirical}
-    told = {
+    bumps = {
         name: {"amplitude": fit.amplitude, "sigma_mm": fit.widths_mm[0], "rms": fit.rms, "resolved": fit.resolved}
         for name, fit in fits.items()
     }
-    return as_dict(one) | told
+    return as_dict(one) | bumps

@@ -83,12 +83,12 @@ gain solve | gain_passes | {gain_passes:.0f} passes, last change {gain_last_chan
 
 def map_summary(tactile_map: TactileMap, *, written: str) -> str:
     """Short report of a map: its verdict with the figures that lead to it, and the names of the files written."""
-    findings, told = tactile_map.findings, _told(tactile_map)
+    findings, facts = tactile_map.findings, _map_facts(tactile_map)
     lines = [
         *finding_lines(findings, "caution"),
-        _verdict_line(findings, told),
-        *([f"left out: {'; '.join(told['dropped'].splitlines())}"] if "dropped" in told else []),
-        f"written: {written}, {told['size']} in cells of {told['cell_mm']:g} mm",
+        _verdict_line(findings, facts),
+        *([f"left out: {'; '.join(facts['dropped'].splitlines())}"] if "dropped" in facts else []),
+        f"written: {written}, {facts['size']} in cells of {facts['cell_mm']:g} mm",
         *finding_lines(findings, "check"),
         *_advice(tactile_map.quality),
         "More (timing, plane, pressure, noise): map -v.",
@@ -96,39 +96,39 @@ def map_summary(tactile_map: TactileMap, *, written: str) -> str:
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
-def _verdict_line(findings: Sequence[Finding], told: Mapping[str, Any]) -> str:
+def _verdict_line(findings: Sequence[Finding], facts: Mapping[str, Any]) -> str:
     """Whether the map is sound, with the figures that lead to it."""
-    figures = [f"{told['frames']} frames"] if "frames" in told else []
-    figures += [told[name] for name in ("scans_used", "every") if name in told]
-    if "coverage" in told:
-        figures.append(f"{told['covered_percent']:.0f} % covered")
-    if "stroke_lag_mm" in told:
-        figures.append("stroke lag {stroke_lag_mm:+.2f} +- {stroke_lag_sd_mm:.2f} mm".format_map(told))
+    figures = [f"{facts['frames']} frames"] if "frames" in facts else []
+    figures += [facts[name] for name in ("scans_used", "every") if name in facts]
+    if "coverage" in facts:
+        figures.append(f"{facts['covered_percent']:.0f} % covered")
+    if "stroke_lag_mm" in facts:
+        figures.append("stroke lag {stroke_lag_mm:+.2f} +- {stroke_lag_sd_mm:.2f} mm".format_map(facts))
     return f"{verdict(findings, answered=True)}: {', '.join(figures)}"
 
 
 def map_text(tactile_map: TactileMap) -> str:
     """Full report of a map: cautions and verdict, a table, what is to be checked, notes and the research-use line."""
-    findings, told, rows = tactile_map.findings, _told(tactile_map), list[tuple[str, str]]()
+    findings, facts, rows = tactile_map.findings, _map_facts(tactile_map), list[tuple[str, str]]()
     if (advice := advise_cell(tactile_map)) is not None:
-        told["advice"] = advice.text()
+        facts["advice"] = advice.text()
     for line in _ROWS.strip("\n").splitlines():
         name, figure, text = line.split("|")
-        if figure.strip() in told:
+        if figure.strip() in facts:
             first, before = rows.pop() if name == "+ " else (name.rstrip(), "")
-            rows.append((first, before + text.removeprefix(" ").format_map(told)))
+            rows.append((first, before + text.removeprefix(" ").format_map(facts)))
     width = max(len(name) for name, _ in rows)
     lines = [f"{name.ljust(width)}  {part}" for name, text in rows for part in text.splitlines()]
-    head = [*finding_lines(findings, "caution"), _verdict_line(findings, told), ""]
+    head = [*finding_lines(findings, "caution"), _verdict_line(findings, facts), ""]
     checks = finding_lines(findings, "check")
     return "\n".join([*head, *lines, "", *checks, *_notes(tactile_map), RESEARCH_USE]) + "\n"
 
 
-def _told(tactile_map: TactileMap) -> dict[str, Any]:
+def _map_facts(tactile_map: TactileMap) -> dict[str, Any]:
     """What is told of a map, by name: its figures, and words on them; what is not known is left out."""
     quality, recipe, values = tactile_map.quality, tactile_map.recipe, tactile_map.mean[tactile_map.covered]
     rows, columns = tactile_map.mean.shape
-    told: dict[str, Any] = {
+    facts: dict[str, Any] = {
         **quality,
         "cell_mm": recipe.cell_mm,
         "size": f"{columns * recipe.cell_mm:g} x {rows * recipe.cell_mm:g} mm",
@@ -143,31 +143,31 @@ def _told(tactile_map: TactileMap) -> dict[str, Any]:
     }
     if values.size:
         units = _UNITS.get(recipe.normalise, f"{recipe.value_unit or 'of unknown unit'} (normalise none)")
-        told |= {"least": values.min(), "most": values.max(), "units": units}
+        facts |= {"least": values.min(), "most": values.max(), "units": units}
     if "frames_total" in quality:
-        told["frames"] = "{frames_used:.0f} of {frames_total:.0f}".format_map(quality)
+        facts["frames"] = "{frames_used:.0f} of {frames_total:.0f}".format_map(quality)
         if quality.get("scans", 1) > 1:
-            told["scans_used"] = f"{quality['scans']:.0f} scans"
+            facts["scans_used"] = f"{quality['scans']:.0f} scans"
         if "frames_every" in quality:
-            told["every"] = f"one of every {quality['frames_every']:.0f} of the scan"
+            facts["every"] = f"one of every {quality['frames_every']:.0f} of the scan"
     window = recipe.pressure_window_kpa or (np.nan, np.nan)
     out = [f"{quality[name]:.0f} {why.format(*window)}" for name, why in _DROPPED.items() if quality.get(name)]
     if out:
-        told["dropped"] = "\n".join(out)
+        facts["dropped"] = "\n".join(out)
     if tactile_map.patient_from_plane is not None:
         repeats = quality.get("landmark_spread_mm")
-        told["patient_axes"] = "from the landmarks" + ("" if repeats is None else f", repeats within {repeats:.1f} mm")
-    told["shifts"] = ", ".join(
+        facts["patient_axes"] = "from the landmarks" + ("" if repeats is None else f", repeats within {repeats:.1f} mm")
+    facts["shifts"] = ", ".join(
         f"{number}: {quality[f'stroke_{number}_shift_x_mm']:+.2f} +- {quality[f'stroke_{number}_sd_x_mm']:.2f}"
         for number in range(1, int(quality.get("strokes", 0)) + 1)
         if f"stroke_{number}_shift_x_mm" in quality
     )
     if "effective_readings" in quality:
         known, least = quality["shared_share"] >= LEAST_SHARE, f"under {100 * LEAST_SHARE:.0f} %"
-        told["shared"] = f"{100 * quality['shared_share']:.0f} %" if known else least
+        facts["shared"] = f"{100 * quality['shared_share']:.0f} %" if known else least
     elif "median_count" in quality:
-        told["unshared"] = True
-    return told
+        facts["unshared"] = True
+    return facts
 
 
 def _notes(tactile_map: TactileMap) -> Iterator[str]:
@@ -238,10 +238,10 @@ def map_figure(
     if not tactile_map.covered.any():
         raise BadDataError("the map holds no data to draw", way_out="make it from a scan with frames in the window")
     view = orientation_of(tactile_map)
-    told = (tactile_map if report is None else report).findings if findings is None else findings
+    shown_findings = (tactile_map if report is None else report).findings if findings is None else findings
     looked_at = [] if report is None else [one for one in report.candidates if one.fault]
     foot = _caption(tactile_map, view)
-    with figure_file(path, size_in=_MOST_IN, trim=True, foot=foot, force=force, findings=told) as figure:
+    with figure_file(path, size_in=_MOST_IN, trim=True, foot=foot, force=force, findings=shown_findings) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.55, 1.0))
         _draw_values(left, tactile_map, view, report)
         _draw_coverage(right, tactile_map, view)
@@ -262,7 +262,7 @@ def map_figure(
     return figure
 
 
-def _pair(view: Orientation, x: Any, y: Any) -> tuple[Any, Any]:
+def _across_up(view: Orientation, x: Any, y: Any) -> tuple[Any, Any]:
     """Order two values by the picture's horizontal and vertical axes."""
     return (y, x) if view.swapped else (x, y)
 
@@ -270,24 +270,24 @@ def _pair(view: Orientation, x: Any, y: Any) -> tuple[Any, Any]:
 def _extent(tactile_map: TactileMap, view: Orientation) -> tuple[float, float, float, float]:
     """Ends of the horizontal and vertical axes, including the outer halves of the cells."""
     half = tactile_map.recipe.cell_mm / 2
-    across, up = _pair(view, tactile_map.x_mm, tactile_map.y_mm)
+    across, up = _across_up(view, tactile_map.x_mm, tactile_map.y_mm)
     return (float(across[0]) - half, float(across[-1]) + half, float(up[0]) - half, float(up[-1]) + half)
 
 
-def draw_cells(axes: Axes, values: Any, extent: Any, **how: Any) -> Any:
+def draw_cells(axes: Axes, values: Any, extent: Any, **looks: Any) -> Any:
     """Draw values as an image between the ends of its axes; masked cells stay grey."""
     axes.set_facecolor("0.85")
-    return axes.imshow(values, origin="lower", extent=extent, interpolation="nearest", **how)
+    return axes.imshow(values, origin="lower", extent=extent, interpolation="nearest", **looks)
 
 
-def _draw_map(axes: Axes, values: Any, tactile_map: TactileMap, view: Orientation, **how: Any) -> Any:
-    return draw_cells(axes, values.T if view.swapped else values, _extent(tactile_map, view), **how)
+def _draw_map(axes: Axes, values: Any, tactile_map: TactileMap, view: Orientation, **looks: Any) -> Any:
+    return draw_cells(axes, values.T if view.swapped else values, _extent(tactile_map, view), **looks)
 
 
-def draw_panel(axes: Axes, values: Any, tactile_map: TactileMap, *, label: str, title: str, **how: Any) -> None:
+def draw_panel(axes: Axes, values: Any, tactile_map: TactileMap, *, label: str, title: str, **looks: Any) -> None:
     """Draw cells in the map's orientation, with its sides and a colour bar; NaN stays grey."""
     view = orientation_of(tactile_map)
-    image = _draw_map(axes, np.ma.masked_invalid(values), tactile_map, view, **how)
+    image = _draw_map(axes, np.ma.masked_invalid(values), tactile_map, view, **looks)
     _colour_bar(axes, image, label)
     _orient(axes, view, tactile_map)
     draw_edges(axes, view)
@@ -325,7 +325,7 @@ def _hatch_few(axes: Axes, tactile_map: TactileMap, view: Orientation) -> None:
     outline = load_matplotlib().path.Path
     half = tactile_map.recipe.cell_mm / 2
     rows, columns = np.nonzero(tactile_map.few)
-    middle = np.stack(_pair(view, tactile_map.x_mm[columns], tactile_map.y_mm[rows]), axis=1)
+    middle = np.stack(_across_up(view, tactile_map.x_mm[columns], tactile_map.y_mm[rows]), axis=1)
     corners = half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
     codes = [outline.MOVETO, outline.LINETO, outline.LINETO, outline.LINETO, outline.CLOSEPOLY]
     cells = outline((middle[:, None] + corners).reshape(-1, 2), np.tile(codes, len(middle)))
@@ -341,8 +341,7 @@ def _hatch_few(axes: Axes, tactile_map: TactileMap, view: Orientation) -> None:
 
 def _explain(axes: Axes, tactile_map: TactileMap, places: Sequence[PassedOver]) -> None:
     """Explain hatching and places below the coverage panel, where no cell is hidden."""
-    at = "({:.0f}, {:.0f}) mm"
-    lines = [f"{i}  {at.format(place.x_mm, place.y_mm)}: {place.fault}" for i, place in enumerate(places, start=1)]
+    lines = [f"{i}  ({one.x_mm:.0f}, {one.y_mm:.0f}) mm: {one.fault}" for i, one in enumerate(places, start=1)]
     wrapped = [textwrap.wrap(line, 66, subsequent_indent="    ", max_lines=2) for line in lines[:_EXPLAINED_PLACES]]
     shown = ["\n".join(line) for line in wrapped]
     if len(lines) > len(shown):
@@ -370,8 +369,8 @@ def _orient(axes: Axes, view: Orientation, tactile_map: TactileMap) -> None:
     words = _AXIS_WORDS if tactile_map.recipe.source == "scan" else {"x": "x (mm)", "y": "y (mm)"}
     back = {view.right: "larger to the left", view.up: "larger downwards"}
     across, up = (
-        words[axis[1]] if axis[0] == "+" else f"{words[axis[1]].removesuffix(')')}, {how})"
-        for axis, how in back.items()
+        words[axis[1]] if axis[0] == "+" else f"{words[axis[1]].removesuffix(')')}, {direction})"
+        for axis, direction in back.items()
     )
     axes.set_xlabel(across, fontsize=9)
     axes.set_ylabel(up, fontsize=9)
@@ -397,11 +396,11 @@ def draw_edges(axes: Axes, view: Orientation) -> None:
         axes.text(*places[side], name, transform=axes.transAxes, path_effects=_outlined(2.5), **looks)
 
 
-def ellipse_of(told: EstimateReport | MassReport) -> tuple[tuple[float, float] | None, float]:
+def ellipse_of(report: EstimateReport | MassReport) -> tuple[tuple[float, float] | None, float]:
     """Diameters of a mass along its own axes, mm, None without a size, and the angle in degrees from x to the first."""
-    along, across = told.d_x_mm, told.d_y_mm
+    along, across = report.d_x_mm, report.d_y_mm
     axes = None if along is None or across is None else (along.median, across.median)
-    return axes, 0.0 if told.angle_deg is None else told.angle_deg.median
+    return axes, 0.0 if report.angle_deg is None else report.angle_deg.median
 
 
 def _draw_fit(axes: Axes, report: EstimateReport, view: Orientation) -> None:
@@ -413,7 +412,7 @@ def _draw_fit(axes: Axes, report: EstimateReport, view: Orientation) -> None:
     axes_mm, angle_deg = ellipse_of(report)
     if axes_mm is not None:
         ellipses.insert(0, (axes_mm, "-", 1.8, "size, median {:.1f} by {:.1f} mm".format(*axes_mm)))
-    centre = _pair(view, *place.median)
+    centre = _across_up(view, *place.median)
     for size_mm, dash, width, label in ellipses:
         _draw_ellipse(axes, centre, size_mm, angle_deg, view, linewidth=width, linestyle=dash, label=label)
     axes.plot(*centre, "+", color="white", markersize=9, markeredgewidth=1.6, path_effects=_outlined(3.2))
@@ -426,7 +425,7 @@ def _draw_ellipse(
     """Draw an ellipse of the given diameters, outlined in black."""
     angle = -angle_deg if view.swapped else angle_deg
     ellipse = load_matplotlib().patches.Ellipse(
-        centre, *_pair(view, *size_mm), angle=angle, fill=False, edgecolor="white", **line
+        centre, *_across_up(view, *size_mm), angle=angle, fill=False, edgecolor="white", **line
     )
     ellipse.set_path_effects(_outlined(line["linewidth"] + 1.6))
     axes.add_patch(ellipse)
@@ -435,7 +434,7 @@ def _draw_ellipse(
 def _draw_masses(axes: Axes, report: EstimateReport, view: Orientation) -> None:
     """Draw the number of each of several masses, and a cross and the size of those besides the fitted lump."""
     for mass in report.masses if len(report.masses) > 1 else ():
-        centre, (size_mm, angle_deg) = _pair(view, *mass.centre_mm.median), ellipse_of(mass)
+        centre, (size_mm, angle_deg) = _across_up(view, *mass.centre_mm.median), ellipse_of(mass)
         above = max(size_mm or (0.0, 0.0)) / 2.0
         top = centre[1] + (above if axes.get_ylim()[1] > axes.get_ylim()[0] else -above)
         words = f"mass {mass.number}"
@@ -450,11 +449,11 @@ def _draw_masses(axes: Axes, report: EstimateReport, view: Orientation) -> None:
 def _draw_places(axes: Axes, places: Sequence[PassedOver], view: Orientation) -> None:
     """Draw a numbered cross at each place where no lump was measured."""
     for number, place in enumerate(places, start=1):
-        at = _pair(view, place.x_mm, place.y_mm)
-        axes.plot(*at, "x", color="white", markersize=6, markeredgewidth=1.4, path_effects=_outlined(3.0))
+        point = _across_up(view, place.x_mm, place.y_mm)
+        axes.plot(*point, "x", color="white", markersize=6, markeredgewidth=1.4, path_effects=_outlined(3.0))
         if number <= _EXPLAINED_PLACES:
             beside = _ABOVE | {"ha": "left", "va": "center", "fontsize": 9, "path_effects": _outlined(2.5)}
-            axes.annotate(f"{number}", at, xytext=(6, 0), **beside)
+            axes.annotate(f"{number}", point, xytext=(6, 0), **beside)
 
 
 def _draw_scale_bar(axes: Axes) -> None:

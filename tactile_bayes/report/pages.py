@@ -51,8 +51,8 @@ def cut(text: str, longest: int = 400) -> str:
 def foot(scans: Iterable[Mapping[str, str]], more: str = "") -> str:
     """Last line of a page: the program, `more` of it, the first scans by their digests, and what sizes come from."""
     digests = [one["sha256"][:12] for one in scans if one.get("sha256")][:_MOST_SCANS]
-    told = [f"scan{'s' if len(digests) > 1 else ''} {', '.join(digests)}"] if digests else []
-    made = "; ".join(filter(None, [f"tactile-bayes {__version__}", more, *told]))
+    named_scans = [f"scan{'s' if len(digests) > 1 else ''} {', '.join(digests)}"] if digests else []
+    made = "; ".join(filter(None, [f"tactile-bayes {__version__}", more, *named_scans]))
     return f"{made}. Sizes come from simulated bodies; no scan of a person has been used. {RESEARCH_USE}"
 
 
@@ -104,8 +104,8 @@ class Growth(Record, eq=False):
     @property
     def outcome(self) -> str:
         """What became of the mass, or why nothing is known of it."""
-        told = ", ".join(filter(None, (self.verdict.replace("_", " "), self.reason)))
-        return told if self.verdict else f"not compared: {self.reason}"
+        words = ", ".join(filter(None, (self.verdict.replace("_", " "), self.reason)))
+        return words if self.verdict else f"not compared: {self.reason}"
 
     @property
     def words(self) -> str:
@@ -118,9 +118,9 @@ def growth_line(rows: Sequence[Growth], table: str) -> str:
     if not rows:
         return ""
     last = {(row.patient, row.mass): row.verdict for row in rows}
-    counts = Counter(found.replace("_", " ") or "not compared" for found in last.values())
-    told = ", ".join(f"{counts[words]} {words}" for words in _OUTCOMES if counts[words])
-    return f"growth of {len(last)} mass{'es' * (len(last) > 1)} with several visits: {told} ({table})"
+    counts = Counter(verdict.replace("_", " ") or "not compared" for verdict in last.values())
+    parts = ", ".join(f"{counts[words]} {words}" for words in _OUTCOMES if counts[words])
+    return f"growth of {len(last)} mass{'es' * (len(last) > 1)} with several visits: {parts} ({table})"
 
 
 # --- A page as files: HTML, and printed to PDF.
@@ -163,7 +163,7 @@ _TIMES: Final = re.compile(rb"/(CreationDate|ModDate) ?\(D:[0-9+Z'-]*\)")
 
 def find_printer() -> Printer:
     """What prints a page here."""
-    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if browser is not None:
         return lambda text: _by_browser(browser, text)
     if find_spec("weasyprint") is not None:
@@ -179,7 +179,7 @@ def _by_browser(browser: str, text: str) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "page.html", Path(folder) / "page.pdf"
         source.write_text(text, encoding="utf-8")
-        words = [
+        command = [
             browser,
             "--headless",
             "--disable-gpu",
@@ -193,13 +193,13 @@ def _by_browser(browser: str, text: str) -> bytes:
             source.as_uri(),
         ]
         try:
-            done = subprocess.run(words, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+            done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
         except (OSError, subprocess.TimeoutExpired) as error:
             raise UsageError(f"{browser} did not print the page ({error}); print it from your browser") from None
         if not target.exists():
             last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1][:200]
             raise UsageError(f"{browser} did not print the page ({last}); print it from your browser")
-        return _TIMES.sub(lambda found: re.sub(rb"[0-9]", b"0", found[0]), target.read_bytes())
+        return _TIMES.sub(lambda time: re.sub(rb"[0-9]", b"0", time[0]), target.read_bytes())
 
 
 def _by_weasyprint(text: str) -> bytes:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 # --- How evenly heads press, as text and as plain data.
 
 
-def named(head: Head) -> str:
+def head_words(head: Head) -> str:
     """A head in a few words."""
     return f"{_arc(head)}, {head.shoulders} of {head.shoulder_mm:g} mm"
 
@@ -38,60 +38,63 @@ def _arc(head: Head) -> str:
     return "flat" if np.isinf(head.radius_mm) else f"R {head.radius_mm:g} mm"
 
 
-def uniformity_text(found: Uniformity, tissue: HomogeneousTissue, *, limit: float) -> str:
+def uniformity_text(head: Uniformity, tissue: HomogeneousTissue, *, limit: float) -> str:
     """One head: a table of moduli and pressures, and whether it meets the limit."""
-    words = "within" if found.worst <= limit else "beyond"
+    words = "within" if head.worst <= limit else "beyond"
     return "\n".join(
         [
-            f"largest departure {100 * found.worst:.1f} %, {words} {100 * limit:g} %",
-            f"head: {named(found.head)}, face {found.face_mm:.1f} mm wide",
+            f"largest departure {100 * head.worst:.1f} %, {words} {100 * limit:g} %",
+            f"head: {head_words(head.head)}, face {head.face_mm:.1f} mm wide",
             _tissue_line(tissue),
-            *_pressure_table(found, tissue),
+            *_pressure_table(head, tissue),
         ]
     )
 
 
-def design_text(found: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit: float) -> str:
+def design_text(heads: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit: float) -> str:
     """The whole search: the answer with its own table, then a table for each place of the shoulders."""
-    count = sum(one.worst <= limit for one in found)
-    lines = [f"{count} of {len(found)} heads stay within {100 * limit:g} % of the mean"]
+    count = sum(one.worst <= limit for one in heads)
+    lines = [f"{count} of {len(heads)} heads stay within {100 * limit:g} % of the mean"]
 
-    def told(one: Uniformity, worst: float) -> str:
-        return f"{named(one.head)}, {100 * worst:.1f} %, face {one.face_mm:.1f} mm wide"
+    def words(one: Uniformity, worst: float) -> str:
+        return f"{head_words(one.head)}, {100 * worst:.1f} %, face {one.face_mm:.1f} mm wide"
 
-    best = most_even(found)
-    lines.append(f"most even: {told(best, best.worst)}")
-    if (answer := narrowest(found, limit=limit)) is not None:
-        lines += [f"narrowest within the limit: {told(answer, answer.worst)}", *_pressure_table(answer, tissue)]
-    if (by_rms := narrowest(found, limit=limit, by_rms=True)) is not None:
-        lines.append(f"narrowest whose root mean square is within it: {told(by_rms, by_rms.worst_rms)}")
+    best = most_even(heads)
+    lines.append(f"most even: {words(best, best.worst)}")
+    if (answer := narrowest(heads, limit=limit)) is not None:
+        lines += [
+            f"narrowest within the limit: {words(answer, answer.worst)}",
+            *_pressure_table(answer, tissue),
+        ]
+    if (by_rms := narrowest(heads, limit=limit, by_rms=True)) is not None:
+        lines.append(f"narrowest whose root mean square is within it: {words(by_rms, by_rms.worst_rms)}")
     lines.append(_tissue_line(tissue))
-    for kind in dict.fromkeys(one.head.shoulders for one in found):
-        lines += ["", *_grid(kind, [one for one in found if one.head.shoulders == kind], limit=limit)]
+    for kind in dict.fromkeys(one.head.shoulders for one in heads):
+        lines += ["", *_grid(kind, [one for one in heads if one.head.shoulders == kind], limit=limit)]
     return "\n".join(lines)
 
 
-def uniformity_document(found: Uniformity, tissue: HomogeneousTissue, *, limit: float) -> dict[str, object]:
+def uniformity_document(head: Uniformity, tissue: HomogeneousTissue, *, limit: float) -> dict[str, object]:
     """One head as plain data; departures as shares of the mean."""
     return {
         "schema": "tactile-bayes/head-uniformity/1",
         **_tissue_document(tissue, limit),
-        **_head_document(found),
-        "largest": found.largest.tolist(),
-        "rms": found.rms.tolist(),
-        "within_limit": found.worst <= limit,
+        **_head_document(head),
+        "largest": head.largest.tolist(),
+        "rms": head.rms.tolist(),
+        "within_limit": head.worst <= limit,
         "research_use": RESEARCH_USE,
     }
 
 
-def design_document(found: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit: float) -> dict[str, object]:
+def design_document(heads: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit: float) -> dict[str, object]:
     """The whole search as plain data; `answer` is None where no head meets the limit."""
-    answer, by_rms = narrowest(found, limit=limit), narrowest(found, limit=limit, by_rms=True)
+    answer, by_rms = narrowest(heads, limit=limit), narrowest(heads, limit=limit, by_rms=True)
     return {
         "schema": "tactile-bayes/head-design/1",
         **_tissue_document(tissue, limit),
-        "heads": [_head_document(one) for one in found],
-        "most_even": _head_document(most_even(found)),
+        "heads": [_head_document(one) for one in heads],
+        "most_even": _head_document(most_even(heads)),
         "answer": answer and _head_document(answer),
         "answer_by_rms": by_rms and _head_document(by_rms),
         "research_use": RESEARCH_USE,
@@ -106,25 +109,25 @@ def _tissue_line(tissue: HomogeneousTissue) -> str:
     )
 
 
-def _pressure_table(found: Uniformity, tissue: HomogeneousTissue) -> list[str]:
+def _pressure_table(head: Uniformity, tissue: HomogeneousTissue) -> list[str]:
     columns = "".join(f"{f'{value:g} kPa':>16}" for value in tissue.pressures_kpa)
     lines = ["largest departure of a taxel from its frame's mean, % (root mean square)", f"{'modulus':>9}{columns}"]
-    for modulus, largest, rms in zip(tissue.moduli_kpa, found.largest, found.rms, strict=True):
+    for modulus, largest, rms in zip(tissue.moduli_kpa, head.largest, head.rms, strict=True):
         cells = "".join(f"{f'{100 * a:.1f} ({100 * b:.1f})':>16}" for a, b in zip(largest, rms, strict=True))
         lines.append(f"{f'{modulus:g} kPa':>9}{cells}")
     return lines
 
 
-def _grid(kind: str, found: Sequence[Uniformity], *, limit: float) -> list[str]:
+def _grid(kind: str, heads: Sequence[Uniformity], *, limit: float) -> list[str]:
     """Radii down, shoulders across; a star marks what meets the limit."""
     where = "cut into the sensing width" if kind == SHOULDERS_INSIDE else "around the sensing width"
-    shoulders = sorted({one.head.shoulder_mm for one in found})
-    cells = {(one.head.radius_mm, one.head.shoulder_mm): one.worst for one in found}
+    shoulders = sorted({one.head.shoulder_mm for one in heads})
+    cells = {(one.head.radius_mm, one.head.shoulder_mm): one.worst for one in heads}
     lines = [
         f"{kind} ({where}): largest departure over all moduli and pressures, %; * within {100 * limit:g} %",
         f"{'R, mm':>8}" + "".join(f"{f'r {value:g}':>6}" for value in shoulders),
     ]
-    for radius in sorted({one.head.radius_mm for one in found}):
+    for radius in sorted({one.head.radius_mm for one in heads}):
         name = "flat" if np.isinf(radius) else f"{radius:g}"
         row = [cells.get((radius, shoulder)) for shoulder in shoulders]
         marked = [
@@ -164,35 +167,36 @@ _MODULUS_COLOURS = (COLOURS[0], COLOURS[2], COLOURS[1])
 
 
 def design_figure(
-    found: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit: float, path: Path, force: bool = False
+    heads: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit: float, path: Path, force: bool = False
 ) -> None:
     """Draw the search, for the place of the shoulders that holds the answer; `limit` is a share of the mean."""
-    answer = narrowest(found, limit=limit) or most_even(found)
-    shown = [one for one in found if one.head.shoulders == answer.head.shoulders]
+    answer = narrowest(heads, limit=limit) or most_even(heads)
+    drawn = [one for one in heads if one.head.shoulders == answer.head.shoulders]
+    cross = head_words(answer.head)
     text = (
         f"Homogeneous tissue of {tissue.modulus_kpa[0]:g} to {tissue.modulus_kpa[1]:g} kPa, {tissue.thickness_mm:g} mm "
-        f"thick, {answer.head.shoulders}; black line and grey band: {100 * limit:g} %; cross: {named(answer.head)}."
+        f"thick, {answer.head.shoulders}; black line and grey band: {100 * limit:g} %; cross: {cross}."
     )
     with figure_file(path, size_in=(12.0, 7.4), foot=text, force=force) as figure:
         upper, (every, cross, simulated) = figure.subplots(2, 3)
         for k, (axes, pressure) in enumerate(zip(upper, tissue.pressures_kpa, strict=True)):
-            worst = [float(one.largest[:, k].max()) for one in shown]
-            _draw_grid(axes, shown, worst, f"({'abc'[k]}) {pressure:g} kPa, any modulus", limit, answer)
-        worst = [one.worst for one in shown]
-        mesh = _draw_grid(every, shown, worst, "(d) any modulus and pressure", limit, answer)
+            worst = [float(one.largest[:, k].max()) for one in drawn]
+            _draw_grid(axes, drawn, worst, f"({'abc'[k]}) {pressure:g} kPa, any modulus", limit, answer)
+        worst = [one.worst for one in drawn]
+        mesh = _draw_grid(every, drawn, worst, "(d) any modulus and pressure", limit, answer)
         figure.colorbar(mesh, ax=upper[2], label="largest departure from the mean, %")
         _draw_shares(cross, answer, tissue, limit, "(e) cross")
-        plain = min(shown, key=lambda one: (abs(one.head.radius_mm - 35.0), abs(one.head.shoulder_mm - 3.0)))
+        plain = min(drawn, key=lambda one: (abs(one.head.radius_mm - 35.0), abs(one.head.shoulder_mm - 3.0)))
         _draw_shares(simulated, plain, tissue, limit, "(f) simulated head")
 
 
 def _draw_grid(
-    axes: Axes, found: Sequence[Uniformity], worst: Sequence[float], title: str, limit: float, answer: Uniformity
+    axes: Axes, heads: Sequence[Uniformity], worst: Sequence[float], title: str, limit: float, answer: Uniformity
 ) -> QuadMesh:
     """Radius across, shoulder up, colours on a logarithmic scale; the heads within the limit are outlined."""
-    radii, shoulders = (sorted({getattr(one.head, name) for one in found}) for name in ("radius_mm", "shoulder_mm"))
+    radii, shoulders = (sorted({getattr(one.head, name) for one in heads}) for name in ("radius_mm", "shoulder_mm"))
     cells: FloatArray = np.full((len(shoulders), len(radii)), np.nan)
-    for one, value in zip(found, worst, strict=True):
+    for one, value in zip(heads, worst, strict=True):
         cells[shoulders.index(one.head.shoulder_mm), radii.index(one.head.radius_mm)] = 100 * value
     places = np.arange(len(radii)), np.arange(len(shoulders))
     mesh = axes.pcolormesh(*places, cells, cmap="cividis", norm="log", vmin=_LEAST, vmax=_MOST)
@@ -255,38 +259,38 @@ _BUMPS = {
 }
 
 
-def comparison_text(measured: MeasuredScan, found: Sequence[ModelComparison]) -> str:
+def comparison_text(measured: MeasuredScan, models: Sequence[ModelComparison]) -> str:
     """How far each model is off, then frames, maps and the bumps on them, with a few models side by side."""
     place = measured.place_mm
     lines = [
         *(
             f"{one.fidelity}: frames differ by {100 * one.figures['frames_all']:.2f} % MSD, "
             f"the map by {100 * one.figures['map_all']:.2f} %"
-            for one in found
+            for one in models
         ),
         f"{len(measured.level_kpa)} frames, mean pressure {measured.level_kpa.mean():.2f} kPa; "
         f"lump at {place[0]:.1f}, {place[1]:.1f} mm of the map",
         DEFINITION,
         "",
     ]
-    for first in range(0, len(found), _BESIDE):
-        lines += _columns(measured, found[first : first + _BESIDE])
+    for first in range(0, len(models), _BESIDE):
+        lines += _columns(measured, models[first : first + _BESIDE])
     return "\n".join(line.rstrip() for line in lines)
 
 
-def _columns(measured: MeasuredScan, found: Sequence[ModelComparison]) -> Iterator[str]:
-    names = [one.fidelity.partition("-") for one in found]
+def _columns(measured: MeasuredScan, models: Sequence[ModelComparison]) -> Iterator[str]:
+    names = [one.fidelity.partition("-") for one in models]
     yield _cells("", "paper", *(first for first, _, _ in names))
     if any(second for _, _, second in names):
         yield _cells("", "", *(second for _, _, second in names))
     for name, (words, times, digits) in _DIFFERENCES.items():
-        yield _cells(words, _PRINTED.get(name, ""), *(f"{times * one.figures[name]:.{digits}f}" for one in found))
+        yield _cells(words, _PRINTED.get(name, ""), *(f"{times * one.figures[name]:.{digits}f}" for one in models))
     yield ""
-    every = [measured.figures, *(one.figures for one in found)]
+    every = [measured.figures, *(one.figures for one in models)]
     for beside, (title, rows) in zip(("measured", ""), _BUMPS.items(), strict=True):
         yield _cells(title, beside)
         for name, words in rows.items():
-            yield _cells(words, *(_plain(one[name]) for one in every))
+            yield _cells(words, *(_figure_cell(one[name]) for one in every))
 
 
 def _cells(words: str, beside: str, *models: str) -> str:
@@ -298,13 +302,13 @@ def finite(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
 
 
-def _plain(value: float) -> str:
+def _figure_cell(value: float) -> str:
     """A model without a bump in the map's plane, such as a cylinder, has none to show."""
     return f"{value:.3f}" if np.isfinite(value) else "none"
 
 
 def comparison_document(
-    measured: MeasuredScan, found: Sequence[ModelComparison], *, inputs: dict[str, Any]
+    measured: MeasuredScan, models: Sequence[ModelComparison], *, inputs: dict[str, Any]
 ) -> dict[str, Any]:
     """The same as plain data; differences as shares, null where no bump was fitted."""
     return {
@@ -315,7 +319,7 @@ def comparison_document(
         "place_mm": list(measured.place_mm),
         "measured": {name: finite(value) for name, value in measured.figures.items()},
         "models": [
-            {"fidelity": one.fidelity, **{name: finite(value) for name, value in one.figures.items()}} for one in found
+            {"fidelity": one.fidelity, **{name: finite(value) for name, value in one.figures.items()}} for one in models
         ],
         "research_use": RESEARCH_USE,
     }
@@ -331,19 +335,19 @@ _ALONG_MM = 6.0
 
 
 def comparison_figure(
-    measured: MeasuredScan, found: Sequence[ModelComparison], path: Path, *, title: str, force: bool = False
+    measured: MeasuredScan, models: Sequence[ModelComparison], path: Path, *, title: str, force: bool = False
 ) -> None:
     """Draw the comparison; maps and residual are those of the first model."""
     with figure_file(path, size_in=(12.0, 8.0), foot=f"{title}.", force=force) as figure:
-        (frames, line, beside), (seen, model, left) = figure.subplots(2, 3)
-        _draw_frames(frames, measured, found, _PLACES_MM[0], "(a)")
-        _draw_frames(line, measured, found, _PLACES_MM[1], "(b)")
-        _draw_line(beside, measured, found)
-        ours, theirs = measured.tactile_map.mean, found[0].tactile_map.mean
+        (frames, line, beside), (seen, modelled, left) = figure.subplots(2, 3)
+        _draw_frames(frames, measured, models, _PLACES_MM[0], "(a)")
+        _draw_frames(line, measured, models, _PLACES_MM[1], "(b)")
+        _draw_line(beside, measured, models)
+        ours, theirs = measured.tactile_map.mean, models[0].tactile_map.mean
         ends = np.nanmin(theirs), np.nanmax(theirs)
-        for axes, values, name in ((seen, ours, "(d) measured"), (model, theirs, f"(e) {found[0].fidelity}")):
+        for axes, values, name in ((seen, ours, "(d) measured"), (modelled, theirs, f"(e) {models[0].fidelity}")):
             mesh = _draw_map(axes, measured, values, name, ends, "viridis")
-        figure.colorbar(mesh, ax=model, shrink=0.7, label="pressure / mean of its frame")
+        figure.colorbar(mesh, ax=modelled, shrink=0.7, label="pressure / mean of its frame")
         residual = ours - theirs
         most = float(np.nanmax(np.abs(residual)))
         mesh = _draw_map(left, measured, residual, "(f) measured less modelled", (-most, most), "RdBu_r")
@@ -351,7 +355,7 @@ def comparison_figure(
 
 
 def _draw_frames(
-    axes: Axes, measured: MeasuredScan, found: Sequence[ModelComparison], place_mm: float, letter: str
+    axes: Axes, measured: MeasuredScan, models: Sequence[ModelComparison], place_mm: float, letter: str
 ) -> None:
     """The centre line of frames whose middle lies at a distance from the lump across it, averaged."""
     off = measured.origin_mm[:, :2] - measured.place_mm
@@ -361,17 +365,17 @@ def _draw_frames(
     s: FloatArray = pitch * (np.arange(count) - 0.5 * (count - 1))
     if near.any():
         axes.plot(s, centre_line(measured.pressure_kpa)[near].mean(axis=0), color="0.55", lw=3.5, label="measured")
-        for one, colour, style in zip(found, COLOURS, _LINES, strict=False):
+        for one, colour, style in zip(models, COLOURS, _LINES, strict=False):
             axes.plot(s, centre_line(one.pressure_kpa)[near].mean(axis=0), style, color=colour, label=one.fidelity)
     words = f"head {place_mm:g} mm from the lump, {near.sum()} frames"
     finish(axes, f"{letter} {words}", "position on the head (mm)", "pressure (kPa)")
 
 
-def _draw_line(axes: Axes, measured: MeasuredScan, found: Sequence[ModelComparison]) -> None:
+def _draw_line(axes: Axes, measured: MeasuredScan, models: Sequence[ModelComparison]) -> None:
     x, mean = centre_row(measured, measured.tactile_map)
     near = np.abs(x) <= NEAR_MM
     axes.plot(x[near], mean[near], "x", color="0.45", markersize=4, label="measured")
-    for one, colour, style in zip(found, COLOURS, _LINES, strict=False):
+    for one, colour, style in zip(models, COLOURS, _LINES, strict=False):
         x, mean = centre_row(measured, one.tactile_map)
         near = np.abs(x) <= NEAR_MM
         axes.plot(

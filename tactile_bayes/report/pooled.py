@@ -29,34 +29,34 @@ MOST_NAMED = 4
 # landmarks the masses of all maps have places in patient axes, and the one that most maps show is pooled.
 
 
-def elsewhere(reports: Sequence[EstimateReport]) -> dict[int, tuple[float, float]]:
+def maps_of_another_mass(reports: Sequence[EstimateReport]) -> dict[int, tuple[float, float]]:
     """Maps that report another mass than the common one, with its place on each, mm; empty without landmarks."""
-    maps = _masses(reports)
-    common = _common(maps)
-    there = {} if common is None else {i: _nearest(masses, common) for i, masses in maps.items()}
-    return {i: one.centre_mm.median for i, one in there.items() if one is not None and not one.reported}
+    maps = _masses_by_map(reports)
+    common = _common_mass(maps)
+    nearest = {} if common is None else {i: _matching_mass(masses, common) for i, masses in maps.items()}
+    return {i: one.centre_mm.median for i, one in nearest.items() if one is not None and not one.reported}
 
 
-def apart_from_others(reports: Sequence[EstimateReport]) -> dict[int, str] | None:
+def maps_lying_apart(reports: Sequence[EstimateReport]) -> dict[int, str] | None:
     """Maps whose reported mass lies elsewhere than the common one, in words; None where that cannot be told."""
-    reported = {i: [one for one in masses if one.reported] for i, masses in _masses(reports).items()}
+    reported = {i: [one for one in masses if one.reported] for i, masses in _masses_by_map(reports).items()}
     if len(reported) < 2:
         return None
-    found = [one for masses in reported.values() for one in masses]
-    common = _common(reported) or max(found, key=_amplitude, default=None)
-    away = {i: _away_mm(one, common) for i, masses in reported.items() for one in masses if common is not None}
+    all_masses = [one for masses in reported.values() for one in masses]
+    common = _common_mass(reported) or max(all_masses, key=_amplitude, default=None)
+    distances = {i: _distance_mm(one, common) for i, masses in reported.items() for one in masses if common is not None}
     words = "its mass lies {:.0f} mm from that of the other maps and may be another one"
-    return {i: words.format(mm) for i, mm in away.items() if mm > MATCH_MM}
+    return {i: words.format(mm) for i, mm in distances.items() if mm > MATCH_MM}
 
 
-def _masses(reports: Sequence[EstimateReport]) -> dict[int, tuple[MassReport, ...]]:
+def _masses_by_map(reports: Sequence[EstimateReport]) -> dict[int, tuple[MassReport, ...]]:
     """Masses of the maps with a lump, by the map's place in the list; none where one has no place in the patient."""
-    found = {i: one.masses for i, one in enumerate(reports) if one.masses}
-    return {} if any(one.centre_patient_mm is None for masses in found.values() for one in masses) else found
+    by_map = {i: one.masses for i, one in enumerate(reports) if one.masses}
+    return {} if any(one.centre_patient_mm is None for masses in by_map.values() for one in masses) else by_map
 
 
-def _away_mm(one: MassReport, other: MassReport) -> float:
-    assert one.centre_patient_mm is not None  # see `_masses`
+def _distance_mm(one: MassReport, other: MassReport) -> float:
+    assert one.centre_patient_mm is not None  # see `_masses_by_map`
     assert other.centre_patient_mm is not None
     return float(np.hypot(*np.subtract(one.centre_patient_mm.median, other.centre_patient_mm.median)))
 
@@ -65,23 +65,23 @@ def _amplitude(mass: MassReport) -> float:
     return 0.0 if mass.amplitude is None else mass.amplitude.median
 
 
-def _common(maps: Mapping[int, Sequence[MassReport]]) -> MassReport | None:
+def _common_mass(maps: Mapping[int, Sequence[MassReport]]) -> MassReport | None:
     """A mass at the place where most maps show one, sized by most, then reported by most; None where all are apart."""
 
     def worth(common: MassReport) -> tuple[int, int, int, float]:
         """On how many maps it is found, sized and reported, and the median of its amplitudes."""
-        there = [one for one in (_nearest(masses, common) for masses in maps.values()) if one is not None]
-        sized, reported = sum(one.max_size_mm is not None for one in there), sum(one.reported for one in there)
-        return len(there), sized, reported, float(np.median([_amplitude(one) for one in there]))
+        matches = [one for one in (_matching_mass(masses, common) for masses in maps.values()) if one is not None]
+        sized, reported = sum(one.max_size_mm is not None for one in matches), sum(one.reported for one in matches)
+        return len(matches), sized, reported, float(np.median([_amplitude(one) for one in matches]))
 
     best = max((one for masses in maps.values() for one in masses), key=worth, default=None)
     return best if best is not None and worth(best)[0] > 1 else None
 
 
-def _nearest(masses: Sequence[MassReport], common: MassReport) -> MassReport | None:
+def _matching_mass(masses: Sequence[MassReport], common: MassReport) -> MassReport | None:
     """The mass nearest to a place, if it lies within `MATCH_MM` of it."""
-    near = min(masses, key=lambda one: _away_mm(one, common), default=None)
-    return near if near is not None and _away_mm(near, common) <= MATCH_MM else None
+    near = min(masses, key=lambda one: _distance_mm(one, common), default=None)
+    return near if near is not None and _distance_mm(near, common) <= MATCH_MM else None
 
 
 # --- The report made.
@@ -98,8 +98,8 @@ def pooled_report(
     repeatability: Repeatability | None = None,
 ) -> PooledReport:
     """Report of a mass from what `estimate` says of its maps; `repeatability`: the site's, where the size is by it."""
-    size, used = pooled.size, pooled.calibration or calibration
-    head = unknown_head(used.recipe.head)
+    size, sized_by = pooled.size, pooled.calibration or calibration
+    head = unknown_head(sized_by.recipe.head)
     largest, smallest = (None if size is None else size.summarise(one, probability=probability) for one in EXTREMES)
     return PooledReport(
         schema=POOLED,
@@ -111,22 +111,22 @@ def pooled_report(
         min_size_mm=smallest,
         another_exam=another_exam(size, probability=probability),
         supposing=suppositions(size, largest),
-        maps=tuple(_map(i, name, reports[i], pooled) for i, name in enumerate(names)),
+        maps=tuple(_pooled_map(i, name, reports[i], pooled) for i, name in enumerate(names)),
         one_size_probability=pooled.one_size,
         one_place_probability=pooled.one_place,
         variance_share=None if size is None else dict(size.variance_share),
         figures={} if size is None else dict(size.figures),
-        left_out=(*([head] if any(head in one.left_out for one in reports) else []), *used.omissions()),
-        fat_mm=used.fat_mm,
-        unknowns=dict(used.unknowns),
-        site=None if used.site is None else site_words(used.site),
+        left_out=(*([head] if any(head in one.left_out for one in reports) else []), *sized_by.omissions()),
+        fat_mm=sized_by.fat_mm,
+        unknowns=dict(sized_by.unknowns),
+        site=None if sized_by.site is None else site_words(sized_by.site),
         repeatability=UNSET if repeatability is None else repeatability.words(),
         research_use=RESEARCH_USE,
         provenance=provenance.as_dict(),
     ).rounded
 
 
-def _map(index: int, name: str, report: EstimateReport, pooled: PooledEstimate) -> PooledMap:
+def _pooled_map(index: int, name: str, report: EstimateReport, pooled: PooledEstimate) -> PooledMap:
     size, reported = report.max_size_mm, [one.number for one in report.masses if one.reported]
     return PooledMap(
         map=name,
@@ -150,7 +150,7 @@ def pooled_findings(pooled: PooledEstimate, reports: Sequence[EstimateReport]) -
         for one in reports[index].findings:
             if one.kind != "outside_calibration":  # of the size alone
                 yield one.labelled(_number(index))
-    apart = apart_from_others(reports)
+    apart = maps_lying_apart(reports)
     for index, words in (apart or {}).items():
         yield finding("another_mass", words, about=_number(index))
     for index, earlier in repeated_scans([scans_of(one.provenance) for one in reports]).items():
@@ -169,12 +169,12 @@ def pooled_findings(pooled: PooledEstimate, reports: Sequence[EstimateReport]) -
             yield finding("several_masses", text, same, same, _number(index))
 
 
-def disagreement(what: str, probability: float, if_exams_differ: float | None = None) -> Finding:
+def disagreement(reason: str, probability: float, if_exams_differ: float | None = None) -> Finding:
     """Caution where maps are not of one size or mass: one gives maps so far apart with these probabilities only."""
     patients = ""
     if if_exams_differ is not None:
         patients = f" ({chance_text(if_exams_differ, 3)} if exams differ as those of patients did)"
-    text = f"{what}; one mass gives maps so far apart with a probability of {chance_text(probability, 3)}{patients}"
+    text = f"{reason}; one mass gives maps so far apart with a probability of {chance_text(probability, 3)}{patients}"
     on_paper = "look at each map: one may be of another mass or of another day"
     return finding("maps_disagree", text, f"{on_paper}, or exams differ more at this site (--repeatability)", on_paper)
 
@@ -194,14 +194,14 @@ def pooled_summary(report: PooledReport) -> str:
     """Report of a mass in at most 12 lines; `pooled_text` gives the rest."""
     findings, largest, figures = report.findings, report.max_size_mm, report.figures
     lines = finding_summary(findings, "caution", most=2)
-    found = [one.max_size_mm for one in report.maps if one.max_size_mm is not None]
-    if found:
-        sizes = ", ".join(_size_words(one, with_ends=report.status == DISAGREE) for one in found[:MOST_NAMED])
-        more = f" and {len(found) - MOST_NAMED} more" if len(found) > MOST_NAMED else ""
-        lines.append(f"A lump was found on {len(found)} of {len(report.maps)} maps, alone sized at {sizes}{more} mm.")
+    sizes = [one.max_size_mm for one in report.maps if one.max_size_mm is not None]
+    if sizes:
+        words = ", ".join(_size_words(one, with_ends=report.status == DISAGREE) for one in sizes[:MOST_NAMED])
+        more = f" and {len(sizes) - MOST_NAMED} more" if len(sizes) > MOST_NAMED else ""
+        lines.append(f"A lump was found on {len(sizes)} of {len(report.maps)} maps, alone sized at {words}{more} mm.")
     lines += finding_summary(findings, "check", most=2)
     if largest is None:
-        lines.append(_no_size(report))
+        lines.append(_no_size_line(report))
     else:
         lines += estimate_text.size_table(report) + estimate_text.width_lines(report.leading.variance_share or {})
         parts = [
@@ -222,7 +222,7 @@ def _size_words(size: Interval, *, with_ends: bool) -> str:
     return f"{size.median:.1f}" + (f" ({size.low:.1f} to {size.high:.1f})" if with_ends else "")
 
 
-def _no_size(report: PooledReport) -> str:
+def _no_size_line(report: PooledReport) -> str:
     head = "No common size" if report.status == DISAGREE else "No estimate"
     return f"{head}: {report.reason}."
 
@@ -231,14 +231,14 @@ def pooled_text(report: PooledReport) -> str:
     """Full report of a mass."""
     lines = finding_lines(report.findings, "caution")
     for number, one in enumerate(report.maps, start=1):
-        told = f"no estimate ({one.reason})"
+        outcome = f"no estimate ({one.reason})"
         if one.max_size_mm is not None:
             mass = "  (mass {} of {} on this map)".format(*one.mass) if one.mass else ""
-            told = f"{_size_words(one.max_size_mm, with_ends=True)} mm alone{mass}"
-        lines.append(f"{number}. {one.map}: {told}")
+            outcome = f"{_size_words(one.max_size_mm, with_ends=True)} mm alone{mass}"
+        lines.append(f"{number}. {one.map}: {outcome}")
     lines += finding_lines(report.findings, "check")
     if report.max_size_mm is None:
-        return "\n".join([*lines, _no_size(report), RESEARCH_USE]) + "\n"
+        return "\n".join([*lines, _no_size_line(report), RESEARCH_USE]) + "\n"
     sizes, figures = _sizes(report), report.figures
     worst, places = max(sizes, key=lambda q: q.mc_error), estimate_text.size_decimals(sizes)
     lines += [

@@ -122,20 +122,20 @@ def study_figures(
     the places drawn without any.
     """
     of_seat = [row for row in rows if row.seat == seat_name(seat)]
-    found = find_lookalikes(settings, seat=seat) if isinstance(settings, StudySettings) else None
+    lookalikes = find_lookalikes(settings, seat=seat) if isinstance(settings, StudySettings) else None
     with _panels(paths[0], _caption("Figure 5", settings, seat), force=force) as panels:
-        _frames_of_lumps(*panels, settings, seat, found)
+        _draw_figure_5(*panels, settings, seat, lookalikes)
     with _panels(paths[1], _caption("Figure 6", settings, seat), force=force) as panels:
         if isinstance(settings, StudySettings):
-            _frames_and_maps(*panels, settings, TableScene(PHANTOM, *phantom, seat), measured)
+            _draw_figure_6(*panels, settings, TableScene(PHANTOM, *phantom, seat), measured)
         else:
-            _map_of_ball(*panels, settings, seat)
+            _draw_figure_6_of_ball(*panels, settings, seat)
     with _panels(paths[2], _caption("Figure 7", settings, seat), force=force) as panels:
-        _figure_7(*panels, of_seat, settings, seat)
+        _draw_figure_7(*panels, of_seat, settings, seat)
     figure_8(of_seat, paths[3], force=force)
     if isinstance(settings, StudySettings):
         _four_lumps(settings, paths[4], seat=seat, force=force)
-    return found
+    return lookalikes
 
 
 def _four_lumps(settings: StudySettings, path: Path, *, seat: float, force: bool) -> None:
@@ -150,13 +150,14 @@ def _four_lumps(settings: StudySettings, path: Path, *, seat: float, force: bool
             finish(axes, title, _ON_HEAD, "pressure (kPa)", headroom=0.15)
 
 
-def lookalikes_text(found: Lookalikes | None) -> str:
+def lookalikes_text(lookalikes: Lookalikes | None) -> str:
     """Figure 5b's pair in a line, or that there is none."""
-    if found is None:
+    if lookalikes is None:
         return "figure 5b: no two visible lumps of sizes that differ by half"
-    pair = " and ".join(f"d {one.d_mm:g} mm at h/d {one.depth_ratio:.3g}" for one in (found.small, found.large))
-    share = f"{100 * found.difference:.1f} % of what the lump adds ({100 * found.of_mean:.2f} % of the mean)"
-    if found.difference <= ALIKE:
+    lumps = (lookalikes.small, lookalikes.large)
+    pair = " and ".join(f"d {one.d_mm:g} mm at h/d {one.depth_ratio:.3g}" for one in lumps)
+    share = f"{100 * lookalikes.difference:.1f} % of what the lump adds ({100 * lookalikes.of_mean:.2f} % of the mean)"
+    if lookalikes.difference <= ALIKE:
         return f"figure 5b: indistinguishable are {pair}: their frames differ by {share}"
     return f"figure 5b: no pair within {100 * ALIKE:g} %; the most alike frames, {pair}, differ by {share}"
 
@@ -189,8 +190,8 @@ def _caption(name: str, settings: StudySettings | SolidSettings, seat: float) ->
     )
 
 
-def _frames_of_lumps(
-    left: Axes, right: Axes, settings: StudySettings | SolidSettings, seat: float, found: Lookalikes | None
+def _draw_figure_5(
+    left: Axes, right: Axes, settings: StudySettings | SolidSettings, seat: float, lookalikes: Lookalikes | None
 ) -> None:
     """Fig 5: frames far from the lump on fat of six thicknesses, and over lumps; in two dimensions with Eq 1, and two
     lumps that look alike."""
@@ -207,10 +208,11 @@ def _frames_of_lumps(
     cases = zip(COLOURS, ("-", "-", "-"), _BALLS, strict=False)
     if flat:
         where, far, title = _ON_HEAD, "fat over gland, 70 mm in all", "over the lump: no two visible lumps"
-        alike = [] if found is None else [(one.d_mm, one.depth_ratio) for one in (found.small, found.large)]
-        cases = zip(COLOURS[1:], ("-", "--", "-"), [*alike, _OTHER], strict=False)
-    if found is not None:
-        title = f"over the lump: two differ by {100 * found.difference:.1f} % of their rise"
+        alike = [] if lookalikes is None else [lookalikes.small, lookalikes.large]
+        lumps = [*((one.d_mm, one.depth_ratio) for one in alike), _OTHER]
+        cases = zip(COLOURS[1:], ("-", "--", "-"), lumps, strict=False)
+    if lookalikes is not None:
+        title = f"over the lump: two differ by {100 * lookalikes.difference:.1f} % of their rise"
     for colour, style, (d, h) in cases:
         frame = settings.over_lump(settings.body(d, h, seat=seat))
         right.plot(frame.s_mm, frame.at(0.0), style, color=colour, label=f"d {d:g} mm, h/d {h:.3g}")
@@ -218,7 +220,7 @@ def _frames_of_lumps(
     finish(right, f"(b) {title}", where, "pressure (kPa)", headroom=0.15)
 
 
-def _frames_and_maps(
+def _draw_figure_6(
     left: Axes, right: Axes, settings: StudySettings, scene: TableScene, measured: Sequence[FrameAgreement]
 ) -> None:
     """Fig 6: frames and map of a phantom, elastic and empirical; measured frames, thick, where there are any."""
@@ -250,7 +252,7 @@ def _draw_frames(axes: Axes, elastic: LineFrames, empirical: LineFrames) -> None
         axes.plot(empirical.s_mm, empirical.at(place), ":", color=colour)
 
 
-def _map_of_ball(left: Axes, right: Axes, settings: SolidSettings, seat: float) -> None:
+def _draw_figure_6_of_ball(left: Axes, right: Axes, settings: SolidSettings, seat: float) -> None:
     """Fig 6: the map of the first phantom, and its sections along both axes of the head."""
     d, h = PHANTOMS[PHANTOM]
     made = settings.maps(settings.body(d, h, seat=seat))(HARD_RATIO)
@@ -277,7 +279,7 @@ def _section(made: TactileMap, axis: str) -> tuple[FloatArray, FloatArray]:
     return across[read], np.asarray(mean[np.ix_(chosen, read)].mean(axis=0))
 
 
-def _figure_7(left: Axes, right: Axes, rows: Sequence[StudyRow], settings: CaseSettings, seat: float) -> None:
+def _draw_figure_7(left: Axes, right: Axes, rows: Sequence[StudyRow], settings: CaseSettings, seat: float) -> None:
     """Maps of a small lump of several stiffnesses with Eq 5 or 7 fitted to them, of a ball across the head, and how
     little the widths depend on stiffness."""
     flat = isinstance(settings, StudySettings)
@@ -285,11 +287,11 @@ def _figure_7(left: Axes, right: Axes, rows: Sequence[StudyRow], settings: CaseS
     maps = settings.maps(settings.body(d, h, seat=seat))
     for colour, ratio in zip(COLOURS, PAPER_STIFFNESS_RATIOS, strict=False):
         made = maps(ratio)
-        found = settings.fitted(made)
+        bump = settings.fitted(made)
         x, value = (made.x_mm, made.mean) if flat else _section(made, "x")
-        both = " x ".join(f"{width:.{2 if flat else 1}f}" for width in found.widths_mm if width is not None)
+        both = " x ".join(f"{width:.{2 if flat else 1}f}" for width in bump.widths_mm if width is not None)
         near = np.abs(x) <= 20.0
-        text = f"E2/E1 {ratio:g}: a {found.amplitude:.3f}, sigma {both} mm"
+        text = f"E2/E1 {ratio:g}: a {bump.amplitude:.3f}, sigma {both} mm"
         left.plot(x[near], value[near], color=colour, label=text)
     level = [row for row in rows if abs(row.depth_ratio - 1.0) < 1e-9 and row.detectable]
     for i, diameter in enumerate(dict.fromkeys(row.d_mm for row in hard_cases(level))):
@@ -303,8 +305,8 @@ def _figure_7(left: Axes, right: Axes, rows: Sequence[StudyRow], settings: CaseS
             right.plot(*zip(*points, strict=True), line, label=label, **looks)
     right.axhspan(0.95, 1.05, color="0.9", zorder=0)
     right.set_xscale("log")
-    what = "maps" if flat else "across the head"
-    finish(left, f"(a) {what}, d {d:g} mm, h/d {h:g}", _ON_SKIN, _SHARE, headroom=0.4)
+    shown = "maps" if flat else "across the head"
+    finish(left, f"(a) {shown}, d {d:g} mm, h/d {h:g}", _ON_SKIN, _SHARE, headroom=0.4)
     which = "; full across, dashed along" if len(_axes_of(rows)) > 1 else ""
     title = f"(b) width, h/d 1{which}; grey: 5 %"
     finish(right, title, "stiffness ratio E2/E1", f"sigma / sigma at {HARD_RATIO:g}")

@@ -76,14 +76,14 @@ def breast_dial(masses: Sequence[ExamMass]) -> str:
     side, rim_mm = known[0][1].side, max(_LEAST_MM, *(1.1 * place.distance_mm for _, place in known))
     parts = [f'<circle r="{_RADIUS}" fill="none" stroke="#111" stroke-width="0.4"/>', '<circle r="0.9" fill="#111"/>']
     for hour in range(1, 13):
-        x, y = _on(hour * 30.0, _RADIUS)
-        inner = _on(hour * 30.0, _RADIUS - (2.0 if hour % 3 == 0 else 1.0))
+        x, y = _dial_point(hour * 30.0, _RADIUS)
+        inner = _dial_point(hour * 30.0, _RADIUS - (2.0 if hour % 3 == 0 else 1.0))
         parts.append(line(through([(x, y), inner]), 0.3))
         if hour % 3 == 0:
-            a, b = _on(hour * 30.0, _RADIUS + 2.4)
+            a, b = _dial_point(hour * 30.0, _RADIUS + 2.4)
             parts.append(text(a, b + 1, f"{hour}", size=2.8))
     for number, place in known:
-        x, y = _on(place.angle_deg, _RADIUS * place.distance_mm / rim_mm)
+        x, y = _dial_point(place.angle_deg, _RADIUS * place.distance_mm / rim_mm)
         parts.append(f'<circle class="lump" cx="{x:.2f}" cy="{y:.2f}" r="1.3" fill="#111"/>')
         if len(known) > 1:
             parts.append(text(x + 1.8, y + 1, f"{number}", size=2.8, anchor="start"))
@@ -94,7 +94,7 @@ def breast_dial(masses: Sequence[ExamMass]) -> str:
     return drawing("dial", label, (-22.0, -17.5, 44.0, 39.0), parts)
 
 
-def _on(angle_deg: float, radius: float) -> tuple[float, float]:
+def _dial_point(angle_deg: float, radius: float) -> tuple[float, float]:
     """Point at an angle clockwise from the top, y downwards."""
     angle = math.radians(angle_deg)
     return radius * math.sin(angle), -radius * math.cos(angle)
@@ -154,8 +154,8 @@ def _coloured(values: FloatArray, limits: tuple[float, float]) -> NDArray[np.uin
     """(n, m, 3) colours of values; cells without data are grey."""
     low, high = limits
     covered, colours = np.isfinite(values), np.array(VIRIDIS, dtype=float)
-    at = np.clip((np.where(covered, values, low) - low) / (high - low), 0.0, 1.0) * (len(colours) - 1)
-    mixed = np.stack([np.interp(at, np.arange(len(colours)), colours[:, i]) for i in range(3)], axis=-1)
+    position = np.clip((np.where(covered, values, low) - low) / (high - low), 0.0, 1.0) * (len(colours) - 1)
+    mixed = np.stack([np.interp(position, np.arange(len(colours)), colours[:, i]) for i in range(3)], axis=-1)
     return np.where(covered[..., None], np.rint(mixed), np.array(_NO_DATA)).astype(np.uint8)
 
 
@@ -234,7 +234,7 @@ def _map_of(exam: ExamMap) -> TactileMap:
     return exam.tactile_map
 
 
-def marked(exam: ExamMap) -> tuple[float, float] | None:
+def marked_place(exam: ExamMap) -> tuple[float, float] | None:
     """Place that the reason for no size is about, where no mass is drawn there; None without one."""
     return None if exam.masses else centre_of(exam.report.about_mm)
 
@@ -261,11 +261,11 @@ def exam_picture(
     parts = [_cells(frame, limits or colour_limits(exam), small=small)]
     parts += edge_names(frame.view, frame.size_mm, small=small)
     for mass in exam.masses:
-        parts += _mass(mass, exam, frame, small=small)
+        parts += _draw_mass(mass, exam, frame, small=small)
     if small:
         parts += scale_bar(height, frame.scale, least_mm=3.0, inset=1.5, size=2.2)
     else:
-        parts += [*scale_bar(height, frame.scale, least_mm=8.0, inset=4.0, size=3.2), *_marks(exam, frame)]
+        parts += [*scale_bar(height, frame.scale, least_mm=8.0, inset=4.0, size=3.2), *_landmarks(exam, frame)]
     return drawing("map", label, (-margin, -margin, width + 2 * margin, height + 2 * margin), parts)
 
 
@@ -390,7 +390,7 @@ def scale_bar(height: float, scale: float, *, least_mm: float, inset: float, siz
     yield outlined_text(max(middle, 1.6 * size), height - inset - 0.5 * size, f"{length:g} mm", size=size)
 
 
-def _mass(mass: ExamMass, exam: ExamMap, frame: Frame, *, small: bool) -> Iterator[str]:
+def _draw_mass(mass: ExamMass, exam: ExamMap, frame: Frame, *, small: bool) -> Iterator[str]:
     """The ellipse of the size, those of its interval's ends, a cross at the centre; numbers where there are several."""
     (x, y), arm = frame.at(mass.centre_mm), 0.6 if small else 1.6
     if mass.axes_mm is not None and mass.largest is not None:
@@ -413,10 +413,10 @@ def _ellipse(mass: ExamMass, times: float, frame: Frame) -> str:
     return through(frame.at((x, y)) for x, y in around.T.tolist()) + "Z"
 
 
-def _marks(exam: ExamMap, frame: Frame) -> Iterator[str]:
+def _landmarks(exam: ExamMap, frame: Frame) -> Iterator[str]:
     """Nipple, direction of the sternal notch, and the place that a reason for no size is about."""
     width, height = frame.size_mm
-    place = marked(exam)
+    place = marked_place(exam)
     if place is not None:
         x, y = frame.at(place)
         yield stroked(f"M{x - 1.5:.2f} {y - 1.5:.2f}l3 3m0 -3l-3 3", 0.4, kind="meant")

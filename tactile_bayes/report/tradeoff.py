@@ -37,8 +37,8 @@ def advice(ladder: Tradeoff) -> list[str]:
     """What to choose, why more buys nothing, and what moves the answer more than any arithmetic."""
     answer, limit = ladder.reference.answer, ladder.tolerance_mm
     if answer is None:
-        return [_without_number(ladder), *ladder.notes]
-    lines = [f"Advice: {_enough(ladder, answer)}"]
+        return [_advice_without_size(ladder), *ladder.notes]
+    lines = [f"Advice: {_cheapest_setting(ladder, answer)}"]
     far = [f"{one.label} {one.ends_off_mm:.1f} mm" for one in ladder.rows if ladder.exceeds_tolerance(one)]
     if far:
         lines.append(f"What moves the ends more than {limit:g} mm: {'; '.join(far)}.")
@@ -59,7 +59,7 @@ def advice(ladder: Tradeoff) -> list[str]:
     return [*lines, *ladder.notes]
 
 
-def _enough(ladder: Tradeoff, reference: SizeAnswer) -> str:
+def _cheapest_setting(ladder: Tradeoff, reference: SizeAnswer) -> str:
     best, default, shares = ladder.cheapest_sufficient(), ladder.default, reference.variance_share
     half = f"the interval's half width is {reference.half_width_mm:.1f} mm"
     if best is None or best.ends_off_mm is None:
@@ -79,7 +79,7 @@ def _enough(ladder: Tradeoff, reference: SizeAnswer) -> str:
     return f"{text}, and {rest:.0f} % of its variance is no error of the map ({share:.0f} % is {SOURCES[source]})."
 
 
-def _without_number(ladder: Tradeoff) -> str:
+def _advice_without_size(ladder: Tradeoff) -> str:
     """Nothing to compare: what the settings say of a lump."""
     sized = [one.label for one in ladder.rows if one.answer.reported is not None]
     chances = [one for row in ladder.rows if (one := row.answer.detected_probability) is not None]
@@ -154,13 +154,13 @@ def tradeoff_text(ladders: Mapping[str, Tradeoff]) -> str:
 
 def ladder_text(ladder: Tradeoff) -> str:
     """What to choose, the table behind it, and notes."""
-    parts, width = [_SHORT.get(name, name) for name in ladder.default.cpu_s], _name(ladder)
+    parts, width = [_SHORT.get(name, name) for name in ladder.default.cpu_s], _label_width(ladder)
     costs, units = ("".join(f"{word:>{_COST}}" for word in words) for words in (parts, ["s"] * len(parts)))
-    what = "size" if sized(ladder) else "sigma"
+    quantity = "size" if gives_sizes(ladder) else "sigma"
     lines = [
         *advice(ladder),
         "",
-        f"{'':<{width}}{costs}{what:>7}{'95 % interval':>15}{'ends':>7}{'widths':>7}",
+        f"{'':<{width}}{costs}{quantity:>7}{'95 % interval':>15}{'ends':>7}{'widths':>7}",
         f"{'':<{width}}{units}{'mm':>7}{'mm':>15}{'off':>7}{'off':>7}",
     ]
     for axis, rows in groupby(ladder.rows, key=lambda one: one.axis):
@@ -171,25 +171,25 @@ def ladder_text(ladder: Tradeoff) -> str:
     return "\n".join([*lines, "", *_notes(ladder)])
 
 
-def _name(ladder: Tradeoff) -> int:
+def _label_width(ladder: Tradeoff) -> int:
     """Columns of a setting's name."""
     return _COLUMNS - _NUMBERS - _COST * len(ladder.default.cpu_s)
 
 
-def sized(ladder: Tradeoff) -> bool:
+def gives_sizes(ladder: Tradeoff) -> bool:
     """Whether what is reported is a size; without a calibration it is a width."""
     return any(SIZE in one.answer.quantities for one in ladder.rows) or ladder.reference.answer is None
 
 
 def _row(one: MeasuredSetting, ladder: Tradeoff) -> list[str]:
     """The setting's name with its numbers beside it, or below where it is long, and notes."""
-    name, width = f"{'*' if one.default else ' '} {one.label}", _name(ladder)
+    name, width = f"{'*' if one.default else ' '} {one.label}", _label_width(ladder)
     numbers = "".join(f"{seconds:>{_COST}.3f}" for seconds in one.cpu_s.values()) + _number(one.answer)
     notes = []
     if one.answer.reported is not None:
         for off in (one.ends_off_mm, one.width_ends_off_mm):
             numbers += f"{'-' if off is None else f'{off:.3f}':>7}"
-        if SIZE not in one.answer.quantities and sized(ladder):
+        if SIZE not in one.answer.quantities and gives_sizes(ladder):
             notes.append("    (a width: this map has no size)")
         if one.answer.method == "ensemble" and "ensemble" not in one.label:
             notes.append("    (by MCMC: importance sampling failed)")
@@ -199,9 +199,9 @@ def _row(one: MeasuredSetting, ladder: Tradeoff) -> list[str]:
 
 def _number(answer: SizeAnswer) -> str:
     """The number, or why there is none, with the probability of a lump where the reason does not name one."""
-    found, reason = answer.reported, answer.reason
-    if found is not None:
-        return f"{found.median:>7.2f}{f'{found.low:.2f} to {found.high:.2f}':>15}"
+    quantity, reason = answer.reported, answer.reason
+    if quantity is not None:
+        return f"{quantity.median:>7.2f}{f'{quantity.low:.2f} to {quantity.high:.2f}':>15}"
     if len(reason) > _REASON:
         reason = f"{reason[: _REASON - 3]}..."
     chance = answer.detected_probability
@@ -211,7 +211,7 @@ def _number(answer: SizeAnswer) -> str:
 
 def _pooled(one: PooledRow, ladder: Tradeoff) -> list[str]:
     name = f"  {one.maps} map{'s' if one.maps > 1 else ''}"
-    line = f"{name:<{_name(ladder)}}{one.cpu_s:>{_COST}.3f}{_number(one.answer)}"
+    line = f"{name:<{_label_width(ladder)}}{one.cpu_s:>{_COST}.3f}{_number(one.answer)}"
     if one.answer.reported is None:
         return [line]
     half = f"    half width {one.answer.half_width_mm:.2f} mm"
@@ -220,7 +220,7 @@ def _pooled(one: PooledRow, ladder: Tradeoff) -> list[str]:
     return [line, half]
 
 
-def _exact(answer: SizeAnswer) -> bool:
+def _is_model_map(answer: SizeAnswer) -> bool:
     """Whether an answer is of a forward model's map, which has no errors."""
     return AMPLITUDE in answer.quantities
 
@@ -228,29 +228,29 @@ def _exact(answer: SizeAnswer) -> bool:
 def _exact_maps(ladder: Tradeoff) -> Iterator[str]:
     """Of maps without errors what they show, and how far that is off the reference, with its sign."""
     best = ladder.reference.answer
-    if best is None or not _exact(best):
+    if best is None or not _is_model_map(best):
         return
     columns = ((ELEMENT, 6, 2), (AMPLITUDE, 7, 4), (WIDTHS[0], 7, 3), (WIDTHS[1], 7, 3))
     yield from ("", f"{'the map':<25}{'mesh':>6}{'a':>7}{'sig. x':>7}{'sig. y':>7}   off, %")
     yield f"{'':<25}{'mm':>6}{'':>7}{'mm':>7}{'mm':>7}{'a':>7}{'x':>7}{'y':>7}{'size':>7}"
     for label, answer in (("the finest", best), *((one.label, one.answer) for one in ladder.rows)):
-        told, line = answer.quantities, f"{label:<25}"
+        shown, line = answer.quantities, f"{label:<25}"
         for name, width, digits in columns:
-            line += f"{f'{told[name].median:.{digits}f}' if name in told else '':>{width}}"
+            line += f"{f'{shown[name].median:.{digits}f}' if name in shown else '':>{width}}"
         for name in (AMPLITUDE, *WIDTHS, SIZE) if answer is not best else ():
-            known = name in told and name in best.quantities
-            line += f"{f'{100 * (told[name].median / best.quantities[name].median - 1):+.2f}' if known else '':>7}"
+            known = name in shown and name in best.quantities
+            line += f"{f'{100 * (shown[name].median / best.quantities[name].median - 1):+.2f}' if known else '':>7}"
         yield line.rstrip()
 
 
 def _notes(ladder: Tradeoff) -> Iterator[str]:
     reference, interval, error = ladder.reference, "of this exam", ""
-    if reference.answer is not None and _exact(reference.answer):
+    if reference.answer is not None and _is_model_map(reference.answer):
         interval = "what the calibration leaves"
     elif reference.answer is not None:
         error = f"its own Monte-Carlo error is {reference.mc_error_mm:.2g} mm, "
     yield f"* is the default. CPU seconds of this machine, warm, the least of the runs; the interval is {interval}."
-    if any("optimise" in one.label or one.axis == "fit window" for one in ladder.rows) and sized(ladder):
+    if any("optimise" in one.label or one.axis == "fit window" for one in ladder.rows) and gives_sizes(ladder):
         yield "Least squares and other windows: sized as if the calibration were learned so; `estimate` refuses that."
     if reference.answer is not None:
         yield (
@@ -290,12 +290,12 @@ def _draw_ladder(figure: Figure, axes: Axes, ladder: Tradeoff) -> None:
     shown = [one for one in ladder.rows if math.isfinite(_height(one, ladder))]
     for i, axis in enumerate(dict.fromkeys(one.axis for one in shown)):
         rows = [one for one in shown if one.axis == axis]
-        axes.plot(*_places(rows, ladder), _MARKS[i % 6], color=_COLOURS[i % 6], label=axis, zorder=3)
+        axes.plot(*_points(rows, ladder), _MARKS[i % 6], color=_COLOURS[i % 6], label=axis, zorder=3)
     default = [one for one in shown if one.default]
-    axes.plot(*_places(default, ladder), "o", ms=15, mfc="none", mec="k", mew=1.5, label="the default", zorder=4)
+    axes.plot(*_points(default, ladder), "o", ms=15, mfc="none", mec="k", mew=1.5, label="the default", zorder=4)
     reference = ladder.reference
     if reference.answer is not None:
-        frontier = _places(ladder.frontier(), ladder)
+        frontier = _points(ladder.frontier(), ladder)
         axes.step(*frontier, where="post", color="0.3", lw=1.0, label="frontier", zorder=2)
         axes.set_ylabel("distance of the interval's ends from the reference, mm (rms)")
         axes.set_yscale("log")
@@ -323,7 +323,7 @@ def _height(one: MeasuredSetting, ladder: Tradeoff) -> float:
     return math.nan if one.answer.detected_probability is None else one.answer.detected_probability
 
 
-def _places(rows: Sequence[MeasuredSetting], ladder: Tradeoff) -> tuple[list[float], list[float]]:
+def _points(rows: Sequence[MeasuredSetting], ladder: Tradeoff) -> tuple[list[float], list[float]]:
     return [max(one.seconds, 1e-4) for one in rows], [_height(one, ladder) for one in rows]
 
 
@@ -332,8 +332,8 @@ def _draw_level(axes: Axes, value: float | None, colour: str, style: str, name: 
     if value:
         place, text = (1.0, max(value, _LEAST_MM)), f"{name}, {value:.2g} mm"
         axes.axhline(place[1], color=colour, ls=style, lw=1.0, zorder=1)
-        how: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
-        axes.annotate(text, place, xytext=(-4, 3), fontsize=8, ha="right", color=colour, **how)
+        coordinates: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
+        axes.annotate(text, place, xytext=(-4, 3), fontsize=8, ha="right", color=colour, **coordinates)
 
 
 def _draw_names(figure: Figure, axes: Axes, shown: Sequence[MeasuredSetting], ladder: Tradeoff) -> None:
@@ -341,24 +341,24 @@ def _draw_names(figure: Figure, axes: Axes, shown: Sequence[MeasuredSetting], la
     figure.draw_without_rendering()
     scale = 72.0 / figure.dpi
     right = axes.get_window_extent().x1 * scale
-    points = zip(*_places(shown, ladder), strict=True)
+    points = zip(*_points(shown, ladder), strict=True)
     places = [[float(v) * scale for v in axes.transData.transform(point)] for point in points]
-    taken: list[Box] = [(x - 4, y - 4, x + 4, y + 4) for x, y in places]
+    occupied: list[Box] = [(x - 4, y - 4, x + 4, y + 4) for x, y in places]
     patch = {"facecolor": "w", "edgecolor": "none", "alpha": 0.7, "pad": 0.3}
     for one, (x, y) in sorted(zip(shown, places, strict=True), key=lambda pair: pair[1][1]):
         text, point = one.label.removeprefix("--method ").removeprefix("--"), (one.seconds, _height(one, ladder))
-        taken.append(_free_place(x, y, _LETTER * len(text), taken, right=right))
-        at = (taken[-1][0] - x, taken[-1][1] + 2 - y)
-        axes.annotate(text, point, xytext=at, textcoords="offset points", fontsize=7, zorder=5, bbox=patch)
+        occupied.append(_free_place(x, y, _LETTER * len(text), occupied, right=right))
+        offset = (occupied[-1][0] - x, occupied[-1][1] + 2 - y)
+        axes.annotate(text, point, xytext=offset, textcoords="offset points", fontsize=7, zorder=5, bbox=patch)
 
 
-def _free_place(x: float, y: float, wide: float, taken: list[Box], *, right: float) -> Box:
+def _free_place(x: float, y: float, wide: float, occupied: list[Box], *, right: float) -> Box:
     """Where a name of so many points of width goes: at the right of its point, or the left where the picture ends."""
     begin = x - 8 - wide if x + wide + 8 > right else x + 8
     for step in (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6):
         low = y - 4.5 + step * _LINE
         box = (begin, low, begin + wide, low + _LINE)
-        covers = ((x0 < box[2] and box[0] < x1 and y0 < box[3] and low < y1) for x0, y0, x1, y1 in taken)
+        covers = ((x0 < box[2] and box[0] < x1 and y0 < box[3] and low < y1) for x0, y0, x1, y1 in occupied)
         if not any(covers):
             break
     return box

@@ -20,12 +20,12 @@ DIGITS: Final = 12  #: Of the numbers of `validate`'s file, so that the order of
 
 def plan_text(plan: PlanReport) -> str:
     """Full text of a plan, ending with the research-use line."""
-    given = [name for name, source in plan.errors_from.items() if source == "option"]
-    piloted = "pilot" in plan.errors_from.values() and given
+    by_option = [name for name, source in plan.errors_from.items() if source == "option"]
+    piloted = "pilot" in plan.errors_from.values() and by_option
     lines = [
         *map(needed_sentence, plan.needed),
         f"Assumed errors of ln size: {_errors(plan, plan.errors)}",
-        *([f"Given by options: {_errors(plan, given)}; the others are the pilot's."] if piloted else []),
+        *([f"Given by options: {_errors(plan, by_option)}; the others are the pilot's."] if piloted else []),
         "",
         "                                     mean error, %     interval, factor",
         "patients  maps  power                 tactile  other   tactile   ratio",
@@ -48,8 +48,8 @@ def needed_sentence(one: Needed) -> str:
     aim = "power" if one.aim == "power" else "an interval of the tactile error of factor"
     maps = f"{one.maps} map{'s' if one.maps > 1 else ''} of each mass"
     ends = one.patients_interval
-    told = "" if ends is None else f" (by the simulation's own error {ends[0]:.0f} to {ends[1]:.0f})"
-    least = " (the least that a plan may have)" if one.patients == MIN_PATIENTS else told
+    range_words = "" if ends is None else f" (by the simulation's own error {ends[0]:.0f} to {ends[1]:.0f})"
+    least = " (the least that a plan may have)" if one.patients == MIN_PATIENTS else range_words
     return f"needed: {one.patients} patients with {maps} for {aim} {one.target:g}{least}"
 
 
@@ -112,10 +112,10 @@ def _modality_lines(name: str, report: ModalityReport) -> Iterator[str]:
                 f"{100 * parts.map**0.5:.0f}; ICC {shown(repeated.figure('icc'), '.2f')}"
             )
     if report.calibration is not None:
-        found = report.calibration
+        calibration = report.calibration
         yield (
-            f"{name}: stated uncertainty: CRPS {number(found.crps_mm, '.2f')} mm, "
-            f"interval score {number(found.interval_score_mm, '.1f')} mm; {found.advice}"
+            f"{name}: stated uncertainty: CRPS {number(calibration.crps_mm, '.2f')} mm, "
+            f"interval score {number(calibration.interval_score_mm, '.1f')} mm; {calibration.advice}"
         )
 
 
@@ -172,7 +172,7 @@ _FIRST = {
     "bias_percent": ("bias %", "+.1f"),
     "slope_through_origin": ("slope", ".2f"),
 }
-_FOUND = {
+_DETECTED = {
     "mape_detected_percent": ("error % found", ".1f"),
     "slope_through_origin_detected": ("slope found", ".2f"),
     "r2_centred": ("r2", ".2f"),
@@ -226,27 +226,28 @@ def _comparison_sentence(pair: PairedComparison, percent: str) -> str:
     other, masses = SPELLED.get(second, second), _plural(pair.masses, "mass")
     if quotient.value is None:
         return f"{first} and {other} are not compared on {masses}: {quotient.reason or 'an error is 0'}"
-    ends = quotient.interval
-    told = f"no interval: {quotient.interval_reason}" if ends is None else f"{percent} {ends[0]:.2f} to {ends[1]:.2f}"
+    interval = f"no interval: {quotient.interval_reason}"
+    if quotient.interval is not None:
+        interval = f"{percent} {_between(quotient.interval, '.2f')}"
     p = "" if pair.p_holm is None else f", p {_short_p(pair.p_holm)}"
-    return f"{first} errs {quotient.value:.2f} times as much as {other}, {told}{p}, {masses}"
+    return f"{first} errs {quotient.value:.2f} times as much as {other}, {interval}{p}, {masses}"
 
 
 def _short_p(p: float) -> str:
     return "< .001" if p < 0.001 else f"{p:.2f}".lstrip("0") if p >= 0.0995 else f"{p:.2g}".lstrip("0")
 
 
-def figure_table(report: TrialReport, wanted: Mapping[str, tuple[str, str]]) -> list[str]:
+def figure_table(report: TrialReport, columns: Mapping[str, tuple[str, str]]) -> list[str]:
     """A table of figures by modality, each above its interval, in up to 80 columns."""
-    rows: list[tuple[str, ...]] = [("", "found", *(words for words, _ in wanted.values()))]
+    rows: list[tuple[str, ...]] = [("", "found", *(words for words, _ in columns.values()))]
     for name, one in report.modalities.items():
         label = name if len(name) <= MOST_LABEL else ""
         if not label:
             rows.append((name,))
-        figures = [(one.figure(key), spec) for key, (_, spec) in wanted.items()]
+        figures = [(one.figure(key), spec) for key, (_, spec) in columns.items()]
         rows.append((label, f"{one.detected} of {one.n}", *(number(figure.value, spec) for figure, spec in figures)))
-        found = one.detected_interval
-        share = "" if found is None else f"{_between((100 * found[0], 100 * found[1]), '.0f')} %"
+        share_ends = one.detected_interval
+        share = "" if share_ends is None else f"{_between((100 * share_ends[0], 100 * share_ends[1]), '.0f')} %"
         rows.append(("", share, *(_between(figure.interval, spec) for figure, spec in figures)))
     widths = [max(map(text_width, column)) for column in zip(*(row for row in rows if len(row) > 1), strict=True)]
     lines = ["  ".join(padded(cell, width) for cell, width in zip(row, widths, strict=False)).rstrip() for row in rows]
@@ -259,7 +260,7 @@ def _between(ends: Ends | None, spec: str) -> str:
 
 def _methods(report: TrialReport) -> Iterator[str]:
     """What `validate -v` adds."""
-    yield from figure_table(report, _FOUND)
+    yield from figure_table(report, _DETECTED)
     yield ""
     for name, one in report.modalities.items():
         if one.within_mass_sd_mm is not None:
@@ -331,11 +332,11 @@ def _reasons(name: str, report: ModalityReport, keys: Sequence[str]) -> Iterator
     figures = {key: why for key, why in owed.items() if not key.endswith("_interval")}
     intervals = {key.removesuffix("_interval"): why for key, why in owed.items() if key.endswith("_interval")}
     intervals = {key: why for key, why in intervals.items() if key not in figures}
-    words = {key: text for key, (text, _) in (_FIRST | _FOUND).items()}
-    for what, missing in (("", figures), ("interval of ", intervals)):
+    words = {key: text for key, (text, _) in (_FIRST | _DETECTED).items()}
+    for lead, missing in (("", figures), ("interval of ", intervals)):
         for reason in dict.fromkeys(missing.values()):
             affected = ", ".join(words.get(key, key.replace("_", " ")) for key, why in missing.items() if why == reason)
-            yield f"{name}: no {what}{affected}: {reason}"
+            yield f"{name}: no {lead}{affected}: {reason}"
 
 
 def found_share(report: ModalityReport) -> str:

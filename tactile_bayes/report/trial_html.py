@@ -45,7 +45,7 @@ def sizes_figure(report: TrialReport, trial: Trial) -> str:
     """
     modalities = trial.sizes().values()
     sds = {number: trial.ex_vivo_sd_mm.get(key) or 0.0 for key, number in mass_numbers(trial.ex_vivo_mm).items()}
-    ends = [end for one in modalities for end in (*one.ex_vivo_mm, *(one.size_mm + _spread(one)))]
+    ends = [end for one in modalities for end in (*one.ex_vivo_mm, *(one.size_mm + _replicate_sds(one)))]
     reach = 1.06 * float(max(ends, default=1.0))
     slopes = {name: one.slope_through_origin for name, one in report.modalities.items()}
     return _svg([partial(_draw_sizes, one, sds, slopes[one.name], reach) for one in modalities])
@@ -56,9 +56,9 @@ def differences_figure(report: TrialReport, trial: Trial) -> str:
 
     All panels have the same axes, so that modalities can be compared by eye.
     """
-    found = [one.only_detected() for one in trial.sizes().values()]
+    detected = [one.only_detected() for one in trial.sizes().values()]
     methods = {name: one.method_comparison for name, one in report.modalities.items()}
-    return _svg([partial(_draw_differences, one, methods[one.name]) for one in found], alike=True)
+    return _svg([partial(_draw_differences, one, methods[one.name]) for one in detected], alike=True)
 
 
 def _svg(panels: Sequence[Callable[[Axes], None]], *, alike: bool = False) -> str:
@@ -77,21 +77,21 @@ def _svg(panels: Sequence[Callable[[Axes], None]], *, alike: bool = False) -> st
     return base64.b64encode(buffer.getvalue()).decode("ascii")
 
 
-def _spread(sizes: ModalitySizes) -> FloatArray:
+def _replicate_sds(sizes: ModalitySizes) -> FloatArray:
     return np.array([group.std(ddof=1) if len(group) > 1 else 0.0 for group in sizes.replicates_mm])
 
 
 def _draw_sizes(sizes: ModalitySizes, sds: Mapping[int, float], slope: float | None, reach: float, axes: Axes) -> None:
-    found = sizes.only_detected()
+    detected = sizes.only_detected()
     axes.plot([0, reach], [0, reach], linestyle="--", color=_GREY, linewidth=1, label="identity")
     if slope is not None:
         end = min(reach, reach / slope) if slope > 0 else reach
         axes.plot([0, end], [0, slope * end], color=_LINE, linewidth=1.5, label=f"through zero, slope {slope:.2f}")
-    across, along = np.array([sds[int(mass)] for mass in found.mass]), _spread(found)
+    across, along = np.array([sds[int(mass)] for mass in detected.mass]), _replicate_sds(detected)
     bars: dict[str, Any] = {"elinewidth": 0.8, "capsize": 1.5, "ecolor": "0.5"}
     bars |= {"xerr": across if across.any() else None, "yerr": along if along.any() else None}
-    points: dict[str, Any] = {"fmt": "o", "markersize": 4, "color": _DOTS, "label": f"{len(found.size_mm)} masses"}
-    axes.errorbar(found.ex_vivo_mm, found.size_mm, **points, **bars)
+    points: dict[str, Any] = {"fmt": "o", "markersize": 4, "color": _DOTS, "label": f"{len(detected.size_mm)} masses"}
+    axes.errorbar(detected.ex_vivo_mm, detected.size_mm, **points, **bars)
     missed = sizes.ex_vivo_mm[~sizes.detected]
     if len(missed):
         label = f"{len(missed)} not found"
@@ -100,8 +100,8 @@ def _draw_sizes(sizes: ModalitySizes, sds: Mapping[int, float], slope: float | N
     finish(axes, sizes.name, "ex-vivo size (mm)", "size (mm)", loc="lower right", **_LEGEND)
 
 
-def _draw_differences(found: ModalitySizes, methods: MethodComparison, axes: Axes) -> None:
-    mean, off = (found.ex_vivo_mm + found.size_mm) / 2, found.size_mm - found.ex_vivo_mm
+def _draw_differences(detected: ModalitySizes, methods: MethodComparison, axes: Axes) -> None:
+    mean, off = (detected.ex_vivo_mm + detected.size_mm) / 2, detected.size_mm - detected.ex_vivo_mm
     axes.plot(mean, off, "o", markersize=4, color=_DOTS)
     axes.axhline(0, color=_GREY, linestyle="--", linewidth=1)
     one = methods.limits.get("mm")
@@ -112,33 +112,34 @@ def _draw_differences(found: ModalitySizes, methods: MethodComparison, axes: Axe
             axes.axhline(value, color=_SECOND, linewidth=1.2, label=f"limit {value:.1f}")
             if ends is not None:
                 axes.axhspan(*ends, color=_SECOND, alpha=0.13, linewidth=0)
-    finish(axes, found.name, "mean of both (mm)", "size - ex vivo (mm)", loc="upper left", **_LEGEND)
+    finish(axes, detected.name, "mean of both (mm)", "size - ex vivo (mm)", loc="upper left", **_LEGEND)
 
 
-def _draw_pit(found: Calibration, axes: Axes) -> None:
+def _draw_pit(calibration: Calibration, axes: Axes) -> None:
     edges = np.linspace(0, 1, BINS + 1)
-    axes.bar(edges[:-1], found.pit, width=1 / BINS, align="edge", color=_DOTS, edgecolor="white", alpha=0.85)
-    axes.axhline(found.n / BINS, color=_LINE, linewidth=1.2, label="if calibrated")
+    axes.bar(edges[:-1], calibration.pit, width=1 / BINS, align="edge", color=_DOTS, edgecolor="white", alpha=0.85)
+    axes.axhline(calibration.n / BINS, color=_LINE, linewidth=1.2, label="if calibrated")
     axes.set_xlim(0, 1)
     across = "share of the stated distribution below excision"
     finish(axes, "Integral transforms", across, "readings", loc="upper left", **_LEGEND)
 
 
-def _draw_ecdf(found: Calibration, prediction: Prediction, axes: Axes) -> None:
+def _draw_ecdf(calibration: Calibration, prediction: Prediction, axes: Axes) -> None:
     pit = np.sort(ndtr(prediction.z))
     share = np.arange(1, len(pit) + 1) / len(pit)
     line = np.array([0.0, 1.0])
-    axes.fill_between(line, line - found.ecdf_band, line + found.ecdf_band, color=_LINE, alpha=0.15, linewidth=0)
-    axes.plot(line, line, color=_LINE, linewidth=1.2, label=f"if calibrated, band for {found.masses} masses")
+    band = calibration.ecdf_band
+    axes.fill_between(line, line - band, line + band, color=_LINE, alpha=0.15, linewidth=0)
+    axes.plot(line, line, color=_LINE, linewidth=1.2, label=f"if calibrated, band for {calibration.masses} masses")
     axes.step(np.concatenate([[0], pit, [1]]), np.concatenate([[0], share, [1]]), where="post", color=_DOTS)
     axes.set(xlim=(0, 1), ylim=(0, 1))
     finish(axes, "Their distribution", "integral transform", "share of readings", loc="upper left", **_LEGEND)
 
 
-def _draw_coverage(found: Calibration, axes: Axes) -> None:
-    nominal = np.array([one.probability for one in found.levels])
-    share = np.array([one.covered / one.n for one in found.levels])
-    low, high = (np.array([one.interval[i] for one in found.levels]) for i in (0, 1))
+def _draw_coverage(calibration: Calibration, axes: Axes) -> None:
+    nominal = np.array([one.probability for one in calibration.levels])
+    share = np.array([one.covered / one.n for one in calibration.levels])
+    low, high = (np.array([one.interval[i] for one in calibration.levels]) for i in (0, 1))
     axes.plot([0, 1], [0, 1], color=_LINE, linewidth=1.2, label="if calibrated")
     reach = np.stack([np.maximum(share - low, 0), np.maximum(high - share, 0)])
     points: dict[str, Any] = {"fmt": "o", "color": _DOTS, "markersize": 5, "label": "found, exact interval"}
@@ -161,16 +162,16 @@ def plan_figure(plan: PlanReport, path: Path, *, force: bool = False) -> None:
 
 def _draw_plan(axes: Axes, plan: PlanReport, aim: Aim) -> None:
     for maps, mark, colour in zip(sorted({one.maps for one in plan.designs}), cycle("os^Dv"), cycle(_COLOURS)):
-        found = [one for one in plan.designs if one.maps == maps]
-        at, label = [one.patients for one in found], f"{maps} map{'s' if maps > 1 else ''} of each mass"
+        designs = [one for one in plan.designs if one.maps == maps]
+        patients, label = [one.patients for one in designs], f"{maps} map{'s' if maps > 1 else ''} of each mass"
         if aim == "power":
-            level = np.array([one.power for one in found])
-            ends = np.array([one.power_interval for one in found])
+            level = np.array([one.power for one in designs])
+            ends = np.array([one.power_interval for one in designs])
             reach = np.abs(ends - level[:, None]).T
-            axes.errorbar(at, level, yerr=reach, marker=mark, color=colour, markersize=4, capsize=2, label=label)
+            axes.errorbar(patients, level, yerr=reach, marker=mark, color=colour, markersize=4, capsize=2, label=label)
         else:
-            widths = [one.tactile_width_ratio or np.nan for one in found]
-            axes.plot(at, widths, marker=mark, color=colour, markersize=4, label=label)
+            widths = [one.tactile_width_ratio or np.nan for one in designs]
+            axes.plot(patients, widths, marker=mark, color=colour, markersize=4, label=label)
     for one in (one for one in plan.needed if one.aim == aim):
         axes.axhline(one.target, color=_GREY, linestyle="--", linewidth=1)
         axes.annotate(f"{one.patients}", (one.patients, one.target), xytext=(4, -12), textcoords="offset points")
@@ -201,8 +202,8 @@ def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence
         growth=growth,
         text=text,
         cells=_cells,
-        of_variances=_of_variances,
-        middles=_middles,
+        of_variances=_variance_cells,
+        middles=_median_cells,
         dumps=json.dumps,
     )
 
@@ -212,9 +213,9 @@ def _masses(trial: Trial) -> tuple[list[str], list[list[str]]]:
     sizes, numbers = trial.sizes(), mass_numbers(trial.ex_vivo_mm)
     cells: dict[tuple[int, str], str] = {}
     for name, one in sizes.items():
-        for mass, ex_vivo, size, found in zip(one.mass, one.ex_vivo_mm, one.size_mm, one.detected, strict=True):
+        for mass, ex_vivo, size, detected in zip(one.mass, one.ex_vivo_mm, one.size_mm, one.detected, strict=True):
             residual = f"{size:.1f} [{size - ex_vivo:+.1f} mm, {100 * (size / ex_vivo - 1):+.0f} %]"
-            cells[int(mass), name] = residual if found else "not found"
+            cells[int(mass), name] = residual if detected else "not found"
     rows = [
         [str(place), f"{ex_vivo:.1f}", *(cells.get((numbers[key], name), "-") for name in sizes)]
         for place, (key, ex_vivo) in enumerate(trial.ex_vivo_mm.items(), start=1)
@@ -228,23 +229,27 @@ def _calibrations(report: TrialReport, trial: Trial) -> Iterator[tuple[str, Cali
     The picture: integral transforms as a histogram and a distribution function with its band, and coverage by level.
     """
     for name, one in report.modalities.items():
-        found, prediction = one.calibration, prediction_of(trial, name)
-        if found is not None and prediction is not None:
-            panels = [partial(_draw_pit, found), partial(_draw_ecdf, found, prediction), partial(_draw_coverage, found)]
-            yield name, found, _svg(panels)
+        calibration, prediction = one.calibration, prediction_of(trial, name)
+        if calibration is not None and prediction is not None:
+            panels = [
+                partial(_draw_pit, calibration),
+                partial(_draw_ecdf, calibration, prediction),
+                partial(_draw_coverage, calibration),
+            ]
+            yield name, calibration, _svg(panels)
 
 
-def _cells(figures: Figures, wanted: Mapping[str, tuple[str, str]]) -> list[str]:
-    """Figures with their intervals, by what is `wanted`: head and format of each by name."""
-    return [trial_words.shown(figures.figure(key), spec) for key, (_, spec) in wanted.items()]
+def _cells(figures: Figures, columns: Mapping[str, tuple[str, str]]) -> list[str]:
+    """Figures with their intervals, by what is `columns`: head and format of each by name."""
+    return [trial_words.shown(figures.figure(key), spec) for key, (_, spec) in columns.items()]
 
 
-def _of_variances(report: ModalityReport) -> list[str]:
+def _variance_cells(report: ModalityReport) -> list[str]:
     """SDs of masses, readers and maps, percent."""
     parts = report.replicates.variance_components
     variances = (None, None, None) if parts is None else (parts.mass, parts.reader, parts.map)
     return [trial_words.number(None if one is None else 100 * one**0.5, ".0f") for one in variances]
 
 
-def _middles(one: ModalityErrors, names: Iterable[str]) -> list[str]:
+def _median_cells(one: ModalityErrors, names: Iterable[str]) -> list[str]:
     return [getattr(one, name).shown(".3g") for name in names]

@@ -40,7 +40,7 @@ from scipy.io import savemat
 
 import tactile_bayes as tb
 from tactile_bayes.campaigns.inputs import open_campaign
-from tactile_bayes.campaigns.report import Row, trial_lines
+from tactile_bayes.campaigns.report import ExamRow, trial_lines
 from tactile_bayes.campaigns.steps import Task, make_map, run_step
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.documents import load_schema
@@ -345,7 +345,7 @@ def test_one_coordinate_of_a_place_alone_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("code", "status"), [("cannot_show", "not_done"), ("undetected", "not_detected")])
 def test_an_exam_that_cannot_show_a_lump_was_not_done(code: str, status: str) -> None:
     """Not held against the modality; the control is a map that could have shown a lump."""
-    row = Row.of(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), estimate_report(reason_code=code))
+    row = ExamRow.of(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), estimate_report(reason_code=code))
     assert row.status == status
     without_faults: Any = SimpleNamespace(faults={})
     together = {row.exam.of_mass: pooled_report(reason="no size", maps=())}

@@ -21,7 +21,7 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import EstimateReport, MassReport, Place
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
-from tactile_bayes.report.pooled import apart_from_others, elsewhere
+from tactile_bayes.report.pooled import maps_lying_apart, maps_of_another_mass
 
 FAST = ("--method", "laplace")
 CALIBRATION = "solid"
@@ -60,10 +60,10 @@ def test_a_map_that_reports_another_mass_is_told_the_place_of_the_common_one_on_
     """Two maps show one mass at 50 mm; the third reports one of 29 mm at 20, and has theirs as its second."""
     maps = [document((51.0, 6.0, True)), document((49.0, 6.5, True))]
     third = document((20.0, 29.0, True), (52.0, 7.0, False), shift=-50.0)
-    assert elsewhere([*maps, third]) == {2: (2.0, 0.0)}
-    assert elsewhere([third, *maps]) == {0: (2.0, 0.0)}
+    assert maps_of_another_mass([*maps, third]) == {2: (2.0, 0.0)}
+    assert maps_of_another_mass([third, *maps]) == {0: (2.0, 0.0)}
     # the control: where all report it nothing is done again
-    assert elsewhere([*maps, document((20.0, 29.0, False), (52.0, 7.0, True))]) == {}
+    assert maps_of_another_mass([*maps, document((20.0, 29.0, False), (52.0, 7.0, True))]) == {}
 
 
 def test_of_two_masses_that_all_maps_show_the_one_that_most_report_is_pooled() -> None:
@@ -73,27 +73,27 @@ def test_of_two_masses_that_all_maps_show_the_one_that_most_report_is_pooled() -
         document((11.0, 11.9, False), (44.0, 17.4, True)),
         document((9.0, 12.2, True), (45.0, 16.8, False)),
     ]
-    assert elsewhere(maps) == {1: (11.0, 0.0)}
+    assert maps_of_another_mass(maps) == {1: (11.0, 0.0)}
 
 
 def test_without_landmarks_or_a_common_place_nothing_is_estimated_again() -> None:
     far = [document((10.0, 12.0, True)), document((50.0, 14.0, True))]
-    assert elsewhere(far) == {}
+    assert maps_of_another_mass(far) == {}
     bare = document((20.0, 29.0, True), (52.0, 7.0, False), landmarks=False)
-    assert elsewhere([document((51.0, 6.0, True)), bare]) == {}
-    assert apart_from_others([document((51.0, 6.0, True)), bare]) is None
-    assert elsewhere([document(), document((10.0, 12.0, True))]) == {}
-    assert apart_from_others([document(), document((10.0, 12.0, True))]) is None
+    assert maps_of_another_mass([document((51.0, 6.0, True)), bare]) == {}
+    assert maps_lying_apart([document((51.0, 6.0, True)), bare]) is None
+    assert maps_of_another_mass([document(), document((10.0, 12.0, True))]) == {}
+    assert maps_lying_apart([document(), document((10.0, 12.0, True))]) is None
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_maps_whose_masses_lie_apart_are_reported(order: tuple[int, int]) -> None:
     """The lower one is named whatever the order; 14 mm between exams are landmarks touched anew."""
     far = [document((10.0, 12.0, True)), document((50.0, 14.0, True))]
-    told = apart_from_others([far[i] for i in order])
+    told = maps_lying_apart([far[i] for i in order])
     assert told == {order.index(0): "its mass lies 40 mm from that of the other maps and may be another one"}
     near = [document((10.0, 12.0, True)), document((24.0, 14.0, True))]
-    assert apart_from_others(near) == {}
+    assert maps_lying_apart(near) == {}
 
 
 def of_breast(masses: Sequence[tuple[float, float, float]], *, seed: int, shift_mm: float) -> TactileMap:

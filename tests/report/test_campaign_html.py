@@ -27,7 +27,7 @@ from tactile_bayes.report.campaign_page import (
     UNSIZED,
     WORST_FIRST,
     ExamEntry,
-    MassRow,
+    MassEntry,
     VisitEntry,
     campaign_html,
     worst,
@@ -61,7 +61,7 @@ class Tags(HTMLParser):
         return sum(tag == name for tag, _ in self.tags)
 
 
-def page_of(*rows: MassRow) -> str:
+def page_of(*rows: MassEntry) -> str:
     return campaign_html(rows, lines=["3 exams."], links={"trial.csv": "trial.csv"}, version="1")
 
 
@@ -69,14 +69,14 @@ def told(text: str) -> tuple[Finding, ...]:
     return (finding("side", text, about=text), finding("few_strokes", text, on_paper=text))
 
 
-def row_of(text: str) -> MassRow:
+def row_of(text: str) -> MassEntry:
     exam = ExamEntry(text, text, None, told(text), b"<svg/>", text, {text: text})
     grown = Growth(text, text, text, text, "failed", text, link=text)
-    return MassRow(text, text, (VisitEntry(text, (exam,), why=text),), text, grown)
+    return MassEntry(text, text, (VisitEntry(text, (exam,), why=text),), text, grown)
 
 
-def mass(name: str, *exams: ExamEntry, size: Quantity | None = None) -> MassRow:
-    return MassRow(name, "1", (VisitEntry("1", exams, size),))
+def mass(name: str, *exams: ExamEntry, size: Quantity | None = None) -> MassEntry:
+    return MassEntry(name, "1", (VisitEntry("1", exams, size),))
 
 
 def sized(size: Quantity, *findings: Finding) -> ExamEntry:
@@ -134,17 +134,17 @@ def test_a_mass_is_of_its_last_visit_and_names_the_exams_that_a_finding_is_of() 
         VisitEntry("1", (sized(SIZE, doubt),), SIZE),
         VisitEntry("2", (ExamEntry("visit 2, exam 1", "no lump"),), why="no lump"),
     )
-    row = MassRow("P", "1", visits)
+    row = MassEntry("P", "1", visits)
     assert (row.status, row.last.size) == (UNSIZED, None)
-    assert [text for _, text in row.told] == [f"{finding_lines((doubt,), paper=True)[0]} (visit 1, exam 1)"]
+    assert [text for _, text in row.remarks] == [f"{finding_lines((doubt,), paper=True)[0]} (visit 1, exam 1)"]
 
 
 def test_what_speaks_against_a_comparison_is_told_once_beside_what_speaks_against_its_exams() -> None:
     of_exam, of_pair = finding("side", "another side"), finding("taken_as_one", "two places")
     visits = tuple(VisitEntry(code, (sized(SIZE, of_exam),), SIZE) for code in "12")
     growth = Growth("P", "1", "1", "2", "compared", verdict="grown", findings=(of_exam.labelled("visit 1"), of_pair))
-    row = MassRow("P", "1", visits, growth=growth)
-    assert [text for _, text in row.told] == finding_lines((of_exam, of_pair), paper=True)
+    row = MassEntry("P", "1", visits, growth=growth)
+    assert [text for _, text in row.remarks] == finding_lines((of_exam, of_pair), paper=True)
     page = page_of(row)
     assert page.count("two places") == 1
     assert ">grown<" in page

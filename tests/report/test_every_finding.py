@@ -31,7 +31,7 @@ from tactile_bayes.api.maps import Map
 from tactile_bayes.api.pooled import PooledSize
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import SizeEstimate
-from tactile_bayes.campaigns.report import Row, done_line, grown_line
+from tactile_bayes.campaigns.report import ExamRow, done_line, grown_line
 from tactile_bayes.declarations import replace
 from tactile_bayes.exports.exam import Identity, MapFile, parse_estimate
 from tactile_bayes.exports.fhir import bundle_of
@@ -46,7 +46,7 @@ from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.mapping.select import scan_findings
-from tactile_bayes.report.campaign_page import ExamEntry, MassRow, VisitEntry, campaign_html
+from tactile_bayes.report.campaign_page import ExamEntry, MassEntry, VisitEntry, campaign_html
 from tactile_bayes.report.compare import compare_summary, compare_text, growths
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.growth_page import DrawnMap, draw_comparison
@@ -185,7 +185,7 @@ def dicom(made: Made, name: str) -> str:
 
 
 def campaign_row(made: Made) -> str:
-    row = Row.of(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), made.answer.report, scans=SCANS)
+    row = ExamRow.of(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), made.answer.report, scans=SCANS)
     cells = done_line(replace(row, findings=made.findings))
     return f"{cells['verdict']} {cells['findings'] or ''}"
 
@@ -203,7 +203,7 @@ def growth_table(made: Made) -> str:
 def campaign_card(made: Made) -> str:
     size = Quantity(median=15.0, mean=15.0, sd=1.0, low=13.0, high=17.0, probability=0.95, kind="eti")
     exam = ExamEntry("visit 1, exam 1", size=size, findings=made.findings)
-    rows = [MassRow("a", "1", (VisitEntry("1", (exam,), size),))]
+    rows = [MassEntry("a", "1", (VisitEntry("1", (exam,), size),))]
     return words_of(campaign_html(rows, lines=(), links={}, version="1"))
 
 

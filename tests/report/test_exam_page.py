@@ -34,7 +34,7 @@ from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.exam_page import exam_page
-from tactile_bayes.report.exam_words import Exam, Given, exam_map, headline, reach_text
+from tactile_bayes.report.exam_words import PageLabels, ShownExam, exam_map, headline, reach_text
 from tactile_bayes.report.pages import BROWSERS, find_printer
 from tactile_bayes.scans import Landmarks
 
@@ -93,10 +93,10 @@ def demo() -> tuple[TactileMap, EstimateReport]:
     return replace(tactile_map, nipple_mm=nipple), report
 
 
-def exam(scans: tuple[Mapping[str, str], ...] = SCANS, **more: Any) -> Exam:
+def exam(scans: tuple[Mapping[str, str], ...] = SCANS, **more: Any) -> ShownExam:
     tactile_map, report = demo()
     side = scans[0].get("side", "") if scans else ""
-    return Exam((exam_map(tactile_map, report, side=side),), None, scans, Given(**more))
+    return ShownExam((exam_map(tactile_map, report, side=side),), None, scans, PageLabels(**more))
 
 
 SMALLEST = SmallestLump(
@@ -109,7 +109,7 @@ SMALLEST = SmallestLump(
 )
 
 
-def without_lump(reason_code: Any = "undetected", **more: Any) -> Exam:
+def without_lump(reason_code: Any = "undetected", **more: Any) -> ShownExam:
     tactile_map, _ = demo()
     gone = estimate_report(
         reason="no lump found on the 50 cm2 that the map covers",
@@ -119,7 +119,7 @@ def without_lump(reason_code: Any = "undetected", **more: Any) -> Exam:
         on_paper="scan the place again",
         **more,
     )
-    return Exam((exam_map(tactile_map, gone, side="left"),), None, SCANS)
+    return ShownExam((exam_map(tactile_map, gone, side="left"),), None, SCANS)
 
 
 def test_the_page_says_size_both_intervals_place_and_use() -> None:
@@ -202,7 +202,7 @@ def test_a_lump_at_the_upper_outer_left_is_drawn_at_the_upper_right_and_told_so(
     x, y = float(tactile_map.x_mm[column]), float(tactile_map.y_mm[row])
     there = report.centre_mm
     placed = replace(report, centre_mm=Point(replace(there.x, median=x, sd=0.1), replace(there.y, median=y, sd=0.1)))
-    text = exam_page(Exam((exam_map(tactile_map, placed, side="left"),), None, SCANS))
+    text = exam_page(ShownExam((exam_map(tactile_map, placed, side="left"),), None, SCANS))
     page = Page(text)
     (drawn,) = page.named("svg", **{"class": "map"})
     width, height = (float(n) for n in drawn["viewbox"].split()[2:])
@@ -296,7 +296,7 @@ def test_several_masses_are_numbered_with_a_place_each() -> None:
     second = unsized("its window reaches beyond the map")
     first = replace(second, number=1, reported=True, reason="")
     both = replace(report, masses=(first, second))
-    page = Page(exam_page(Exam((exam_map(tactile_map, both, side="left"),), None, SCANS)))
+    page = Page(exam_page(ShownExam((exam_map(tactile_map, both, side="left"),), None, SCANS)))
     assert "2 masses, mass 1 about" in page.words
     assert "Size of mass 1" in page.words
     assert "no size (probability of a lump 0.99): its window reaches beyond the map" in page.words
@@ -312,7 +312,7 @@ def test_a_second_mass_is_drawn_as_its_ellipse() -> None:
 
     def extents(mass: MassReport) -> tuple[float, float]:
         both = replace(report, masses=(first, mass))
-        page = Page(exam_page(Exam((exam_map(tactile_map, both, side="left"),), None, SCANS)))
+        page = Page(exam_page(ShownExam((exam_map(tactile_map, both, side="left"),), None, SCANS)))
         path = page.named("path", **{"class": "size"})[1]["d"]
         points = np.array([[float(n) for n in pair.split()] for pair in path.strip("MZ").split("L")])
         return float(np.ptp(points[:, 0])), float(np.ptp(points[:, 1]))
@@ -339,7 +339,7 @@ def pooled_as(report: EstimateReport, maps: int, **more: Any) -> PooledReport:
 def test_of_several_maps_the_first_that_shows_a_lump_is_drawn() -> None:
     with_lump, without = exam().maps[0], without_lump().maps[0]
     pooled = pooled_as(with_lump.report, 2)
-    both = Exam((without, with_lump), pooled, SCANS)
+    both = ShownExam((without, with_lump), pooled, SCANS)
     assert both.main is with_lump
     page = Page(exam_page(both))
     assert "How good the exam was (map 2)" in page.words
@@ -347,7 +347,7 @@ def test_of_several_maps_the_first_that_shows_a_lump_is_drawn() -> None:
     assert "Map 2 of 2. Full line: the estimated size of all maps; dashed: the ends of its interval." in page.words
     assert "Probability that it is a lump, by map 2: 0.9" in page.words
     assert len(page.named("path", **{"class": "size-high"})) == 1
-    alone = Page(exam_page(Exam((with_lump,), None, SCANS))).words
+    alone = Page(exam_page(ShownExam((with_lump,), None, SCANS))).words
     assert "Map 1 of" not in alone
     assert "Full line: the estimated size; dashed" in alone
     assert "by this map: 0.9" in alone
@@ -370,7 +370,7 @@ def test_what_was_reached_is_told_by_the_patients_left_and_right() -> None:
 
 def test_without_a_nipple_the_xiphoid_tells_the_place_and_the_page_says_why() -> None:
     tactile_map, report = demo()
-    page = Page(exam_page(Exam((exam_map(replace(tactile_map, nipple_mm=None), report, side=""),), None, ())))
+    page = Page(exam_page(ShownExam((exam_map(replace(tactile_map, nipple_mm=None), report, side=""),), None, ())))
     assert "of the xiphoid and" in page.words
     assert "No clock position: the scan names no nipple and no side." in page.words
     assert page.named("svg", **{"class": "dial"}) == []
@@ -379,7 +379,7 @@ def test_without_a_nipple_the_xiphoid_tells_the_place_and_the_page_says_why() ->
 def test_a_nipple_off_the_map_is_pointed_to() -> None:
     tactile_map, report = demo()
     far = replace(tactile_map, nipple_mm=tactile_map.nipple_mm + np.array([200.0, 0.0, 0.0]))
-    page = Page(exam_page(Exam((exam_map(far, report, side="left"),), None, SCANS)))
+    page = Page(exam_page(ShownExam((exam_map(far, report, side="left"),), None, SCANS)))
     assert len(page.named("path", **{"class": "nipple-off"})) == 1
     assert page.named("path", **{"class": "nipple"}) == []
 
@@ -401,7 +401,7 @@ def test_a_page_from_python_is_the_same_and_private(tmp_path: Path) -> None:
         found.report(tmp_path / "a.html")
 
 
-def full() -> Exam:
+def full() -> ShownExam:
     """As much as a page can hold: repeats, masses, cautions, long texts, a tall map."""
     tactile_map, report = demo()
     reason = "a reason that is long " * 20
@@ -413,7 +413,7 @@ def full() -> Exam:
     facts = dict.fromkeys(("subject", "posture", "examiner", "visit", "mass"), "W" * 99)
     scans = tuple({**facts, "side": "left", "sha256": f"{n}" * 64, "subject": f"{n}" + "W" * 99} for n in range(12))
     maps = (exam_map(tall, told, side="left"),) * 12
-    return Exam(maps, pooled, scans, Given("W" * 60, "W" * 50, "2026-03-01"))
+    return ShownExam(maps, pooled, scans, PageLabels("W" * 60, "W" * 50, "2026-03-01"))
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.posterior_nc import read_posterior
 from tactile_bayes.posterior.result import fitted_cells
-from tactile_bayes.report.figure_file import named_exam
+from tactile_bayes.report.figure_file import exam_title
 
 NOISE_SD = 0.004
 SLOPE = 0.003
@@ -94,7 +94,7 @@ def test_what_neighbours_share_is_drawn_apart_so_that_the_rest_is_noise() -> Non
 def test_titles_carry_what_the_scans_say_of_the_exam_and_no_digest(
     name: str, scans: list[dict[str, str]], title: str
 ) -> None:
-    assert named_exam(name, scans) == title
+    assert exam_title(name, scans) == title
 
 
 def test_a_dollar_in_a_name_starts_no_formula(tmp_path: Path) -> None:

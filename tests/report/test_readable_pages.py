@@ -23,7 +23,7 @@ from posterior_maps import bump_map
 import tactile_bayes as tb
 from tactile_bayes.api.maps import Map
 from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.report.campaign_page import ExamEntry, MassRow, VisitEntry, campaign_html
+from tactile_bayes.report.campaign_page import ExamEntry, MassEntry, VisitEntry, campaign_html
 from tactile_bayes.report.pages import TEMPLATES
 
 DEMO = Path(tb.__file__).parent / "demo"
@@ -78,7 +78,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         ExamEntry("visit 1, exam 2", "no lump", thumbnail=b"<svg/>", page="exams/b/exam.html"),
         ExamEntry("visit 1, exam 3", "map failed", failed=True),
     ]
-    rows = [MassRow("P1", "1", (VisitEntry("1", tuple(exams), size, 1),))]
+    rows = [MassEntry("P1", "1", (VisitEntry("1", tuple(exams), size, 1),))]
     found = {path.stem: path.read_text() for path in folder.glob("*.html")}
     return found | {"campaign": campaign_html(rows, lines=["1 mass."], links={"a": "a.csv"}, version="1")}
 
