@@ -1,4 +1,4 @@
-"""A campaign from its table of exams to the trial's report: what is checked, run, written and told."""
+"""A campaign from its table of exams to the trial's report: checks, run, files and summary."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tactile_bayes.size.pooling import Repeatability
 
 
 class CampaignResult(TextResult, eq=False):
-    """What a campaign did, or would do."""
+    """Outcome of a campaign, or its plan."""
 
     campaign: Campaign
     folder: Path
@@ -35,7 +35,7 @@ class CampaignResult(TextResult, eq=False):
 
     @property
     def text(self) -> str:
-        """What ``campaign run`` prints."""
+        """Text that ``campaign run`` prints."""
         lines = self._planned() if self.written is None else self._done(self.written)
         report_text = "" if self.written is None else self.written.report  # which ends with the words of research
         return "\n".join([*lines, report_text or f"{RESEARCH_USE}\n"])
@@ -171,5 +171,5 @@ def _check_folder(table: Sequence[Exam], output: Path, settings: CampaignSetting
 
 
 def _all_named(run: Campaign, step: str) -> bool:
-    """Whether all exams or masses that need a step are known by name, and fit a line."""
+    """True if a step is due and the names kept are those of all exams or masses that need it."""
     return 0 < run.todo[step] == len(run.names[step])

@@ -1,4 +1,4 @@
-"""The exams of a folder: what is there, a first list of them, and which of them are of one mass."""
+"""The exams of a folder: their files, a first table of them, their masses and visits."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from tactile_bayes.posterior.result import Estimate
 from tactile_bayes.posterior.verdict import no_verdict
 from tactile_bayes.trial.readings import day_of, visits_in_order
 
-# --- What a file says of its exam: facts of the session, and the files that it was made from.
+# --- Facts of an exam in its file: those of the session, and the files that it was made from.
 
 ARRAYS: Final = (".npz", ".mat", ".h5", ".hdf5")  #: Of files that hold all arrays of a scan.
 SCANS: Final = (".mcap", *ARRAYS)
@@ -41,13 +41,13 @@ _ENDINGS: Final = (*SCANS, MAP)
 
 
 class FileFacts(Record):
-    """What a file says of its exam."""
+    """Facts of an exam that its file holds."""
 
     facts: Mapping[str, str] = field(default_factory=dict)  #: By the columns of the table of exams.
     sources: frozenset[str] = frozenset()  #: SHA-256 of the files that it was made from.
 
 
-# --- What a file's name says of its exam, by a pattern such as ``{patient}_{visit}_{exam}.npz``.
+# --- Facts of an exam in its file's name, by a pattern such as ``{patient}_{visit}_{exam}.npz``.
 
 _NAMED: Final = ("patient", "visit", "mass", "exam", "side", "reader", "date")
 _SIDES: Final = {"l": "left", "r": "right", "left": "left", "right": "right"}
@@ -83,7 +83,7 @@ class NamePattern:
         return "[^/]*" if part == "*" else re.escape(part)
 
     def facts(self, name: str) -> dict[str, str]:
-        """What a file's name says, by the columns of the table.
+        """Facts in a file's name, by the columns of the table.
 
         A name that does not follow the pattern, or a word in it that is no side, date or number, is a `BadDataError`.
         """
@@ -111,9 +111,9 @@ class NamePattern:
 
 
 def _read_facts(path: Path, name: str, pattern: NamePattern | None) -> FileFacts:
-    """What a scan or a map says, as far as all scans of the file agree, and its name; arrays of a scan say nothing.
+    """Facts on which all scans of a scan or map agree, and those in its name; arrays of a scan hold none.
 
-    Where file and name contradict each other that is an error.
+    A `BadDataError` where file and name contradict each other.
     """
     sessions: Sequence[Mapping[str, Any]] = ()
     made: Any = ()
@@ -138,7 +138,7 @@ def _read_facts(path: Path, name: str, pattern: NamePattern | None) -> FileFacts
 
 
 class FolderExams(Record):
-    """Rows for exams.csv, and what somebody should know of the folder."""
+    """Rows for exams.csv from a folder, and notes on its other files."""
 
     rows: list[dict[str, Any]] = field(default_factory=list)  #: Of files that the table does not list yet.
     skipped: list[str] = field(default_factory=list)  #: Files that give none, with the reason.
@@ -176,7 +176,7 @@ def _files_of(folder: Path, table: Path, listing: FolderExams) -> dict[str, Path
 def _duplicates(
     paths: Mapping[str, Path], facts_of: Mapping[str, FileFacts], listed: Collection[str]
 ) -> dict[str, str]:
-    """Names of files that are no further exam, each with the reason; `facts_of` are those that can be read.
+    """Files that repeat another exam, each with the reason; `facts_of`: facts of the files that can be read.
 
     Of files of the same bytes the one that is listed stays, else that of the shortest name. Of a scan and its map, and
     of a scan and the arrays that it was imported from, the scan stays, unless the other is listed.
@@ -281,7 +281,7 @@ def _spell_as(listed: Iterable[Mapping[str, str]], rows: Sequence[dict[str, Any]
 
 
 def _code_key(row: Mapping[str, str], column: str) -> tuple[str, str, str]:
-    """What a code shares with those that differ from it by capitals alone; visits and masses are of one patient."""
+    """Key shared by codes that differ in capitals alone; visits and masses are of one patient."""
     return column, "" if column == "patient" else row["patient"].casefold(), row[column].casefold()
 
 
@@ -310,7 +310,7 @@ OWN_AXES: Final = finding(
 
 
 class Match(Record):
-    """Which mass of a map is an exam's, by where other exams have the breast's masses."""
+    """Where to look for an exam's mass on its map: places of the breast's masses on other exams' maps."""
 
     mass: str  #: Code of the exam's mass, which one of the places is of.
     named: tuple[Exam, ...]  #: Exams that say where a mass lies on their map, one for each of the breast's masses.
@@ -318,7 +318,7 @@ class Match(Record):
 
 
 class Breasts:
-    """Exams of each breast, so that those of a large table are found without a walk through it."""
+    """Index of exams by breast."""
 
     def __init__(self, exams: Sequence[Exam]) -> None:
         self._exams: dict[tuple[str, str | None], list[Exam]] = defaultdict(list)
@@ -326,9 +326,9 @@ class Breasts:
             self._exams[exam.patient, exam.side].append(exam)
 
     def exams_with_places(self, exam: Exam, of: Container[str] | None = None) -> list[Exam]:
-        """For an exam without a place those that name one: for each mass of the breast one, of its visit if possible.
+        """Exams that place the breast's masses, one for each mass, of the exam's visit if possible.
 
-        Empty where the exam has a place, or no exam names one of its mass; `of` holds the names of those that count.
+        Empty if the exam has a place itself, or no exam places its mass; `of`: names of the exams to choose from.
         """
         if exam.centre_mm is not None:
             return []
@@ -341,11 +341,10 @@ class Breasts:
 
 
 def estimate_matched(path: Path, settings: Settings, match: Match) -> SizeEstimate:
-    """Estimate the mass of a map that lies nearest to where another exam has it.
+    """Estimate the mass of a map that lies within a distance of its place on another exam's map.
 
-    Without a mass there the estimate is of the place, and says why it has no size.
-
-    At fault (`BadDataError`) are several masses of the map that may be the one, and a place off the map.
+    Without a mass there the estimate is of the place, with the reason for no size. Several masses that may be the one,
+    and a place off the map, are a `BadDataError`.
     """
     mass, most_mm = match.mass, match.most_mm
     outcome = estimate_file(path, settings)
@@ -388,7 +387,7 @@ def map_of_exam(path: Path, exam: Exam) -> TactileMap:
 
 
 def places_on(tactile_map: TactileMap, path: Path, named: Sequence[Exam]) -> dict[str, tuple[float, float]]:
-    """Where masses lie on a map, by their code: x and y in patient axes are kept; as they are without landmarks."""
+    """Places of masses on a map, by code: transferred through patient axes, or as they are without landmarks."""
     places, from_plane = {}, tactile_map.patient_from_plane
     for one in named:
         assert one.centre_mm is not None
@@ -412,7 +411,7 @@ MassPlace = tuple[Place, bool]  #: Where a mass lies on its map, and whether it 
 
 
 def unnamed_masses(masses: Sequence[Sequence[MassPlace]]) -> list[Finding]:
-    """Masses of one scan that no row names; `masses` are those of each row of the scan."""
+    """A finding for each mass of a scan that no row names; `masses`: of each row of the scan."""
     known = [place for of_row in masses for place, reported in of_row if reported]
     findings = []
     for place, _ in masses[0]:
@@ -423,7 +422,7 @@ def unnamed_masses(masses: Sequence[Sequence[MassPlace]]) -> list[Finding]:
     return findings
 
 
-# --- Visits of a campaign's masses, which are compared for growth.
+# --- Visits of a campaign's masses.
 
 Visits = dict[str, list[Exam]]  #: Exams of one mass by the code of the visit, in order of time.
 

@@ -1,4 +1,4 @@
-"""What a campaign reads and where it writes."""
+"""Input files of a campaign, and its output folder."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def open_campaign(folder: Path, *, dry: bool = False) -> Iterator[BatchStore | N
 
 
 def _commit(result: Result) -> Result:
-    """Put a result's files in place for the journal; the campaign stops where the disk does not take them."""
+    """Put a result's files in place, before the journal takes it; a `UsageError` where the disk does not take them."""
     fault = result.get(UNWRITTEN)
     if fault is None:
         try:
@@ -70,7 +70,7 @@ def _commit(result: Result) -> Result:
 
 
 def unchanged(folder: Path, result: Result) -> bool:
-    """Whether the files of a step are still what it wrote: by their stamps, and where these differ by their digests."""
+    """True if the files of a step are as it wrote them: by their stamps, and where these differ by their digests."""
     stamps = result.get("stamps", {})
     try:
         return all(
@@ -84,10 +84,10 @@ def unchanged(folder: Path, result: Result) -> bool:
 def remove_stale_files(
     folder: Path, exams: Sequence[Exam], files_of: Callable[[str, str], Collection[str]], *, unread: Collection[str]
 ) -> list[str]:
-    """Remove files of earlier runs that this one would not make, and name the folders of exams no longer listed.
+    """Remove files of earlier runs that this one did not make; returns folders of exams that the table does not list.
 
-    `files_of` says what a step of this run made of an exam or mass; `unread` are exams whose file could not be read: a
-    disk that is away costs nothing that is done.
+    `files_of`: names of the files that a step of this run made for an exam or mass; `unread`: exams whose file could
+    not be read, which keep their files.
     """
     left = []
     spared = {*unread, *(name for exam in exams if exam.name in unread for name in (exam.of_mass, exam.of_visits))}
@@ -142,9 +142,10 @@ _SETTLED_S: Final = 10.0  #: A file that was last changed so long ago has times 
 
 
 def _digest_key(exam: Exam) -> tuple[str, bool]:
-    """Name that the digest of the exam's file has in the journal, and whether it tells the content from a later one.
+    """Key of the file's digest in the journal, and True if no later content can have the same key.
 
-    It does not where the file was changed a moment ago, or cannot be looked at; a store's tag needs no time.
+    A file that changed a moment ago may get other content under its key, and one that cannot be read has none; the tag
+    of an object store is safe at once.
     """
     try:
         if exam.address:
@@ -196,9 +197,9 @@ def read_sources(
 
 
 class DuplicateExams:
-    """Exams that share what only masses of one scan may share, told as they come.
+    """Finds exams with the same content, which only masses of one scan may have, block by block.
 
-    `what` is shared, for people: ``"bytes"`` or ``"recording"``.
+    `shared` is the content's name for messages: ``"bytes"`` or ``"recording"``.
     """
 
     def __init__(self, breasts: Breasts, shared: str) -> None:
@@ -206,9 +207,9 @@ class DuplicateExams:
         self._sharing: dict[str, list[Exam]] = defaultdict(list)
 
     def faults(self, marks: Mapping[Exam, Iterable[str]]) -> dict[str, str]:
-        """Reasons against exams, these and earlier ones, by the exam's name; `marks` says what each of these holds.
+        """Faults of these exams and of earlier ones, by name; `marks`: digests of each exam's content.
 
-        Masses of one scan, each with its place, are sound.
+        Masses of one scan, each with its place, have none.
         """
         new = {mark: None for of_exam in marks.values() for mark in of_exam}
         for exam, of_exam in marks.items():

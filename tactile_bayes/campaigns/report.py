@@ -1,4 +1,4 @@
-"""What a campaign writes beside the exams: tables, the index, and the trial's report."""
+"""A campaign's tables, index page and trial report, beside the folders of its exams."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class ExamRow(Record, eq=False):
     synthetic: bool | None = None
     """`scans`, `synthetic`: Of the file: digests and facts, whether it is simulated (None: unknown)."""
     findings: tuple[Finding, ...] = ()
-    """What speaks against the exam: of its estimate, of the pooled size of its mass, of the table."""
+    """Findings on its estimate, on the pooled size of its mass, and on the table."""
 
     @classmethod
     def of(cls, exam: Exam, report: EstimateReport, **facts: Any) -> ExamRow:
@@ -112,7 +112,7 @@ def exam_rows(campaign: Campaign, pooled: Pooled) -> list[ExamRow]:
 
 
 def _pooled_findings(pooled: Iterable[PooledReport]) -> dict[str, tuple[Finding, ...]]:
-    """What the pooled size of its mass says against each exam, such as that its lump lies elsewhere."""
+    """Findings of pooled sizes by the exam that they are about, such as a lump that lies elsewhere."""
     return {
         name: tuple(
             replace(one, about="")
@@ -164,12 +164,12 @@ def done_line(row: ExamRow) -> dict[str, object]:
 
 
 def _exam_cells(exam: Exam) -> dict[str, object]:
-    """What the tables repeat of an exam, by their columns."""
+    """Cells that name an exam, by the tables' columns."""
     return {name: getattr(exam, name) for name in ("patient", "visit", "mass", "replicate", "side", "reader", "file")}
 
 
 def _quantity_cells(quantity: Quantity | None, names: Mapping[str, str]) -> dict[str, object]:
-    """Figures of a quantity by their columns; none without one."""
+    """Cells of a quantity's figures, by their columns; none without a quantity."""
     return {} if quantity is None else {column: getattr(quantity, name) for column, name in names.items()}
 
 
@@ -237,7 +237,7 @@ def _trial_reading(row: ExamRow, modality: str, *, reader: str | None = None) ->
 
 
 def growth_rows(campaign: Campaign) -> list[Growth]:
-    """What `compare` says of each mass with several visits, in order of the masses."""
+    """Change of each mass with several visits, in order of the masses."""
     compared, rows = campaign.keys["compare"], []
     for name, visits in masses_with_visits(campaign.exams).items():
         codes, exam = [*visits], next(iter(visits.values()))[0]
@@ -285,7 +285,7 @@ _LINKS: Final = (layout.MAP_FIGURE, layout.SIZE_FIGURE, layout.SIZED_FIGURE)
 
 
 class Written(Record):
-    """What was written, in words."""
+    """Summary of the written files, in words."""
 
     counts: str  #: How the exams ended.
     masses: tuple[str, ...]  #: What became of masses with several exams or visits, a line each.
@@ -338,7 +338,7 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
 
 
 def _names_with_finding(rows: Sequence[ExamRow], kind: str, name: str) -> list[str]:
-    """Names of the exams, or of their masses, that a finding of the kind speaks against, each once."""
+    """Names of the exams, or of their masses, with a finding of the kind, each once."""
     return list(dict.fromkeys(getattr(row.exam, name) for row in rows if any(one.kind == kind for one in row.findings)))
 
 
@@ -397,7 +397,7 @@ def _fault_of_exam(exams: Sequence[Exam], row: int, column: str, words: str, /, 
 
 
 def _write_report(folder: Path, settings: CampaignSettings, growth: Sequence[Growth]) -> tuple[str, str]:
-    """Write what `validate` writes for the trial table; returns its text, or why there is none."""
+    """Write the files of `validate` for the trial table; returns the report's text, and the fault if there is none."""
     title, trial_settings = settings_by(settings.protocol)
     assert settings.excision is not None
     try:
@@ -482,7 +482,7 @@ def _exam_entry(campaign: Campaign, row: ExamRow, *, inline: bool) -> ExamEntry:
 
 
 def repeatability_words(campaign: Campaign) -> str:
-    """What the repeats say of the site, and that the sizes are by it; why they do not where they might have."""
+    """The learned spread between exams, which sizes use; else why it was not learned, where it might have been."""
     repeatability = campaign.repeatability
     if repeatability is None:
         return f"spread between exams not learned: {campaign.not_learned}" if campaign.not_learned else ""

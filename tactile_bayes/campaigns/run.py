@@ -57,7 +57,7 @@ _AHEAD_IN_BLOCK: Final = 8  #: Blocks hold so many times what an executor takes 
 
 
 def no_bar(_label: str) -> AbstractContextManager[Progress]:
-    """Nobody is told."""
+    """A context without a progress bar."""
     return nullcontext(no_progress)
 
 
@@ -77,7 +77,7 @@ class Campaign:
     dry: bool = False
     bar: Bar = no_bar
     keys: dict[str, dict[str, str]] = field(default_factory=lambda: {step: {} for step in steps.FILES})
-    """By step and name of the exam or mass, under which key the journal has the result."""
+    """Key of the result in the journal, by step and name of the exam or mass."""
     faults: dict[str, Fault] = field(default_factory=dict)  #: By the name of the exam or mass.
     kept: Counter[str] = field(default_factory=Counter)
     todo: Counter[str] = field(default_factory=Counter)
@@ -225,11 +225,11 @@ class Campaign:
         self._copy(EXAMS, [exam.name for exam in exams], made_by=("map", "estimate", "figures"))
 
     def _with_estimate(self, exams: Sequence[Exam]) -> list[Exam]:
-        """Those that have an estimate."""
+        """The exams that have an estimate."""
         return [exam for exam in exams if exam.name in self.keys["estimate"]]
 
     def _recorded_once(self, exams: Sequence[Exam]) -> list[Exam]:
-        """The exams without those of a recording that another exam has, in whatever file: they are no repeats."""
+        """The exams whose recording no other exam has, in whatever file; the others are no repeats and fail."""
         marks = {exam: list(recordings(self.result("map", exam.name).get("scans", ()))) for exam in exams}
         faults = self._recordings.faults(marks)
         for name, reason in faults.items():
@@ -241,7 +241,7 @@ class Campaign:
         return left
 
     def _copy(self, kind: str, names: Sequence[str], *, made_by: Sequence[str]) -> None:
-        """Copy what steps made of exams or masses into the object store."""
+        """Copy the files that steps made for exams or masses into the object store."""
         if self.settings.copy_to:
             tasks = []
             for name in names:
@@ -278,7 +278,7 @@ class Campaign:
         return self._task(step, exam.name, key, partial(make, self._folder_of(exam), settings, match))
 
     def _with_known_place(self, mapped: Sequence[Exam]) -> list[Exam]:
-        """The exams without those whose mass is named by a place on a map that could not be made."""
+        """The exams except those whose mass is placed on a map that could not be made; these fail."""
         lost = [exam for exam in mapped if self._breasts.exams_with_places(exam) and not self._exams_with_places(exam)]
         for exam in lost:
             named = ", ".join(one.name for one in self._breasts.exams_with_places(exam) if one.mass == exam.mass)
@@ -287,11 +287,11 @@ class Campaign:
         return [exam for exam in mapped if exam not in lost]
 
     def _exams_with_places(self, exam: Exam) -> list[Exam]:
-        """Exams with a map that name the places of the breast's masses, where this one names none."""
+        """Exams with a map that place the breast's masses, if this one places none."""
         return self._breasts.exams_with_places(exam, of=self.keys["map"])
 
     def _settings_key(self, settings: Settings, normalise: str) -> dict[str, Any]:
-        """All that an estimate depends on besides its map: settings, and the digests of the files that they name."""
+        """Inputs of an estimate besides its map: settings, and the digests of the files that they name."""
         plain = {name: getattr(settings, name) for name in names_of(settings)}
         name = str(plain.pop("size_calibration") or default_for(normalise))
         settings_file = plain.pop("settings_file")
@@ -313,7 +313,7 @@ class Campaign:
         return self._digests[path]
 
     def _learn_repeatability(self, sound: Sequence[Exam]) -> None:
-        """Learn the spread between exams from the repeats, and size every exam by it from what its estimate left."""
+        """Learn the spread between exams from the repeats, and size every exam by it from the draws of its estimate."""
         estimated, needed = self._with_estimate(sound), self._needed
         masses = steps.count_repeated_masses(sound if self.dry else estimated, self.settings)
         if masses < steps.FEWEST_MASSES:
@@ -360,7 +360,7 @@ class Campaign:
         return self._task("page", exam.name, key, make)
 
     def _expected(self, exam: Exam) -> dict[str, str]:
-        """What the table says of the exam, as far as it does."""
+        """Facts of the exam in the table, by column; blank ones are left out."""
         columns = ("patient", "side", "reader", "visit", "mass")
         return {name: value for name in columns if (value := getattr(exam, name)) is not None}
 
@@ -402,7 +402,7 @@ class Campaign:
     def _run_masses(
         self, step: str, inputs: Mapping[str, _Any], task_of: Callable[[str, _Any], steps.Task], *, masses: int
     ) -> None:
-        """Run a step for the masses that have what it needs, out of so many."""
+        """Run a step for the masses with inputs, out of so many; `inputs`: by name."""
         known = {} if self._sizes_unknown else inputs
         for names in _blocks(list(known), self._block):
             self._run(step, [task_of(name, known[name]) for name in names], of=len(names))
@@ -411,7 +411,7 @@ class Campaign:
             self._run(one, [], of=masses - len(known))
 
     def _unpoolable(self) -> str:
-        """Which calibration cannot size several maps together; empty for none."""
+        """Reason why masses cannot be pooled: a calibration not learned over bodies; empty for none."""
         for name in {self.settings.of(exam).size_calibration for exam in self.exams} - {None}:
             path = size_calibration_path(str(name))
             if path is None or not isinstance(read_size_calibration(path), BodyCalibration):
@@ -424,7 +424,7 @@ class Campaign:
         return self._task("pool", name, key, make)
 
     def _shared_settings(self, exams: Sequence[Exam]) -> tuple[Settings, dict[str, Any]]:
-        """Settings by which exams are sized together, and all that the result depends on."""
+        """Settings by which exams are sized together, and the inputs that key the result."""
         normalise = self._normalise(exams[0])
         settings = replace(self.settings.of(exams[0]), centre_mm=self.settings.estimate.centre_mm)
         settings = self._by_repeatability(settings, normalise)

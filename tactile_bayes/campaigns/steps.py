@@ -68,8 +68,8 @@ class CampaignSettings(CampaignOptions, kw_only=True):
     estimate: Settings = field(default_factory=Settings)
     """As of `estimate`; a row of the table may replace place, known values and calibration."""
     own_repeatability: bool = True
-    """Whether the spread between exams is learned from the campaign's own repeats, where enough masses have them and
-    the estimate's settings do not say it.
+    """True to learn the spread between exams from the campaign's own repeats, where enough masses have them and the
+    estimate's settings do not state it.
     """
 
     def of(self, exam: Exam) -> Settings:
@@ -131,10 +131,10 @@ FILES: Final = {
 """The files that each step may write."""
 UNWRITTEN: Final = "unwritten"  #: Key of a result that the disk did not take: the campaign's fault, not the exam's.
 _A_MAP, _ARRAYS = "a map or posterior (netCDF)", "an archive (.npz or a spreadsheet)"
-"""What `kind_of` calls the files that are no scans."""
+"""Names that `kind_of` gives to files that are no scans."""
 
 Result = dict[str, Any]
-Made = tuple[Result, Writes]  #: What a step found, and how to write each of its files.
+Made = tuple[Result, Writes]  #: Results of a step, and a writer for each of its files.
 
 
 class Task(Record):
@@ -173,11 +173,10 @@ def _write_staged(task: Task, writes: Writes) -> Result:
 
 
 def run_step(task: Task) -> Result:
-    """Run a step; returns digests of its files by name, where they wait, the seconds it took and what else it found.
+    """Run a step; returns the digests of its files by name, their staging folder, its seconds, and its other results.
 
-    `put_in_place` brings the files to their place: a worker that outlives its command must not.
-
-    What is wrong with the exam is a `TactileBayesError` without a path.
+    `put_in_place` moves the files to their place: a worker that outlives its command must not. A fault of the exam is a
+    `TactileBayesError` without a path.
     """
     begun, begun_cpu = time.perf_counter(), time.thread_time()
     try:
@@ -199,8 +198,8 @@ def make_map(
 ) -> Made:
     """The exam's map from its scan or its arrays (brought in as `import` does), or the map that its file is.
 
-    `expected` is what the table says of the exam, by its columns: what belongs to another exam is refused. `address` is
-    of a file in an object store, downloaded for as long as the map is made.
+    `expected`: the table's facts of the exam, by column; a file of another exam is refused. `address`: of a file in an
+    object store, downloaded for as long as the map is made.
     """
     if address:
         with downloaded(address) as path:
@@ -238,9 +237,9 @@ def _copy_map(source: Path, expected: Mapping[str, str]) -> Made:
 
 
 def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
-    """Refuse a file that says it is of another exam than the table does.
+    """Refuse a file whose facts contradict the table's; a fact that either lacks is not compared, nor are capitals.
 
-    What either leaves out is not compared, nor are capitals: the table has no two codes that differ by these alone.
+    The table has no two codes that differ by capitals alone.
     """
     both = {
         ours: facts[theirs] for ours, theirs in layout.SAME_IN_SCANS.items() if facts.get(theirs) and expected.get(ours)
@@ -255,7 +254,7 @@ def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
 
 
 def make_estimate(folder: Path, settings: Settings, match: Match | None) -> Made:
-    """The estimate, the draws of its size and what pools and sizes by the site start from."""
+    """Estimate, draws of its size, and the draws from which masses are pooled and sized by the site."""
     estimate = _estimate_exam(folder, settings, match)
     answer = estimate.answer
     report, shape = answer.report.checked(), answer.shape
@@ -268,7 +267,7 @@ def make_estimate(folder: Path, settings: Settings, match: Match | None) -> Made
 
 
 def _estimate_exam(folder: Path, settings: Settings, match: Match | None) -> SizeEstimate:
-    """The exam's estimate: of the mass that its row names, where other exams have it."""
+    """The exam's estimate; with a match, of the mass that lies where other exams place it."""
     if match is None:
         return estimate_file(folder / layout.MAP, settings)
     estimate = estimate_matched(folder / layout.MAP, settings, match)
@@ -293,9 +292,9 @@ def make_figures(folder: Path, settings: Settings, match: Match | None) -> Made:
 
 
 def make_page(folder: Path, expected: Mapping[str, str], *, report: str) -> Made:
-    """The exam's page and its thumbnail from what its steps left, its size from the file `report`.
+    """The exam's page and thumbnail from the files of earlier steps, its size from the file `report`.
 
-    The table tells what the scans do not.
+    Facts that the scans lack are the table's.
     """
     tactile_map, scans = read_map_and_scans(folder / layout.MAP)
     from_table = {layout.SAME_IN_SCANS[name]: text for name, text in expected.items() if name in layout.SAME_IN_SCANS}
@@ -311,7 +310,7 @@ def make_page(folder: Path, expected: Mapping[str, str], *, report: str) -> Made
 
 
 def make_pool(folder: Path, names: Sequence[str], settings: Settings) -> Made:
-    """Pool exams of a mass as `estimate --pool` does, from what their estimates left in their folders below this."""
+    """Pool exams of a mass as `estimate --pool` does, from the files of their estimates in folders below this."""
     answers = [_answer(folder / name) for name in names]
     pooled = pool_answers(answers, settings, names=names, files=[folder / name / layout.MAP for name in names])
     report = pooled.pooled_report.checked()
@@ -326,8 +325,7 @@ def make_growth(
 ) -> Made:
     """Compare the visits of a mass as `compare` does; the table says that they are of one where landmarks do not.
 
-    `visits` names the exams of each in order of time, with folders below `folder`; `course` is what the table says of
-    them.
+    `visits`: names of each visit's exams in order of time, with folders below `folder`; `course`: the table's facts.
     """
     answers = [[_answer(folder / name) for name in names] for names in visits]
     with_draws = [one for maps in answers for one in maps if one.shape is not None]
@@ -395,7 +393,7 @@ def count_repeated_masses(exams: Iterable[Exam], settings: CampaignSettings) -> 
 
 
 def learn_repeatability(repeats: Sequence[ExamFolder]) -> Made:
-    """Learn the spread between exams of one mass; where that cannot be, the reason is the result."""
+    """Learn the spread between exams of one mass; the result is the reason where that cannot be."""
     try:
         learned = learn_from_exams(repeats, fewest=FEWEST_MASSES)
     except BadDataError as error:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def site_words(site: SiteShift, log_width: float | None = None) -> str:
-    """Which calibration was corrected, by how many phantoms and by how much.
+    """The corrected calibration's name, the number of phantoms, and the correction with its interval.
 
     `log_width`: ln of the mean width in mm of the map in question; that of the phantoms where left out.
     """
@@ -35,7 +35,7 @@ def site_words(site: SiteShift, log_width: float | None = None) -> str:
 
 
 def site_calibration_text(calibration: BodyCalibration) -> str:
-    """The correction: shift, slope, what it leaves, and what is odd about it."""
+    """Text of a site's correction: cautions, shift, slope, and the scatter that it leaves."""
     site = calibration.site
     if site is None:
         raise ValueError("the calibration has no correction")
@@ -65,7 +65,7 @@ FEW: Final = 5  #: Masses below which the report says that they are few.
 
 
 def repeatability_text(site: RepeatabilityFile) -> str:
-    """Report of what repeated exams say of a site."""
+    """Text of a site's repeatability, learned from repeated exams."""
     median, low, high = (100 * one for one in (site.median, site.low, site.high))
     apart = [
         f"{one.name} (probability by chance {chance_text(one.by_chance, 4)})"
@@ -119,7 +119,7 @@ BODY_NAMES = {
 
 
 def body_calibration_text(calibration: BodyCalibration) -> str:
-    """Constants, spreads, what the unknowns cost, and the errors on masses left out."""
+    """Text of a calibration over bodies: constants, spreads, cost of the unknowns, cross-validated errors, ranges."""
     fit, held = defaultdict(lambda: float("nan"), {"bodies": 0.0, "maps": 0.0} | dict(calibration.fit)), ""
     if "left_out_held_percent" in fit:
         held = f", {fit['left_out_held_percent']:.0f} % in their {100 * HELD_OUT_PROBABILITY:g} % interval"
@@ -141,7 +141,7 @@ def body_calibration_text(calibration: BodyCalibration) -> str:
 
 
 def _eq6_lines(calibration: BodyCalibration) -> list[str]:
-    """The constants of Eq 6, by the depth of the fat where maps tell it, and its residual."""
+    """Constants of Eq 6, at several depths of fat where maps show the depth, and its residual."""
     alpha, p = calibration.centre.log_amplitude, calibration.centre.log_width
     sigma = f"sigma the geometric mean width, here {np.exp(p):.2g} mm"
     if calibration.depth is None:
@@ -162,7 +162,7 @@ def _eq6_lines(calibration: BodyCalibration) -> list[str]:
 
 
 def _other_lines(calibration: BodyCalibration) -> list[str]:
-    """By how much bodies of another origin depart; none where nothing told it."""
+    """Departure of bodies of another origin; none where it is unknown."""
     fit, source = calibration.fit, calibration.spread.other_source
     if not source:
         return []
@@ -179,7 +179,7 @@ def constants_text(constants: Mapping[str, float]) -> str:
 
 
 def calibration_line(name: str, calibration: Calibration, *, sigma_mm: float) -> str:
-    """Which calibration gave the size of a map with this mean width, and what it cannot know."""
+    """The calibration that sized a map of this mean width, with its constants and unknowns."""
     line = f"Sizes by the {name}"
     if isinstance(calibration, BodyCalibration):
         head = "" if calibration.recipe.head is None else f"; for a head of {calibration.recipe.head}"
@@ -191,7 +191,7 @@ def calibration_line(name: str, calibration: Calibration, *, sigma_mm: float) ->
 
 
 def fat_text(fat_mm: float | None) -> str:
-    """What the frames told for the sizes, as the beginning of `unknowns_text`; empty where nothing of it is used."""
+    """Depth of the fat that sizes use, to stand before `unknowns_text`; empty where they use none."""
     if fat_mm is None:
         return ""
     return f"fat under the head {fat_mm:.1f} mm deep, from the pressure profile away from the lump; "

@@ -41,7 +41,7 @@ class ExamEntry(Record, eq=False):
 
     @property
     def alt(self) -> str:
-        """What the picture shows, for those who do not see it."""
+        """Alternative text of the picture."""
         ring = "no lump ringed" if self.size is None else f"a ring around the lump of {self.size.median:.1f} mm"
         return f"Map of {self.words}, {ring}"
 
@@ -85,21 +85,21 @@ class MassEntry(Record, eq=False):
 
     @property
     def exams(self) -> list[ExamEntry]:
-        """Those of all visits."""
+        """Exams of all visits."""
         return [exam for visit in self.visits for exam in visit.exams]
 
     @property
     def status(self) -> str:
-        """Of the last visit; a mass is failed where all its exams there are."""
+        """One of `STATUSES`, by the last visit; failed if all of its exams are."""
         if self.last.size is not None:
             return SIZED
         return FAILED if all(exam.failed for exam in self.last.exams) else UNSIZED
 
     @property
     def remarks(self) -> Iterator[tuple[str, str]]:
-        """Severity and text of each finding, once, with the exams that it is of where it is not of all.
+        """Severity and text of each finding, once; those not of all exams name theirs.
 
-        What speaks against the comparison of the visits comes after what speaks against exams, and not again.
+        Findings of the comparison follow those of the exams.
         """
         every = self.exams
         known = {one.text for exam in every for one in exam.findings}
@@ -118,7 +118,7 @@ class MassEntry(Record, eq=False):
 
     @property
     def badness(self) -> tuple[int, int, int, float]:
-        """Sort key of what is to be looked at first."""
+        """Sort key: masses to be looked at first come first."""
         size, findings = self.last.size, [one for exam in self.exams for one in exam.findings]
         failed = sum(exam.failed for exam in self.exams)
         doubts = sum(10 if one.severity == "caution" else 1 for one in findings)

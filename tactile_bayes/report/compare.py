@@ -132,7 +132,7 @@ class ChangeReport(Record):
 
     @property
     def for_alike_exams_only(self) -> bool:
-        """True where a change is shown, but not if exams differ as patients' did."""
+        """True if the change is shown only where exams repeat as simulated ones do."""
         shown, another = self.verdict != "no_change_shown", self.another_exam
         return shown and another is not None and another.percent.low <= 0 <= another.percent.high
 
@@ -164,7 +164,7 @@ class CompareReport(Report, kw_only=True):
 _IF_EXAMS_REPEAT: Final = (
     "if exams repeat as simulated ones do; if they differ as those of patients did, no change is shown"
 )
-"""What a verdict rests on where the site has not learned how its own exams repeat."""
+"""Condition of a verdict where the site has not learned its own repeatability."""
 
 
 def growths(patient: str, mass: str, visits: Sequence[str], report: CompareReport, link: str) -> list[Growth]:
@@ -291,7 +291,7 @@ def _trend_report(joint: JointSizes, days: Sequence[float], probability: float) 
     return TrendReport(len(days), days[-1] - days[0], *rates, line.departure)
 
 
-# --- A comparison of visits as text: the change of size in words that its odds carry.
+# --- A comparison of visits as text.
 
 MORE: Final = "More (maps, every visit, growth rates, omissions): compare -v."
 _MOST_VISITS: Final = 3  #: Visits that a short report names one by one.
@@ -335,12 +335,12 @@ def compare_text(report: CompareReport) -> str:
 
 
 def verdict_sentence(report: CompareReport) -> str:
-    """Whether the mass has grown, or why nothing is compared."""
+    """Verdict on the change, or the reason why visits are not compared."""
     return _verdict_line(report.changes[-1]) if report.status == "compared" else _refusal(report)
 
 
 def change_sentences(report: CompareReport) -> list[str]:
-    """The change to the last visit with its odds, and what it supposes."""
+    """Change to the last visit, its odds, and the spread between exams that they suppose."""
     if report.status != "compared":
         return []
     change, odds, *another = _change_lines(report.changes[-1])
@@ -355,7 +355,7 @@ def rate_sentences(report: CompareReport) -> list[str]:
 
 
 def _refusal(report: CompareReport) -> str:
-    """Why nothing is compared, and what would help."""
+    """Reason why visits are not compared, with the remedy."""
     head = "Not compared: not shown to be one mass" if report.status == "not_one_mass" else "Not compared"
     advice = f" {capitalised(report.advice)}." if report.advice else ""
     return f"{head}: {report.reason}.{advice}"
@@ -381,7 +381,7 @@ def _place_line(place: VisitPlace, *, name: bool = False) -> list[str]:
 
 
 def _change_lines(change: ChangeReport) -> list[str]:
-    """The change, its odds, and both if exams of one mass differ as the paper's maps did, where the spread is none."""
+    """Change and its odds; without a stated spread also both if exams of one mass differ as the paper's maps did."""
     q, another = change.percent, change.another_exam
     median, low, high = map(signed, (q.median, q.low, q.high))
     odds = [(one.percent, chance_text(one.probability, 3)) for one in change.grown_by]
@@ -433,7 +433,7 @@ def _rate_words(rate: GrowthRate | TrendReport) -> str:
 
 
 def _site_line(report: CompareReport) -> list[str]:
-    """Whose spread between exams the intervals and the smallest detectable change suppose, where it was learned."""
+    """The site's learned spread between exams, which intervals and smallest detectable change suppose; else none."""
     words = report.site_words
     return [f"{capitalised(words)}; the figures above are for such exams."] if words else []
 

@@ -56,7 +56,7 @@ def estimate_quantities(estimate: Estimate, tactile_map: TactileMap, *, probabil
 
 
 def another_exam(size: SizePosterior | None, *, probability: float) -> reports.AnotherExam | None:
-    """The spread between exams of a mass as a share of its size, and both sizes with it; None where it is not told."""
+    """Sizes with the paper's spread between exams, and that spread as a share of the size; None without it."""
     another = None if size is None else size.another_exam
     if another is None:
         return None
@@ -71,7 +71,7 @@ MIDDLE_MM: Final = 20.0
 
 
 def side_of(scans: Sequence[Mapping[str, str]]) -> str:
-    """Which breast the scans say they are of, as `Provenance.scans` has them; empty where they do not agree."""
+    """The breast's side in `Provenance.scans`; empty where the scans do not agree."""
     sides = {scan.get("side", "") for scan in scans}
     return sides.pop() if len(sides) == 1 else ""
 
@@ -153,13 +153,13 @@ def touching_masses(masses: Sequence[SizedMass]) -> tuple[reports.Touching, ...]
 
 
 def together_words(pair: reports.Touching) -> str:
-    """How long two masses are together."""
+    """Joint length of two masses, with its interval."""
     length = pair.together_mm
     return f"together {length.median:.1f} mm long ({length.low:.1f} to {length.high:.1f})"
 
 
 def touching_findings(pairs: Sequence[reports.Touching]) -> list[Finding]:
-    """Which masses may be one lump."""
+    """A finding for each pair of masses that may be one lump."""
     return [
         finding("touching", "masses {} and {} may be one lump: ".format(*one.masses) + together_words(one))
         for one in pairs
@@ -292,14 +292,14 @@ SUPPOSED_PAIRS = (
     ("the lump soft", "soft", "hard", " ({:g} times as stiff as fat)", " ({:g} times)"),
     ("it centred on the gland's surface", "centred", "resting", "", " on the gland"),
 )
-"""Of suppositions, with the words of the first, and what follows each, a value in it."""
+"""Words of the first supposition, names of both, and words after each with its value."""
 
 
 Suppositions = Mapping[str, reports.Supposed]
 
 
 def suppositions(size: SizePosterior | None, largest: Quantity | None) -> dict[str, reports.Supposed] | None:
-    """The property that is supposed, its value, and the largest size with it, by name; None without a size."""
+    """Each supposed property with its value and the largest size given it, by name; None without a size."""
     if size is None or largest is None:
         return None
     return {
@@ -337,7 +337,7 @@ def supposed_line(supposed: Suppositions | None, median_mm: float, *, places: in
 
 
 def _moving_pair(supposed: Suppositions | None, median_mm: float, names: tuple[str, str]) -> list[reports.Supposed]:
-    """Two suppositions, where one of them at least moves the largest size; empty otherwise."""
+    """Both suppositions of these names if one of them moves the largest size, else none."""
     pair = [] if supposed is None else [supposed[name] for name in names if name in supposed]
     moves = any(abs(one.max_size_mm.median / median_mm - 1) >= LEAST_CHANGE for one in pair)
     return pair if moves and len(pair) == 2 else []
@@ -431,7 +431,7 @@ def mass_words(mass: MassReport, reported: MassReport | None) -> str:
 
 
 def reported_number_words(masses: Sequence[MassReport]) -> str:
-    """Which of the masses is reported, in words; empty where it is the only one."""
+    """Number of the reported mass, such as "Mass 1 of 2"; empty where it is the only one."""
     reported = next((one for one in masses if one.reported), None)
     return "" if reported is None or len(masses) == 1 else f"Mass {reported.number} of {len(masses)}"
 
@@ -489,7 +489,7 @@ def estimate_report(
 
 
 def smallest_lump(smallest: SmallestLumps) -> reports.SmallestLump:
-    """What a map without a lump would have shown, as files have it."""
+    """Smallest lumps that a map without one would have shown, as files have them."""
 
     def row(diameters: FloatArray) -> Any:
         return tuple(float(d) if math.isfinite(d) else None for d in diameters)
@@ -504,7 +504,7 @@ def smallest_lump(smallest: SmallestLumps) -> reports.SmallestLump:
 
 
 def size_diagnostics(size: SizePosterior) -> dict[str, Any]:
-    """What the diagnostics say of a size; a figure that is not finite is null."""
+    """Diagnostics of a size; a figure that is not finite is null."""
     return _finite({"invalid_draws": size.invalid, **size.figures})
 
 

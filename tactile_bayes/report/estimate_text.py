@@ -21,7 +21,7 @@ from tactile_bayes.size.draws import EXTREMES, SIZES
 
 
 def smallest_text(smallest: SmallestLump) -> str:
-    """What would have shown, by depth, where the map is best and where it is worst; without a full stop."""
+    """Diameters that would have shown, by depth, where the map is best and where it is worst; without a full stop."""
     ends = zip(smallest.depths_mm, smallest.best_mm, smallest.worst_mm, strict=True)
     ranges = []
     for depth, best, worst in ends:
@@ -55,12 +55,12 @@ SOURCES = {
 
 
 def exams_label(spread: float | None) -> str:
-    """What an interval supposes: how far exams of one mass are apart, as a share of its size; None for not at all."""
+    """The spread between exams that an interval supposes; `spread` is a share of the size, None for no spread."""
     return f"if exams differ by {100 * spread:.0f} %" if spread is not None else "if exams do not differ"
 
 
 def two_intervals_text(this: float | None, another: float) -> str:
-    """What the intervals of a size suppose, the leading one first; `this` is None for no spread between exams."""
+    """Both spreads that the intervals of a size suppose; `this`: of the narrower one, None for no spread."""
     alike = "no spread" if this is None else f"{100 * this:.0f} %"
     return (
         f"The intervals of the sizes suppose that exams of one mass differ by {100 * another:.0f} %, as those of "
@@ -70,7 +70,7 @@ def two_intervals_text(this: float | None, another: float) -> str:
 
 
 def site_interval_text(repeatability: str) -> str:
-    """What the interval of a size supposes where the site's repeatability is known, from `Repeatability.words`."""
+    """The spread that the interval of a size supposes at a site of known repeatability (`Repeatability.words`)."""
     return f"The interval is for any exam of the mass: {repeatability}."
 
 
@@ -87,7 +87,7 @@ def ends_text(name: str, mc_error: float, sd: float) -> str:
 
 
 def shape_text(figures: Mapping[str, float]) -> str:
-    """Whether the lump is sized as round or oval, and the difference that makes to the largest size."""
+    """The lump's outline, round or oval, with its probability and its effect on the largest size."""
     lead = "Irregular outline. " if figures.get("irregular_outline") else ""
     probability = figures["oval_probability"]
     longer = 100 * math.expm1(figures["oval_half_log_ratio"])
@@ -224,7 +224,7 @@ def _advice_lines(report: EstimateReport) -> list[str]:
 
 
 def _quantities(report: EstimateReport | PooledReport) -> dict[str, Quantity]:
-    """What the report has of `ROWS`, by name."""
+    """Quantities of `ROWS` that the report has, by name."""
     found: dict[str, Any] = {}
     for path, _, _ in ROWS:
         holder, _, name = path.rpartition(".")
@@ -293,7 +293,7 @@ def _detail_lines(estimate: Estimate, report: EstimateReport) -> list[str]:
 
 
 def invalid_draws(report: EstimateReport) -> list[str]:
-    """How many draws gave no size; empty for none."""
+    """A phrase that counts the draws without a size; empty where all have one."""
     number = report.diagnostics.get("invalid_draws")
     return [f"{number} draws gave no size and were left out"] if number else []
 
@@ -357,7 +357,7 @@ def estimate_summary(estimate: Estimate, report: EstimateReport) -> str:
 
 
 def _estimate_lines(estimate: Estimate, report: EstimateReport, cautions: list[str], checks: list[str]) -> list[str]:
-    """The body of a report with an estimate; what makes the interval wide gives way to masses."""
+    """Lines of a short report between its cautions and its last lines; sources of width give way to masses."""
     quantities, largest = _quantities(report), report.max_size_mm
     shown = EXTREMES if largest is not None else WIDTHS
     lines = cautions + size_table(report, (*shown, ANOTHER_LARGEST, ANOTHER_SMALLEST))

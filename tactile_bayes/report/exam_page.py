@@ -73,7 +73,7 @@ def exam_page(exam: ShownExam) -> str:
 
 
 def _place(exam: ShownExam) -> dict[str, Any]:
-    """Where the lump lies, beside a clock face of the breast."""
+    """Clock face of the breast, with sentences on the lump's place and probability."""
     mass = exam.main.masses[0]
     sentences = [exam_words.place_sentence(mass, INTERVAL if exam.largest is None else exam.largest.probability)]
     if mass.probability is not None:

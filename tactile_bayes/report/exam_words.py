@@ -1,4 +1,4 @@
-"""What the page of an exam says."""
+"""Contents of an exam's page, and its sentences."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class ExamMap(Record, eq=False):
 
 
 class PageLabels(Record):
-    """What was given for the page besides maps: title, name and date, empty where they were not."""
+    """Title, name and date to print on a page; each may be empty."""
 
     title: str = ""
     name: str = ""
@@ -76,7 +76,7 @@ class PageLabels(Record):
 
 
 class ShownExam(Record, eq=False):
-    """What one page shows."""
+    """Contents of one page."""
 
     maps: tuple[ExamMap, ...]  #: Several are repeats of one mass.
     pooled: PooledReport | None = None  #: The size from all maps; None with one map.
@@ -117,7 +117,7 @@ class ShownExam(Record, eq=False):
 
     @property
     def disagrees(self) -> bool:
-        """Whether the maps are not of one size, or not of one mass."""
+        """True if the maps are not of one size, or not of one mass."""
         return self.pooled is not None and self.pooled.status == DISAGREE
 
 
@@ -206,7 +206,7 @@ def size_sentences(exam: ShownExam) -> Iterator[str]:
 
 
 def _supposed(exam: ShownExam) -> str:
-    """What the size's interval supposes of the spread between exams, and where that is from."""
+    """Spread between exams that the size's interval supposes, and its source."""
     report, spread = exam.report, exam.report.figures.get("between_map_sd")
     if report.another_exam is not None:
         after = " after these maps" if exam.pooled is not None else ""
@@ -229,7 +229,7 @@ def _supposed(exam: ShownExam) -> str:
 
 
 def nothing_sentences(exam: ShownExam) -> Iterator[str]:
-    """Why there is no size, what could have been missed, and what would help."""
+    """Reason for no size, lumps that the map could have missed, and the remedy."""
     if exam.disagrees:
         yield "No common size is given: look at each map."
         for number, one in enumerate(() if exam.pooled is None else exam.pooled.maps, start=1):
@@ -274,7 +274,7 @@ def short_place(mass: ExamMass) -> str:
 
 
 def why_no_clock(exam: ShownExam) -> str:
-    """Why the page tells no place by the clock, where a patient was scanned; empty where it does."""
+    """The facts missing for a clock position on a patient's scan; empty if there is one, or no patient."""
     tactile_map = exam.main.tactile_map
     if (
         tactile_map is None
@@ -288,7 +288,7 @@ def why_no_clock(exam: ShownExam) -> str:
 
 
 def quality_rows(exam: ShownExam) -> Iterator[tuple[str, str]]:
-    """Rows of the table on how good the exam was."""
+    """Rows of the table on the exam's quality."""
     if exam.main.tactile_map is not None:
         yield from _scan_rows(exam.main.tactile_map)
     days = [scan["array_calibration_days"] for scan in exam.scans if "array_calibration_days" in scan]
@@ -301,7 +301,7 @@ def quality_rows(exam: ShownExam) -> Iterator[tuple[str, str]]:
 
 
 def _scan_rows(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
-    """Rows on what was scanned, and how."""
+    """Rows on coverage, pressure, frames and landmarks."""
     quality = tactile_map.quality
     yield "covered", covered_text(tactile_map)
     if reach := reach_text(tactile_map):
@@ -374,7 +374,7 @@ def mass_row(mass: ExamMass) -> tuple[str, str, str]:
 
 
 def facts(exam: ShownExam) -> Iterator[tuple[str, str]]:
-    """What the scans say of the exam, with what was given for the page."""
+    """Rows of an exam's facts: the page's labels, and codes from the scans."""
     if exam.labels.name:
         yield "Name", exam.labels.name
     for key in ("subject", "side", "mass", "visit", "posture", "examiner"):

@@ -126,7 +126,7 @@ def _values_at(tactile_map: TactileMap, x_mm: FloatArray, y_mm: FloatArray) -> F
 
 
 def _drawn_visits(laid: Sequence[LaidMap]) -> list[int]:
-    """The visits whose maps are drawn: the first and the last ones."""
+    """Indices of the visits whose maps are drawn: the first and the last ones."""
     return [0, *range(max(1, len(laid) - _MOST_VISITS + 1), len(laid))]
 
 
@@ -142,7 +142,7 @@ _SCALE: Final = 0.7  #: Of life size, of the maps.
 
 
 class Course(Record):
-    """What is known of the visits besides their maps; empty where it is not."""
+    """Facts on the visits besides their maps; empty where unknown."""
 
     title: str = ""
     name: str = ""

@@ -204,7 +204,7 @@ def _mean(cases: Rows, name: str) -> float:
 
 
 def _mean_msd_words(heads: Sequence[Rows]) -> str:
-    """How near both tables come to the print."""
+    """Mean MSD of frames and of maps, beside the nearest head's and the printed ones."""
     parts = []
     for words, name in (("frames", "centred_frame"), ("maps", "map")):
         nearest = "".join(f"nearest head {_mean(beside, name):.1f}, " for beside in heads[1:])
@@ -214,7 +214,7 @@ def _mean_msd_words(heads: Sequence[Rows]) -> str:
 
 
 def _other_definitions(cases: Rows) -> list[str]:
-    """Results of other definitions: means over the cases with the least and the largest."""
+    """Table of MSD by other definitions: mean over the cases, least and largest."""
     lines = [
         "Other definitions, %: mean (least-largest); printed 4.0-4.3, 2.2-2.7",
         f"{'':<32}{'frame':>16}{'frame / mean':>16}{'map':>16}",
@@ -240,7 +240,7 @@ def _table(title: str, name: str, heads: Sequence[Rows]) -> list[str]:
 
 
 def tables_document(by_head: ByHead, phantoms: ByHead, *, seat: float) -> dict[str, Any]:
-    """The same as plain data, shares instead of percent; the head that was asked for first."""
+    """Both tables as plain data, shares instead of percent; the chosen head comes first."""
     first = next(iter(by_head))
     return {
         "schema": "tactile-bayes/tables/1",
@@ -268,7 +268,7 @@ def tables_document(by_head: ByHead, phantoms: ByHead, *, seat: float) -> dict[s
 
 
 def _case_document(one: model_comparison.Agreement) -> dict[str, Any]:
-    """A lump's figures; a line's fit has one width."""
+    """Figures of a lump, with the bumps fitted to both models' lines."""
     fits = {"elastic": one.elastic, "empirical": one.empirical}
     bumps = {
         name: {"amplitude": fit.amplitude, "sigma_mm": fit.widths_mm[0], "rms": fit.rms, "resolved": fit.resolved}

@@ -97,7 +97,7 @@ def map_summary(tactile_map: TactileMap, *, written: str) -> str:
 
 
 def _verdict_line(findings: Sequence[Finding], facts: Mapping[str, Any]) -> str:
-    """Whether the map is sound, with the figures that lead to it."""
+    """Verdict on the map with its main figures."""
     figures = [f"{facts['frames']} frames"] if "frames" in facts else []
     figures += [facts[name] for name in ("scans_used", "every") if name in facts]
     if "coverage" in facts:
@@ -125,7 +125,7 @@ def map_text(tactile_map: TactileMap) -> str:
 
 
 def _map_facts(tactile_map: TactileMap) -> dict[str, Any]:
-    """What is told of a map, by name: its figures, and words on them; what is not known is left out."""
+    """Known figures of a map, and words on them, by name."""
     quality, recipe, values = tactile_map.quality, tactile_map.recipe, tactile_map.mean[tactile_map.covered]
     rows, columns = tactile_map.mean.shape
     facts: dict[str, Any] = {
@@ -184,7 +184,7 @@ def _notes(tactile_map: TactileMap) -> Iterator[str]:
 
 
 def _advice(quality: Mapping[str, float]) -> Iterator[str]:
-    """What could be done better, or would bend a size."""
+    """Advice on the pressure window and on skewed strokes."""
     gated = quality.get("dropped_low", 0.0) + quality.get("dropped_high", 0.0)
     if gated > _MUCH_GATED * quality.get("frames_total", np.inf):
         ends = f"{quality['level_p05_kpa']:.1f} to {quality['level_p95_kpa']:.1f} kPa"
@@ -263,7 +263,7 @@ def map_figure(
 
 
 def _across_up(view: Orientation, x: Any, y: Any) -> tuple[Any, Any]:
-    """Order two values by the picture's horizontal and vertical axes."""
+    """Values along x and y as those across and up the picture."""
     return (y, x) if view.swapped else (x, y)
 
 

@@ -103,13 +103,13 @@ class Growth(Record, eq=False):
 
     @property
     def outcome(self) -> str:
-        """What became of the mass, or why nothing is known of it."""
+        """Verdict on the change with its condition, or the reason why visits were not compared."""
         words = ", ".join(filter(None, (self.verdict.replace("_", " "), self.reason)))
         return words if self.verdict else f"not compared: {self.reason}"
 
     @property
     def words(self) -> str:
-        """The same with what speaks against it."""
+        """`outcome` with its findings."""
         return ". ".join([self.outcome, *finding_lines(self.findings, paper=True)])
 
 
@@ -127,14 +127,14 @@ def growth_line(rows: Sequence[Growth], table: str) -> str:
 
 
 class PageFiles(Record):
-    """Where a page goes."""
+    """Files that a page is written to."""
 
     html: Path
     pdf: Path | None = None  #: None writes none.
     force: bool = False  #: Overwrite them.
 
     def check(self) -> None:
-        """Refuse, before any work is done, what could not be written."""
+        """Refuse names that could not be written, before any work is done."""
         check_suffix(self.html, "HTML")
         refuse_existing(self.html, force=self.force)
         if self.pdf is not None:
@@ -162,7 +162,7 @@ _TIMES: Final = re.compile(rb"/(CreationDate|ModDate) ?\(D:[0-9+Z'-]*\)")
 
 
 def find_printer() -> Printer:
-    """What prints a page here."""
+    """Function that turns HTML into PDF: an installed browser's, else WeasyPrint's."""
     browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if browser is not None:
         return lambda text: _by_browser(browser, text)

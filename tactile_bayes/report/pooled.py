@@ -23,7 +23,7 @@ from tactile_bayes.size.terms import UNLIKE_LEARNED, unknown_head
 
 MOST_NAMED = 4
 
-# --- Which mass of each map is the one that is pooled: by its place in the patient.
+# --- The mass of each map that is pooled: by its place in the patient.
 #
 # A report is about the surest mass of its map, so of two maps of one breast each may report another one. With
 # landmarks the masses of all maps have places in patient axes, and the one that most maps show is pooled.
@@ -140,7 +140,7 @@ def _pooled_map(index: int, name: str, report: EstimateReport, pooled: PooledEst
 
 
 def pooled_findings(pooled: PooledEstimate, reports: Sequence[EstimateReport]) -> Iterator[Finding]:
-    """What speaks against the size: of the maps in which a lump was found, and of the maps together."""
+    """Findings on the maps with a lump, each named by its map, and on the maps together."""
     if pooled.status == DISAGREE and pooled.one_place is not None and pooled.one_place < LEAST_PROBABILITY:
         yield disagreement(pooled.reason, pooled.one_place)
     elif pooled.status == DISAGREE and pooled.one_size is not None:

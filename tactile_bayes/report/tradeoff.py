@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 def advice(ladder: Tradeoff) -> list[str]:
-    """What to choose, why more buys nothing, and what moves the answer more than any arithmetic."""
+    """The cheapest sufficient setting, and settings and pooled maps that change the answer more than accuracy does."""
     answer, limit = ladder.reference.answer, ladder.tolerance_mm
     if answer is None:
         return [_advice_without_size(ladder), *ladder.notes]
@@ -80,7 +80,7 @@ def _cheapest_setting(ladder: Tradeoff, reference: SizeAnswer) -> str:
 
 
 def _advice_without_size(ladder: Tradeoff) -> str:
-    """Nothing to compare: what the settings say of a lump."""
+    """Advice where the default gives no size: settings that give one, and the probabilities of a lump."""
     sized = [one.label for one in ladder.rows if one.answer.reported is not None]
     chances = [one for row in ladder.rows if (one := row.answer.detected_probability) is not None]
     span = ""
@@ -153,7 +153,7 @@ def tradeoff_text(ladders: Mapping[str, Tradeoff]) -> str:
 
 
 def ladder_text(ladder: Tradeoff) -> str:
-    """What to choose, the table behind it, and notes."""
+    """Advice, the table of settings, and notes."""
     parts, width = [_SHORT.get(name, name) for name in ladder.default.cpu_s], _label_width(ladder)
     costs, units = ("".join(f"{word:>{_COST}}" for word in words) for words in (parts, ["s"] * len(parts)))
     quantity = "size" if gives_sizes(ladder) else "sigma"
@@ -177,7 +177,7 @@ def _label_width(ladder: Tradeoff) -> int:
 
 
 def gives_sizes(ladder: Tradeoff) -> bool:
-    """Whether what is reported is a size; without a calibration it is a width."""
+    """True if sizes are reported, False if widths, for lack of a calibration."""
     return any(SIZE in one.answer.quantities for one in ladder.rows) or ladder.reference.answer is None
 
 
@@ -198,7 +198,7 @@ def _row(one: MeasuredSetting, ladder: Tradeoff) -> list[str]:
 
 
 def _number(answer: SizeAnswer) -> str:
-    """The number, or why there is none, with the probability of a lump where the reason does not name one."""
+    """Median and interval, else the reason for none, with the probability of a lump if the reason lacks it."""
     quantity, reason = answer.reported, answer.reason
     if quantity is not None:
         return f"{quantity.median:>7.2f}{f'{quantity.low:.2f} to {quantity.high:.2f}':>15}"
@@ -221,12 +221,12 @@ def _pooled(one: PooledRow, ladder: Tradeoff) -> list[str]:
 
 
 def _is_model_map(answer: SizeAnswer) -> bool:
-    """Whether an answer is of a forward model's map, which has no errors."""
+    """True if an answer is of a forward model's map, which has no errors."""
     return AMPLITUDE in answer.quantities
 
 
 def _exact_maps(ladder: Tradeoff) -> Iterator[str]:
-    """Of maps without errors what they show, and how far that is off the reference, with its sign."""
+    """Table of a forward model's maps, which have no errors: bump, and signed deviation from the reference."""
     best = ladder.reference.answer
     if best is None or not _is_model_map(best):
         return

@@ -44,7 +44,7 @@ def plan_text(plan: PlanReport) -> str:
 
 
 def needed_sentence(one: Needed) -> str:
-    """How many patients reach what was asked for."""
+    """Number of patients needed for a target."""
     aim = "power" if one.aim == "power" else "an interval of the tactile error of factor"
     maps = f"{one.maps} map{'s' if one.maps > 1 else ''} of each mass"
     ends = one.patients_interval
@@ -259,7 +259,7 @@ def _between(ends: Ends | None, spec: str) -> str:
 
 
 def _methods(report: TrialReport) -> Iterator[str]:
-    """What `validate -v` adds."""
+    """Lines that `validate -v` adds."""
     yield from figure_table(report, _DETECTED)
     yield ""
     for name, one in report.modalities.items():
@@ -327,7 +327,7 @@ def ratio_line(name: str, one: ModalityRatio) -> str:
 
 
 def _reasons(name: str, report: ModalityReport, keys: Sequence[str]) -> Iterator[str]:
-    """Why figures or their intervals are missing; missing replicates are named in the JSON only."""
+    """Reasons for missing figures and intervals; those of missing replicates stand in the JSON only."""
     owed = {key: report.reasons[key] for key in keys if not key.startswith(("within_mass", "calibration"))}
     figures = {key: why for key, why in owed.items() if not key.endswith("_interval")}
     intervals = {key.removesuffix("_interval"): why for key, why in owed.items() if key.endswith("_interval")}
@@ -340,7 +340,7 @@ def _reasons(name: str, report: ModalityReport, keys: Sequence[str]) -> Iterator
 
 
 def found_share(report: ModalityReport) -> str:
-    """Masses found of those looked for, with the interval of their share."""
+    """Number of detected masses of those looked for, with the interval of their share."""
     share = f"{report.detected}/{report.n}"
     if report.detected_interval is None:
         return share

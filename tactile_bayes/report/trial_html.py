@@ -152,7 +152,7 @@ def _draw_coverage(calibration: Calibration, axes: Axes) -> None:
 
 
 def plan_figure(plan: PlanReport, path: Path, *, force: bool = False) -> None:
-    """Draw the designs of a plan by their number of maps, and what reaches what was asked for."""
+    """Draw the designs of a plan by their number of maps, and the patients that reach each target."""
     aims: list[Aim] = list(dict.fromkeys(one.aim for one in plan.needed)) or ["power"]
     size_in = (_PANEL_IN * 1.4 * len(aims), _PANEL_IN)
     with figure_file(path, size_in=size_in, foot=None, force=force) as figure:
@@ -240,7 +240,7 @@ def _calibrations(report: TrialReport, trial: Trial) -> Iterator[tuple[str, Cali
 
 
 def _cells(figures: Figures, columns: Mapping[str, tuple[str, str]]) -> list[str]:
-    """Figures with their intervals, by what is `columns`: head and format of each by name."""
+    """Figures with their intervals; `columns`: head and format of each by name."""
     return [trial_words.shown(figures.figure(key), spec) for key, (_, spec) in columns.items()]
 
 
