@@ -318,7 +318,7 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
     links |= {layout.REPEATABILITY: layout.REPEATABILITY} if campaign.repeatability else {}
     sized, failed = sum(row.size is not None for row in rows), sum(row.failed for row in rows)
     counts = f"{sized} sized, {len(rows) - sized - failed} without a size, {failed} failed"
-    write_text(folder / INDEX, _index_html(campaign, rows, pooled, growth, counts=counts, links=links), force=True)
+    write_text(folder / INDEX, index_html(campaign, rows, pooled, growth, counts=counts, links=links), force=True)
     left_out = set() if masses is None else {(row.exam.patient, row.exam.mass) for row in rows} - masses
     together = f"no mass pooled: {campaign.not_pooled}" if campaign.not_pooled else ""
     together = f"{len(pooled)} masses pooled, each at one visit" if pooled else together
@@ -410,7 +410,7 @@ def _write_report(folder: Path, settings: CampaignSettings, growth: Sequence[Gro
     return analysis.told(methods=False), ""
 
 
-def _index_html(
+def index_html(
     campaign: Campaign,
     rows: Sequence[ExamRow],
     pooled: Pooled,
@@ -445,13 +445,15 @@ def _index_html(
 def _visit_entry(
     day: date | None, rows: Sequence[ExamRow], exams: tuple[ExamEntry, ...], report: PooledReport | None
 ) -> VisitEntry:
-    """A visit with its size: the pooled one where there is one, else that of its one exam."""
+    """A visit with its size: the pooled one where there is one, else that of its one exam; without one the reason."""
     code = rows[0].exam.visit
     words = code if day is None or day.isoformat() == code else f"{code}, {day.isoformat()}"
     if report is not None:
         size = report.leading.max_size_mm
+        if len(rows) == 1:
+            return VisitEntry(words, exams, size, why="" if size else rows[0].on_paper)
         estimated = sum(one.status == "estimate" for one in report.maps)
-        return VisitEntry(words, exams, size, estimated if len(rows) > 1 else 0, "" if size else report.reason)
+        return VisitEntry(words, exams, size, estimated, "" if size else report.reason)
     size = exams[0].size if len(exams) == 1 else None
     reasons = dict.fromkeys(row.on_paper for row in rows)
     return VisitEntry(words, exams, size, why="" if size else "; ".join(filter(None, reasons)) or "not pooled")

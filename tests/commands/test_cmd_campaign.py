@@ -40,7 +40,7 @@ from scipy.io import savemat
 
 import tactile_bayes as tb
 from tactile_bayes.campaigns.inputs import open_campaign
-from tactile_bayes.campaigns.report import ExamRow, trial_lines
+from tactile_bayes.campaigns.report import ExamRow, index_html, trial_lines
 from tactile_bayes.campaigns.steps import Task, make_map, run_step
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.documents import load_schema
@@ -350,6 +350,16 @@ def test_an_exam_that_cannot_show_a_lump_was_not_done(code: str, status: str) ->
     without_faults: Any = SimpleNamespace(faults={})
     together = {row.exam.of_mass: pooled_report(reason="no size", maps=())}
     assert [one["status"] for one in trial_lines(without_faults, [row], together, None)] == [status, status]
+
+
+def test_the_index_gives_the_reason_of_a_visits_one_exam_not_a_count_of_maps() -> None:
+    exam = Listed("a.nc", Path("a.nc"), "P", "1", "1", 1)
+    row = ExamRow.of(exam, estimate_report(reason="no lump found within 20 mm of the place", reason_code="undetected"))
+    pooled = {exam.of_mass: pooled_report(reason="a lump was found on 0 of 1 maps", maps=())}
+    run: Any = SimpleNamespace(exams=[exam], files=lambda *_: {}, repeatability=None, folder=Path("out"))
+    page = index_html(run, [row], pooled, (), counts="0 sized", links={})
+    assert "no lump found within 20 mm" in page
+    assert "0 of 1 maps" not in page
 
 
 @pytest.mark.long
