@@ -43,8 +43,19 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--budget", type=float, metavar="S", help="Skip tests that would begin after S seconds.")
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Turn the order round, neighbours staying together; steps of a prime number visit every place."""
+    """Mark the further cases of `long_repeats`, and turn the order round as `--begin-at` asks.
+
+    Neighbours stay together; steps of a prime number visit every place.
+    """
+    repeated = set[str]()
+    for item in items:
+        if item.get_closest_marker("long_repeats"):
+            test = item.nodeid.partition("[")[0]
+            if test in repeated:
+                item.add_marker("long")
+            repeated.add(test)
     if begin := config.getoption("--begin-at"):
         place = begin * 97 % max(len(items), 1)
         items[:] = items[place:] + items[:place]

@@ -82,6 +82,7 @@ EXPECTED = [draw(seed) for seed in range(12)]
 # --- the same results anywhere
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("workers", [0, 1, 2])
 def test_results_do_not_depend_on_the_number_of_workers(workers):
     with open_executor(workers=workers) as executor:
@@ -204,6 +205,7 @@ def waits_to_write(pid: int) -> bool:
     return where in ("1", "44", "46", "64", "206")  # write, sendto, sendmsg of x86-64; write, sendto of arm64
 
 
+@pytest.mark.long
 def test_an_item_whose_worker_dies_twice_is_at_fault_and_no_other():
     with open_executor(workers=2) as executor:
         outcomes = run_batch(die_on_three, range(8), key=str, executor=executor)

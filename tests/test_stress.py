@@ -34,11 +34,13 @@ def plain() -> np.ndarray:
     return frames_at_poses(SCENE, *head_positions(SCENE, TIMES), mean_kpa=level)[0]
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("physics", [Physics(), fat(0.0), Physics(skin_radius_mm=1e9)], ids=["none", "even", "flat"])
 def test_without_stress_the_frames_are_the_solid_models(physics: Physics, plain: np.ndarray) -> None:
     np.testing.assert_allclose(frames(physics), plain, atol=2e-5 * plain.max())
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize(
     "physics",
     [

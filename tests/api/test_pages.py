@@ -31,6 +31,7 @@ def run(blocks: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch) -> dic
     return names
 
 
+@pytest.mark.long
 def test_the_python_guide_runs_as_printed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -647,6 +647,7 @@ def check_resumed(folder: Path, undisturbed: Path) -> None:
     assert len(done) == len(set(done)) == STEPS_OF_ALL
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("after", [3, *(pytest.param(n, marks=pytest.mark.slow) for n in (0, 7))])
 def test_a_killed_run_ends_in_the_same_bytes(
     after: int, undisturbed: Path, own: Path, child_environment: dict[str, str]

@@ -59,6 +59,7 @@ def test_a_map_made_otherwise_is_refused_with_the_command_that_makes_it(folder, 
     assert f"make the map again with `{command}`" in done.stderr
 
 
+@pytest.mark.long
 def test_a_calibration_of_cylinders_of_one_seat_says_so_first(folder: Path) -> None:
     words = ("estimate", "mean.nc", "--method", "laplace", "--size-calibration")
     first = run_here(*words, "plane-strain", cwd=folder).stdout.splitlines()[0]

@@ -81,6 +81,7 @@ def test_a_grid_may_say_its_seats(run_cli: Run, tmp_path: Path) -> None:
     assert float(rows[0]["amplitude"]) > float(rows[1]["amplitude"]) > float(rows[2]["amplitude"])
 
 
+@pytest.mark.long
 def test_an_interrupted_study_goes_on_where_it_stopped(folder: Path, run_cli: Run, tmp_path: Path) -> None:
     """The store of a killed run: two geometries, and a third half written."""
     from tactile_bayes.actions.study import study_settings

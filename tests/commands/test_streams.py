@@ -34,6 +34,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_a_nearly_full_disk_never_takes_half_a_result_in_silence(
     unbuffered: str, folder: Path, child_environment: dict[str, str]
@@ -53,6 +54,7 @@ def test_a_nearly_full_disk_never_takes_half_a_result_in_silence(
     assert "the standard output cannot be written (File too large)" in done.stderr
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
 def test_closed_streams_change_nothing_but_what_is_seen(
     closed: str, folder: Path, child_environment: dict[str, str]

@@ -50,6 +50,7 @@ def written(made: Path, tmp_path: Path) -> list[Path]:
     return sorted(shutil.copytree(made, tmp_path / "out").iterdir())
 
 
+@pytest.mark.long_repeats
 def test_dciodvfy_reports_no_error(written: list[Path]) -> None:
     for path in written:
         lines = said(tool("dciodvfy"), path).splitlines()

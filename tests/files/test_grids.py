@@ -366,6 +366,7 @@ def test_a_dead_line_that_is_noisy_is_named(tmp_path: Path) -> None:
     read_grid(tmp_path / "g.npz", normalise="gain")
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("cell_mm", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("normalise", ["gain", "none"])
 def test_nothing_stands_apart_in_a_map_of_a_scan(tmp_path: Path, cell_mm: float, normalise: str) -> None:

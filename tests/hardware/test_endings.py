@@ -133,6 +133,7 @@ def test_a_closed_terminal_ends_the_recording_in_order(tmp_path, child_environme
     assert read_scan_report(tmp_path / "a.mcap").complete
 
 
+@pytest.mark.long_repeats
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="the system does not tell of processes in /proc")
 @pytest.mark.parametrize("how", ["kill", "close"])
 def test_an_estimator_does_not_outlive_its_recording(tmp_path, child_environment, how):

@@ -79,6 +79,7 @@ class TestLinearModel:
         z = (LINEAR.draw("laplace", noise=0.5).flat - LINEAR.beta) / LINEAR.sd
         assert max(kstest(z[:, i], t(LINEAR.dof).cdf).pvalue for i in range(DIMENSION)) < 1e-3
 
+    @pytest.mark.long_repeats
     @pytest.mark.parametrize("method", METHODS)
     def test_moments_are_exact_within_monte_carlo_error(self, method: str) -> None:
         """A mean is known to SD / sqrt(n), a deviation to 1 / sqrt(2 n) and 10 % more for the tails of the t."""

@@ -90,6 +90,7 @@ def overlap(scan: Scan) -> _Overlap:
     return found
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("name", SEEN)
 def test_a_mistake_is_refused_and_named(name):
     scan = mistaken(lump(), name)
@@ -109,6 +110,7 @@ def test_a_scan_that_is_right_is_left_alone():
     assert not set(check.not_shown) & set(SEEN)
 
 
+@pytest.mark.long
 def test_a_lever_arm_left_out_shows_by_the_turn_of_the_mount():
     check = checked(corrected(lump(), ["lever-none"]))
     assert check.refused
@@ -229,6 +231,7 @@ def later(scan: Scan, late_ms: float) -> Scan:
     return replace(scan, poses=told, frames=PressureFrames(frames.time_s + 1.0, frames.counts))
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("late_ms", [-400.0, -100.0, 100.0, 300.0])
 def test_another_clock_is_named_with_its_sign(late_ms):
     check = checked(later(lump(), late_ms))

@@ -115,6 +115,7 @@ def mirrored(scan: Scan, axis: int) -> Scan:
     return flipped(replace(scan, head=head, poses=poses, landmarks=marks), axis)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("axis", [0, pytest.param(1, marks=pytest.mark.slow)], ids=["rows", "columns"])
 def test_a_mirrored_head_gives_the_same_latency(axis):
     """Counting taxels from the other side changes nothing; a mirrored scene changes only where cells begin.
@@ -140,6 +141,7 @@ def test_strokes_one_way_do_not_tell_the_latency():
         build_map(one_way, latency_ms="auto")
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize(("name", "true_ms"), [("s01", 0.0), ("s03", 4.0), ("s05", 8.0), ("s11", 11.0)])
 def test_the_latency_of_scans_by_an_independent_model_is_found(shared_data, name, true_ms):
     """Truth from truth.csv; the scans tilt and press as a hand does, unlike a map of bumps."""

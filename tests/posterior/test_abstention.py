@@ -106,6 +106,7 @@ def test_a_wide_rise_at_the_rim_asks_for_strokes_and_not_for_a_larger_window() -
     assert answer.advice == answer.on_paper == "extend the strokes beyond it"
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("centre", [None, (3.0, 2.0)])
 def test_no_lump_is_said_first_with_the_place(centre: tuple[float, float] | None) -> None:
     tactile_map = grid_map(1 + WHITE)

@@ -90,9 +90,8 @@ def answer(tactile_map: TactileMap, method: str, fit: SamplerSettings) -> Estima
     return found
 
 
-METHOD = pytest.mark.parametrize(
-    "method", [m if m != "ensemble" else pytest.param(m, marks=pytest.mark.slow) for m in METHODS]
-)
+MARKS = {"optimise": [pytest.mark.long], "laplace": [pytest.mark.long], "ensemble": [pytest.mark.slow]}
+METHOD = pytest.mark.parametrize("method", [pytest.param(m, marks=MARKS.get(m, [])) for m in METHODS])
 
 
 @METHOD

@@ -73,6 +73,7 @@ def test_the_surest_is_reported_though_another_is_sized_larger() -> None:
     assert given.masses[1].largest_mm == pytest.approx(larger, rel=0.02)
 
 
+@pytest.mark.long
 def test_a_shoulder_sized_larger_than_the_lump_beside_it_is_not_reported() -> None:
     """A lump, and a low wide shoulder of the level, as uneven pressure leaves it; `validation.masses` has a hundred."""
     rng = np.random.default_rng(1)
@@ -212,6 +213,7 @@ def test_a_fit_that_moves_to_the_first_lump_gives_no_size() -> None:
     assert "does not tell them apart" in masses[1].estimate.reason
 
 
+@pytest.mark.long
 def test_a_mass_that_the_whole_map_does_not_show_has_the_size_of_the_map_less_the_first() -> None:
     """Also far from the first lump, which moves the least-squares start of the whole map."""
     two = scene(narrow=0.2, away=45.0, half_mm=45.0)

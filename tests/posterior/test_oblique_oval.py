@@ -65,6 +65,7 @@ def oval(angle_deg: float) -> TactileMap:
     return grid_map(1.0 + 0.4 * bump + 0.02 * np.random.default_rng(1).standard_normal(x.shape), normalise="gain")
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("angle_deg", [45.0, -45.0])
 def test_an_oval_at_45_degrees_has_one_angle_and_its_diameters_lie_along_it(angle_deg: float) -> None:
     report = estimate_one(oval(angle_deg), Settings(method="laplace")).answer.report

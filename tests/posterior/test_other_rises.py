@@ -79,6 +79,7 @@ def test_what_a_lump_that_is_no_gaussian_leaves_is_not_named(exponent: float) ->
     assert rises == ()
 
 
+@pytest.mark.long
 def test_a_lump_beside_a_rim_that_was_read_seldom_is_named() -> None:
     """The rim's errors are larger, and as part of the window they hid it."""
     rim = np.arange(-HALF_MM, HALF_MM + 1.0)[:, None] < -20.0
@@ -117,6 +118,7 @@ def test_a_low_rise_beside_a_lump_is_hardly_shown() -> None:
     assert listed(0.0, 0.12) == []
 
 
+@pytest.mark.long
 def test_a_lump_that_goes_on_into_a_rim_that_was_read_seldom_is_hardly_shown() -> None:
     rng, rim = np.random.default_rng(1), np.arange(-HALF_MM, HALF_MM + 1.0)[:, None] < -20.0
     first = bump_values(half_mm=HALF_MM, x=-18.0, y=8.0, sigma_x=4.5, sigma_y=4.5, amplitude=0.3)
@@ -152,6 +154,7 @@ def test_a_larger_lump_far_away_is_no_rib_under_a_small_one() -> None:
     assert found.scene.fit.scene.extra != "rib"
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize(("second", "places"), [(0.15, [(24, 14)]), (0.0, [])])
 def test_a_lump_on_the_rib_beside_another_lump_is_named_and_the_rib_is_not(
     second: float, places: list[tuple[int, int]]

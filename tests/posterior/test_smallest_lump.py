@@ -46,6 +46,7 @@ def test_as_plain_data_a_lump_that_nothing_shows_is_null() -> None:
     assert told.probability == 0.95
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize(("times", "shown"), [(2.0, True), (0.4, False)])
 def test_a_bump_well_above_the_needed_amplitude_is_found_and_one_below_is_not(times: float, shown: bool) -> None:
     width = float(WIDTHS_MM[2])

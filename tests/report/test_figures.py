@@ -110,6 +110,7 @@ def test_a_map_is_drawn_in_the_same_bytes_each_time(tmp_path, fit, normalise):
     assert stat.S_IMODE((tmp_path / "a.png").stat().st_mode) == 0o600
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("shape", [(31, 41), (31, 20), (12, 41)])
 @pytest.mark.parametrize("fit", [None, FIT])
 @pytest.mark.parametrize("places", [0, 6])
@@ -137,6 +138,7 @@ def test_a_users_matplotlib_settings_do_not_change_the_picture(tmp_path):
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize(
     ("notch", "x_to_the_left", "y_up"), [((0.0, 1.0), True, True), ((0.0, -1.0), False, False), (None, True, True)]
 )

@@ -207,6 +207,7 @@ def test_terms_are_derivatives_by_the_coefficients(learned) -> None:
         np.testing.assert_allclose(one.width_slope(a, p), slope, rtol=1e-6)
 
 
+@pytest.mark.long
 def test_errors_of_bodies_left_out_are_those_of_refitting() -> None:
     """Closed form on the tangent against learning anew without each tenth of the bodies."""
     full = table(120, fat=False, fat_matters=False)
@@ -236,6 +237,7 @@ def coverage(calibration: BodyCalibration, *, shrink: float = 1.0) -> float:
     return held / 60
 
 
+@pytest.mark.long
 def test_intervals_of_new_bodies_hold_and_too_narrow_ones_do_not(learned) -> None:
     """Nominal 90 %; the control has a fifth of the spread between bodies."""
     assert coverage(learned) > 0.8

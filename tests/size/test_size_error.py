@@ -53,6 +53,7 @@ def one_map(rng: np.random.Generator, noise: float = 0.02) -> ShapeDraws:
     return shape(2.7, noise=noise, seed=int(rng.integers(1 << 30)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["max_size_mm", "min_size_mm"])
 def test_ends_of_a_size_stray_over_seeds_by_no_more_than_is_told_and_by_little(name: str) -> None:
     def make(rng: np.random.Generator):
@@ -70,6 +71,7 @@ def test_ends_of_a_size_stray_over_seeds_by_no_more_than_is_told_and_by_little(n
     assert stray > 2.0 * told
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [0.02, 0.3])
 def test_ends_of_a_pooled_size_stray_by_no_more_than_is_reported(noise: float) -> None:
     """With the spread between maps known to be nothing, what the maps say matters most."""

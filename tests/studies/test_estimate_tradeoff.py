@@ -272,6 +272,7 @@ def test_beside_chains_other_models_are_tried_by_laplace():
     assert {one.axis for one in silent} == {study.METHOD, study.FIELD, study.WINDOW}
 
 
+@pytest.mark.long
 def test_settings_that_disagree_are_not_believed():
     none = replace(made("none", 1.0, None, default=True), answer=answer_without_number("no lump", 0.9))
     some = replace(made("some", 1.0, None), answer=replace(row("--method laplace").answer, detected_probability=0.96))

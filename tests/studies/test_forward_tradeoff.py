@@ -93,6 +93,7 @@ def test_each_model_has_one_default_and_a_finer_reference() -> None:
     assert [one.label for one in settings_of(CASE, PLANE)[0] if one.options.empirical] == ["Eqs 1 to 4"]
 
 
+@pytest.mark.long
 def test_the_default_plane_setting_is_the_study(monkeypatch: pytest.MonkeyPatch) -> None:
     ticks = count()
     monkeypatch.setattr(tradeoffs, "_PLANE", ((2, 0.25), (1, 0.5)))

@@ -114,6 +114,7 @@ def mean_product(fields: np.ndarray, lag: int) -> tuple[float, float]:
     return float(products.mean()), float(products.std() / np.sqrt(len(products)))
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("length", LENGTHS_MM)
 def test_simulated_fields_have_the_exponential_correlation(length: float) -> None:
     axis = np.arange(0.0, 51.0)
@@ -125,6 +126,7 @@ def test_simulated_fields_have_the_exponential_correlation(length: float) -> Non
     assert abs(mean - np.exp(-round(length) / (2 * length))) > 4 * error  # the control: twice as long
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("length", LENGTHS_MM)
 def test_a_field_is_as_strong_at_the_rim_of_a_map_as_inside(length: float) -> None:
     """One made of cosines is twice as strong where they are mirrored."""
@@ -191,6 +193,7 @@ def size_ranks(n: int, *, wider: float = 1.0) -> np.ndarray:
     return np.array(ranks)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("maps", "wider"), [(30, 2.0), pytest.param(150, 1.3, marks=pytest.mark.slow)])
 def test_a_size_drawn_from_the_law_of_its_draws_ranks_uniformly(maps: int, wider: float) -> None:
     assert rank_test("size_mm", size_ranks(maps), draws=DRAWS).inside

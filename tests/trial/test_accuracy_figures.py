@@ -198,6 +198,7 @@ def test_ratio_to_an_error_of_zero_is_undefined() -> None:
     assert ratio.reasons["ratio"] == "the error of tactile is 0"
 
 
+@pytest.mark.long
 def test_equal_readings_of_the_true_size_have_no_error() -> None:
     """The sum of three equal readings, divided by three, may differ from them in the last bit."""
     key = ("P1", "1")

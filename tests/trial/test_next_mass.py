@@ -93,6 +93,7 @@ def quick(log_density, centre, covariance, *, rng):
     return ensemble(log_density, centre, covariance, rng=rng, options=options)
 
 
+@pytest.mark.long
 def test_draws_find_what_made_the_data_and_who_errs_less() -> None:
     made, ex_vivo = readings(2, patients=60)
     found = next_mass(Trial(made, ex_vivo), sample=quick, rng=np.random.default_rng(3))

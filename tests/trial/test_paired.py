@@ -196,6 +196,7 @@ def case(**changes: float) -> PlanCase:
     return PlanCase(**(plain | changes))
 
 
+@pytest.mark.long
 def test_plans_gain_by_patients_and_by_maps_less_each_time() -> None:
     found = [simulate_design(case(maps=m)) for m in (1, 3, 5)]
     assert simulate_design(case(patients=12)).power < found[1].power

@@ -252,6 +252,7 @@ def agrees_with_half_its_cell(body: Body) -> None:
 QUICK, OTHERS = Body(15, 0.8, 0.5, poisson=0.4999), (Body(15, 1.0, 0.0), Body(10, 0.8, 1.2))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("body", [QUICK, *(pytest.param(one, marks=pytest.mark.slow) for one in OTHERS)], ids=repr)
 def test_half_the_cell_gives_the_same_map(body: Body) -> None:
     agrees_with_half_its_cell(body)

@@ -188,6 +188,7 @@ def test_without_a_lump_the_elements_sink_as_the_exact_layers() -> None:
     np.testing.assert_allclose(by_elements, exact, atol=0.002 * np.abs(exact).max())
 
 
+@pytest.mark.long
 def test_two_meshes_of_one_body_agree() -> None:
     """With one tissue throughout, where the layers "meet" moves the mesh and nothing else."""
     meshes = [LumpGeometry(7.5, 7.5, 15.0, Layers(boundary, gland_ratio=1.0)) for boundary in (15.0, 20.0, 40.0)]

@@ -215,6 +215,7 @@ SLOW = [
 CASES = [*QUICK, *[pytest.param(*case, marks=pytest.mark.slow) for case in SLOW if case not in QUICK]]
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize(("seat", "d", "depth_ratio"), CASES)
 def test_an_independent_models_phantoms_are_met(shared_data: Path, seat: str, d: float, depth_ratio: float) -> None:
     row = phantoms(shared_data)[seat, d, depth_ratio]

@@ -176,6 +176,7 @@ WHERE_TAXELS_RESOLVE = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "d", "depth_ratio"),
     [*QUICK, *[pytest.param(*case, marks=pytest.mark.slow) for case in WHERE_TAXELS_RESOLVE if case not in QUICK]],

@@ -38,6 +38,7 @@ def each_by_itself(
         return target.conditional(theta)
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("scene", [Scene("round"), Scene("ellipse"), Scene("ellipse", tilt=False)])
 @pytest.mark.parametrize(("spread", "at"), AROUND.values(), ids=AROUND)
 @pytest.mark.parametrize("settled", [True, False])

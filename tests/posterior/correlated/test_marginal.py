@@ -100,6 +100,7 @@ def test_bumps_on_the_grid_are_the_forward_models() -> None:
             np.testing.assert_allclose(window.of_cells(found), exact, atol=tolerance)
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize(
     "scene",
     [

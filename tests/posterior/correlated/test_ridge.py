@@ -30,6 +30,7 @@ def estimate(values: np.ndarray) -> Estimate:
     return estimate_map(grid_map(values), calibration=None, options=options, rng=np.random.default_rng(1))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (6, 13))])
 def test_a_ridge_alone_gets_no_number(seed: int) -> None:
     found = estimate(1.0 + ridge(seed) + errors(seed))

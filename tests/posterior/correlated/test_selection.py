@@ -145,6 +145,7 @@ def widths_beside(kind: str, scene: str, *, maps: int) -> tuple[float, np.ndarra
     return float(np.abs(np.mean(z, axis=0)).max()), np.mean(np.abs(z) <= 1.645, axis=0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["second lump", pytest.param("rib", marks=pytest.mark.slow)])
 def test_a_neighbour_does_not_move_the_widths(kind: str) -> None:
     """10 maps: a mean off by 0.3 SD is its standard error; without the neighbour in the model it is off by more."""

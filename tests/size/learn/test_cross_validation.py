@@ -50,6 +50,7 @@ def study(width: Width = by_eq_6, *, along: Width | None = None) -> SizeTable:
     return SizeTable(d, a, sigma, None if along is None else along(d, a), None, None, cases)
 
 
+@pytest.mark.long
 def test_the_form_that_made_the_table_is_right_and_the_other_is_not() -> None:
     eq6 = cross_validate(study(by_eq_6))
     quadratic = cross_validate(study(by_quadratic))
@@ -86,6 +87,7 @@ def test_a_geometry_is_one_seat_diameter_and_depth() -> None:
     assert geometry_numbers(np.full(4, 10.0), cases).tolist() == [0, 0, 1, 2]
 
 
+@pytest.mark.long
 def test_each_width_and_both_have_their_errors() -> None:
     found = cross_validate(study(by_quadratic, along=lambda d, a: np.full_like(d, 4.0) + 0.1 * a))
     assert found is not None

@@ -56,6 +56,7 @@ def test_sizes_and_what_a_body_does_to_all_its_maps_cancel() -> None:
     assert first.density == pytest.approx(second.density, rel=1e-6, abs=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("spread", [0.03, 0.15])
 def test_the_interval_holds_the_true_spread_and_not_where_map_errors_are_left_out(spread: float) -> None:
     held, control = 0, 0
