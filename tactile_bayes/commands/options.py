@@ -15,7 +15,7 @@ import click
 
 from tactile_bayes.api.settings import Settings, read_settings
 from tactile_bayes.declarations import Record, default_of, extra_of, field_types, meaning_of, range_of, value_type
-from tactile_bayes.errors import BY_OPTIONS, number_words
+from tactile_bayes.errors import BY_OPTIONS, UsageError, number_words
 from tactile_bayes.files.atomic import Format, check_suffix, refuse_existing, refuse_same
 from tactile_bayes.options import RecordOptions
 from tactile_bayes.presets import HEADS
@@ -59,6 +59,8 @@ class FilePath(click.Path):
                 elif written or other_written:
                     refuse_same([path], [other])
             seen.append((path, written))
+        if self.writes is not None and str(value).endswith(os.sep) and not path.is_dir():
+            raise UsageError(f"{value} is the name of a folder; name a file, in a folder that exists")
         if self.writes == "figure":
             figure_file.check_suffix(path)
         elif self.writes is not None:

@@ -59,6 +59,15 @@ WRITERS = {
 SUFFIX = {"estimate -o": ".nc", "import a grid": ".nc", "import a scan": ".mcap", "map": ".nc", "validate": ".json"}
 
 
+@pytest.mark.parametrize("words", [WRITERS["map"], WRITERS["estimate -o"], ("map", "scan.mcap", "--figure")])
+def test_the_name_of_a_new_folder_is_no_file(words, plain, run_cli):
+    """``map scan.mcap -o maps/`` wrote a file called maps."""
+    done = run_cli(*words, "maps/", cwd=plain)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "error: maps/ is the name of a folder; name a file, in a folder that exists\n"
+    assert not (plain / "maps").exists()
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("case", WRITERS)
 def test_a_disk_that_is_full_leaves_what_was_there(case: str, plain: Path, run_python: Run) -> None:
