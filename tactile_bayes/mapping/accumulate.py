@@ -1,4 +1,4 @@
-"""Frames added up in cells, of whole scans or as they come, with gains and a flat field; what readings share."""
+"""Sums of frames in cells, of whole scans or frame by frame; gains, flat field and correlation of the errors."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from tactile_bayes.presets import CELL_MM, PRESSURE_WINDOW_KPA
 from tactile_bayes.progress import Progress, no_progress
 from tactile_bayes.scans import CountArray, ElementCalibration, HeadGeometry, HeadShape, Scan
 
-# --- Used frames of a scan on the map's lattice, which can be read any number of times.
+# --- Used frames of a scan on the map's lattice.
 
 
-class Source(Record, eq=False):
-    """Used frames of one scan, which can be read chunk by chunk any number of times."""
+class FrameSource(Record, eq=False):
+    """Used frames of one scan, which can be read in chunks any number of times."""
 
     selection: SelectedFrames  #: The scan with its used frames.
     projection: cells.Projection  #: The used frames only, in their order.
@@ -34,18 +34,22 @@ class Source(Record, eq=False):
         return np.flatnonzero(self.selection.used)
 
     def parts(self, size: int) -> Iterator[tuple[slice, CountArray]]:
-        """Iterate over stretches of at most `size` used frames and their (f, k) counts."""
+        """Slices of at most `size` used frames, with their (f, k) counts."""
         frames, counts = self.frames, self.selection.scan.frames.counts
         for part in chunks(len(frames), size):
             chosen = frames[part]
-            whole = chosen[-1] - chosen[0] == len(chosen) - 1  # a stretch without gaps need not be copied
-            yield part, self.selection.readout.counts(counts[chosen[0] : chosen[-1] + 1] if whole else counts[chosen])
+            gapless = chosen[-1] - chosen[0] == len(chosen) - 1  # such frames need not be copied
+            yield part, self.selection.readout.counts(counts[chosen[0] : chosen[-1] + 1] if gapless else counts[chosen])
 
 
-def sources_of(selections: Sequence[SelectedFrames], *, plane_from_base: FloatArray, cell_mm: float) -> list[Source]:
-    """Put the scans' used frames on one lattice."""
+def frame_sources(
+    selections: Sequence[SelectedFrames], *, plane_from_base: FloatArray, cell_mm: float
+) -> list[FrameSource]:
+    """The scans' used frames on one lattice."""
     return [
-        Source(part, part.projector(plane_from_base=plane_from_base, cell_mm=cell_mm).at(part.poses.part(part.used)))
+        FrameSource(
+            part, part.projector(plane_from_base=plane_from_base, cell_mm=cell_mm).at(part.poses.part(part.used))
+        )
         for part in selections
     ]
 
@@ -54,29 +58,25 @@ def sources_of(selections: Sequence[SelectedFrames], *, plane_from_base: FloatAr
 
 MAX_GAIN_PASSES = 50
 GAIN_TOLERANCE = 1e-4
-# So many readings are kept between passes, at 17 bytes each; of more all is found anew in every pass.
-KEPT_READINGS = 2**24
+CACHED_READINGS = 2**24  #: Readings up to which all are cached between passes, at 17 bytes each.
 _CHUNK = 128
 
 
 def _solve_gains(
-    sources: list[Source], levels: list[FloatArray], *, progress: Progress
+    sources: list[FrameSource], levels: list[FloatArray], *, progress: Progress
 ) -> tuple[list[FloatArray], int, float]:
-    """Gains of the used frames, one array per scan, with the passes made and the largest relative change in the last.
+    """Gains of the used frames, one array per scan, the number of passes, and the largest relative change in the last.
 
-    Alternates between the map, given the gains, and each frame's least-squares gain, given the map.
-
-    The model is pressure = gain of the frame x map at the cell. Only the product is determined: the level is set in the
-    end so that the median of the map's cells is 1, since most cells lie beside the lump. Frames far apart are tied only
-    through those between them, so plain alternation creeps. Every third step extrapolates along the direction of the
-    last two (SQUAREM, Varadhan & Roland 2008, Scand. J. Statist. 35, scheme S3), on the logarithms of the gains.
+    Alternating least squares of pressure = gain of the frame x map at the cell, with every third step extrapolated on
+    the logarithms of the gains (SQUAREM, Varadhan & Roland 2008, Scand. J. Statist. 35, scheme S3): frames far apart
+    are tied only through those between them.
     """
-    system = _System(sources, progress)
+    system = _GainSystem(sources, progress)
     ends = np.cumsum([len(level) for level in levels])[:-1]
     path = [np.log(np.concatenate(levels))]
     passes, change = 0, np.inf
     while change > GAIN_TOLERANCE and passes < MAX_GAIN_PASSES:
-        path.append(np.log(system.improved(np.exp(path[-1]))))
+        path.append(np.log(system.improved_gains(np.exp(path[-1]))))
         change = float(np.abs(path[-1] - path[-2]).max(initial=0.0))
         passes += 1
         if len(path) == 3 and change > GAIN_TOLERANCE:
@@ -87,100 +87,96 @@ def _solve_gains(
 def _extrapolated(start: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
     """Limit of the steps from `start` over `first` to `second`, by extrapolation."""
     step = first - start
-    bend = second - first - step
-    size = float(np.linalg.norm(bend))
+    curvature = second - first - step
+    size = float(np.linalg.norm(curvature))
     if not size > 0:
         return second
     length = max(1.0, float(np.linalg.norm(step)) / size)
-    return start + 2 * length * step + length**2 * bend
+    return start + 2 * length * step + length**2 * curvature
 
 
-_Part = tuple[NDArray[np.integer], FloatArray, BoolArray | None]
+_Chunk = tuple[NDArray[np.integer], FloatArray, BoolArray | None]
 
 
-class _System:
+class _GainSystem:
     """All used frames of all scans on one block of cells."""
 
-    def __init__(self, sources: list[Source], progress: Progress) -> None:
+    def __init__(self, sources: list[FrameSource], progress: Progress) -> None:
         self._sources, self._progress = sources, progress
         blocks = [source.projection.block() for source in sources if len(source.projection)]
         top, left = np.min([first for first, _ in blocks], axis=0).tolist()
-        bottom, right = np.max([np.add(*one) for one in blocks], axis=0).tolist()
+        bottom, right = np.max([np.add(*block) for block in blocks], axis=0).tolist()
         self._first, self._shape = (top, left), (bottom - top, right - left)
         self._readings = sum(len(source.projection) * len(source.selection.readout.taxels) for source in sources)
-        self._kept: dict[tuple[int, int], _Part] = {}
+        self._cache: dict[tuple[int, int], _Chunk] = {}
         self._count = self._total(None)
 
-    def improved(self, gains: FloatArray) -> FloatArray:
+    def improved_gains(self, gains: FloatArray) -> FloatArray:
         """Least-squares gain of each frame against the map of all frames with `gains`: sum(p m) / sum(m^2)."""
         total = self._total(gains)
         mean = np.divide(total, self._count, out=np.zeros_like(total), where=self._count > 0)
-        better = np.empty(len(gains))
-        for frames, flat, pressure, valid in self._parts():
+        improved = np.empty(len(gains))
+        for frames, flat, pressure, valid in self._chunks():
             expected = mean[flat]
             if valid is not None:
                 expected *= valid
             products = np.einsum("fk,fk->f", pressure, expected)
-            better[frames] = products / np.einsum("fk,fk->f", expected, expected)
-        return better
+            improved[frames] = products / np.einsum("fk,fk->f", expected, expected)
+        return improved
 
     def _total(self, gains: FloatArray | None) -> FloatArray:
         """Sum over each cell's readings of their pressure over their frame's gain; without gains, their number."""
         size = self._shape[0] * self._shape[1]
         total = np.zeros(size)
-        for frames, flat, pressure, valid in self._parts():
+        for frames, flat, pressure, valid in self._chunks():
             counted = np.ones_like(pressure) if valid is None else valid
             weight = counted if gains is None else pressure / gains[frames, None]
             total += np.bincount(flat.ravel(), weight.ravel(), size)
         return total
 
-    def _parts(self) -> Iterator[tuple[slice, *_Part]]:
-        """Chunks: frames' indices, their cells, pressures (0 where not valid) and which are valid."""
+    def _chunks(self) -> Iterator[tuple[slice, *_Chunk]]:
+        """Chunks of frames: their slice, their readings' cells, pressures (0 where invalid) and validity."""
         start, total = 0, sum(len(source.projection) for source in self._sources)
         for number, source in enumerate(self._sources):
             for part, counts in source.parts(_CHUNK):
-                yield slice(start, start + len(counts)), *self._part(number, part, counts)
+                yield slice(start, start + len(counts)), *self._chunk(number, part, counts)
                 start += len(counts)
                 self._progress(start, total)
 
-    def _part(self, number: int, part: slice, counts: CountArray) -> _Part:
-        if (number, part.start) in self._kept:
-            return self._kept[number, part.start]
+    def _chunk(self, number: int, part: slice, counts: CountArray) -> _Chunk:
+        if (number, part.start) in self._cache:
+            return self._cache[number, part.start]
         source = self._sources[number]
         pressure, valid = source.selection.readout.pressure_kpa(counts)
         if valid is not None:
             pressure *= valid
-        found = source.projection.part(part).flat(self._first, self._shape), pressure, valid
-        if self._readings <= KEPT_READINGS:
-            self._kept[number, part.start] = found
-        return found
+        chunk = source.projection.part(part).flat(self._first, self._shape), pressure, valid
+        if self._readings <= CACHED_READINGS:
+            self._cache[number, part.start] = chunk
+        return chunk
 
 
 # --- Response of each taxel to an even pressure, from frames without a lump.
 
-MOST_FRAMES = 4096  #: Frames that are looked at, spread evenly over the scan.
-# A frame is called lump-free when its departure from the head's usual profile is within this factor of the calmest
-# tenth's, and there must be this many of them.
+MOST_FRAMES = 4096  #: Frames that are read, spread evenly over the scan.
+# A frame is lump-free when its departure from the head's usual profile is within this factor of the tenth percentile;
+# there must be this many of them.
 CALM_FACTOR = 1.1
 LEAST_FRAMES = 50
 
 
 def divided(scan: Scan, response: FloatArray) -> Scan:
     """Copy of the scan with its calibration divided by the (rows, columns) response of its taxels."""
-    held = scan.element_calibration
-    gain, offset = held.gain_kpa_per_count / response, held.offset_kpa / response
-    return replace(scan, element_calibration=replace(held, gain_kpa_per_count=gain, offset_kpa=offset))
+    stated = scan.element_calibration
+    gain, offset = stated.gain_kpa_per_count / response, stated.offset_kpa / response
+    return replace(scan, element_calibration=replace(stated, gain_kpa_per_count=gain, offset_kpa=offset))
 
 
 def flat_field(selection: SelectedFrames) -> tuple[FloatArray, int]:
-    """(rows, columns) response of the taxels over the lump-free frames of a scan, and how many those are.
+    """(rows, columns) mean response of the taxels over the lump-free frames of a scan, and the number of these.
 
-    It is 1 where a taxel reads as much as its frame's mean, and for taxels left out. `BadDataError` when too few frames
-    look alike.
-
-    The usual profile of the head is each taxel's median over frames, which a lump under a minority of them does not
-    move. Frames that depart from it no more than the calmest ones are lump-free; their mean is the response. A lump
-    under most frames would be taken for the head's own profile and be flattened away.
+    It is 1 where a taxel reads as much as its frame's mean, and for taxels left out. Frames near the taxels' medians
+    over frames are lump-free; a lump under most frames is flattened away. `BadDataError` for too few such frames.
     """
     good = selection.good_taxels
     frames = np.flatnonzero(selection.used)
@@ -206,24 +202,23 @@ def flat_field(selection: SelectedFrames) -> tuple[FloatArray, int]:
 
 
 class Accumulated(Record, eq=False):
-    """Sums over all frames, and how the gains were solved."""
+    """Sums over all frames, and the solution for their gains."""
 
-    sums: cells.CellSums  #: The cells.
+    sums: cells.CellSums
     levels: list[FloatArray]  #: Divisors of the frames, one array per scan.
-    scale: float = 1.0  #: Divisor of the sums' values (1 but for ``gain``, whose level is set afterwards).
+    scale: float = 1.0
+    """Divisor of the sums' values: 1, or with ``gain`` the median of the cells, most of which lie beside a lump."""
     passes: int = 1  #: Passes over the scan.
-    last_change: float = 0.0
-    """Largest relative change of a frame's gain in the last pass; 0 unless the gains are solved for."""
+    last_change: float = 0.0  #: Largest relative change of a gain in the last pass; 0 without gains.
 
 
 def accumulate(
-    sources: list[Source], *, cell_mm: float, normalise: str, progress: Progress = no_progress
+    sources: list[FrameSource], *, cell_mm: float, normalise: str, progress: Progress = no_progress
 ) -> Accumulated:
     """Average the normalised readings of all used frames in cells on the plane; progress starts anew in each pass.
 
-    ``"mean"`` divides each frame by its mean over the valid taxels, as the paper does. A lump under the head is in that
-    mean, so the map's amplitude and widths come out low by a few per cent. ``"gain"`` solves for one gain per frame
-    jointly with the map. ``"none"`` keeps kPa.
+    ``"mean"`` divides each frame by its mean over the valid taxels, as the paper does, which takes part of the lump
+    away (record 0065); ``"gain"`` solves for a gain per frame jointly with the map; ``"none"`` keeps kPa.
     """
     levels = [source.selection.level_kpa[source.selection.used] for source in sources]
     if normalise == "none":
@@ -236,9 +231,9 @@ def accumulate(
 
 
 def add_all(
-    sources: list[Source], levels: list[FloatArray], *, cell_mm: float, progress: Progress = no_progress
+    sources: list[FrameSource], levels: list[FloatArray], *, cell_mm: float, progress: Progress = no_progress
 ) -> cells.CellSums:
-    """One pass over all used frames, each divided by its level."""
+    """Sums over all used frames, each divided by its level."""
     sums = cells.CellSums(cell_mm)
     done, total = 0, sum(len(source.projection) for source in sources)
     for source, level in zip(sources, levels, strict=True):
@@ -255,11 +250,7 @@ def add_all(
 
 
 class MapAccumulator:
-    """Accumulates frames, in any portions and order, into a map on a plane that can be read at any time.
-
-    Everything that is added up is a whole number of tiny steps (`CellSums`, `Readout`), so neither
-    portions nor order leave a trace. Each frame is divided by its mean: a gain per frame needs all frames at once.
-    """
+    """Map that grows by frames, in any portions and order, each divided by its mean, and can be read at any time."""
 
     def __init__(
         self,
@@ -276,16 +267,16 @@ class MapAccumulator:
         self._projector = cells.Projector(head, plane_from_base=plane_from_base, taxels=taxels, cell_mm=cell_mm)
         self._sums, self._profile = cells.CellSums(cell_mm), GrowingProfile(taxels)
         dropped = ("dropped_no_pose", "dropped_elements", "dropped_low", "dropped_high")
-        self._counted = Counter(dict.fromkeys(("frames_total", "frames_used", *dropped, "saturated_readings"), 0))
+        self._counters = Counter(dict.fromkeys(("frames_total", "frames_used", *dropped, "saturated_readings"), 0))
 
     @property
     def figures(self) -> dict[str, float]:
-        """Frames and readings so far, used and left out by reason."""
+        """Numbers of frames and readings so far, used and left out by reason."""
         more = {"clipped_values": self._sums.clipped, "negative_readings": self._sums.negative}
-        return {name: float(value) for name, value in {**self._counted, **more}.items()}
+        return {name: float(value) for name, value in {**self._counters, **more}.items()}
 
     def add(self, counts: CountArray, poses: cells.FramePoses) -> BoolArray:
-        """Add (n, rows, columns) frames with the n poses at their times; returns the (n,) that were used."""
+        """Add (n, rows, columns) frames with the n poses at their times; returns an (n,) mask of the used ones."""
         parts = chunks(len(counts), cells.chunk_frames(self._readout.size))
         used = [self._add(self._readout.counts(counts[part]), poses.part(part)) for part in parts]
         return np.concatenate([np.zeros(0, dtype=bool), *used])
@@ -294,77 +285,62 @@ class MapAccumulator:
         pressure, valid = self._readout.pressure_kpa(counts)
         level, share = self._readout.levels(pressure, valid)
         low, high, used = gate(poses.known, level, share, pressure_window_kpa=self._window_kpa)
-        left_out = {"dropped_no_pose": ~poses.known, "dropped_low": low, "dropped_high": high}
-        self._counted.update({name: int(np.count_nonzero(some)) for name, some in left_out.items()})
-        self._counted["frames_total"] += len(used)
-        self._counted["dropped_elements"] += int(np.count_nonzero(~(used | low | high | ~poses.known)))
+        dropped = {"dropped_no_pose": ~poses.known, "dropped_low": low, "dropped_high": high}
+        dropped["dropped_elements"] = ~(used | low | high | ~poses.known)
+        self._counters.update({name: int(np.count_nonzero(mask)) for name, mask in dropped.items()})
+        self._counters["frames_total"] += len(used)
         if not used.any():
             return used
         frames = slice(None) if used.all() else used  # nothing is copied where all are used
         poses, pressure, level, share = poses.part(frames), pressure[frames], level[frames], share[frames]
-        self._counted["frames_used"] += len(level)
-        self._counted["saturated_readings"] += round(float((1 - share).sum()) * self._readout.size)
+        self._counters["frames_used"] += len(level)
+        self._counters["saturated_readings"] += round(float((1 - share).sum()) * self._readout.size)
         self._profile.add(pressure, level, share)
         valid, projection = None if valid is None else valid[frames], self._projector.at(poses)
         cells.add_frames(self._sums, pressure, valid, projection=projection, level=level)
         return used
 
     def snapshot(self) -> TactileMap:
-        """The map so far, a copy; it has no cell before the first frame.
-
-        What a frame's readings share (`shared_frame_figures`) is not in its quality: the errors of
-        frames are not kept, and with the next frame they would be others.
-        """
+        """A copy of the map so far, without `shared_frame_figures`; it has no cell before the first frame."""
         sums = self._sums.trimmed()
         low, high = self._window_kpa
         return TactileMap(
-            mean=sums.mean(),
-            variance=sums.variance(),
-            count=sums.count,
-            x_mm=sums.x_mm(),
-            y_mm=sums.y_mm(),
+            **sums.map_arrays(),
             recipe=MapRecipe("scan", "mean", float(sums.cell_mm), (float(low), float(high))),
             plane_from_base=self.plane_from_base,
-            frame_count=self._counted["frames_used"],
+            frame_count=self._counters["frames_used"],
             quality=self.figures | self._profile.figures(),
             head=HeadShape.of(self._head.surface_mm, self._head.pitch_mm),
         )
 
 
-# --- Correlation of the errors within a frame: readings share frames, so a map holds less than they would alone.
-#
-# The figures are of the readings about the map, so whatever neighbours share is in them: the frame's level, the
-# pose, the slope within a cell, a response that the calibration left.
+# --- Correlation of the errors within a frame (record 0047): of readings about the map, so it holds all that neighbours
+# share: the frame's level, the pose, the slope within a cell, a response that the calibration left.
 
 # Runs of successive frames, spread evenly over the scan: enough pairs for a correlation to 0.01, at 400 frames' cost.
 RUNS = 16
 RUN_FRAMES = 25
-# Fewer readings (of about that many frames' worth) than this, about a map that other frames made, say nothing.
+# Fewest runs, and fewest readings in cells that other frames made too, for an estimate.
 LEAST_RUNS = 2
 LEAST_READINGS = 1000
-REACH_PITCHES = 8  #: Neighbours are compared up to this distance, in taxel pitches.
-# A length is told only where at least this share is common to neighbours, and none longer than this (mm).
-LEAST_SHARE = 0.02
-LONGEST_MM = 100.0
+REACH_PITCHES = 8  #: Largest distance of the neighbours that are compared, in taxel pitches.
+LEAST_SHARE = 0.02  #: Least share of the error variance for which a length is given.
+LONGEST_MM = 100.0  #: Longest length that is fitted.
 _LENGTHS = 400
 
 
 def shared_frame_figures(
-    sources: Sequence[Source], levels: Sequence[FloatArray], sums: cells.CellSums
+    sources: Sequence[FrameSource], levels: Sequence[FloatArray], sums: cells.CellSums
 ) -> dict[str, float]:
-    """Figures of the error correlation within a frame, from at most `RUNS` x `RUN_FRAMES` of the frames that made
-    `sums`.
+    """Figures of the error correlation within a frame, from `RUNS` x `RUN_FRAMES` of the frames in `sums`.
 
-    ``shared_share`` is the share of a reading's error variance that is common to its neighbours in the frame, and
-    ``shared_length_mm`` the distance over which it falls by e (only where the share is above `LEAST_SHARE`).
-    ``effective_readings`` is how many independent readings those of the median cell are worth, by what readings of one
-    cell within `RUN_FRAMES` successive frames have in common; ``shared_frames`` counts the frames looked at. Empty
-    where that is undetermined: too few frames, or readings without any scatter.
+    ``shared_share`` of a reading's error variance is common to its neighbours in the frame; it falls by e over
+    ``shared_length_mm``: correlation = share x exp(-d / length). The readings of the median cell are worth
+    ``effective_readings`` independent ones, by what they share within a run. ``shared_frames`` were read. Empty for too
+    few frames, or readings without scatter.
 
-    The correlation at distance d is fitted with share x exp(-d / length). A product of errors takes one about the map
-    of all frames and one about the map without the run of frames: with independent runs its mean is the covariance
-    itself, however few readings a cell has. What lasts longer than a run (a latency, a moving patient) is not in
-    ``effective_readings``.
+    A product of errors takes one about the map of all frames and one about the map without the run: then its mean is
+    the covariance, however few readings a cell has.
     """
     frames = sum(len(source.projection) for source in sources)
     runs = [
@@ -375,28 +351,28 @@ def shared_frame_figures(
     readings = sum(int(np.count_nonzero(run.known)) for run in runs)
     if len(runs) < LEAST_RUNS or readings < LEAST_READINGS:
         return {}
-    variance = sum(float(np.einsum("fk,fk->", run.whole, run.others)) for run in runs) / readings
+    variance = sum(float(np.einsum("fk,fk->", run.error, run.error_without)) for run in runs) / readings
     if not variance > cells.VALUE_STEP**2:
         return {}
-    share, length_mm = _decay(*_correlations(sources, runs, variance))
+    share, length_mm = _fit_decay(*_correlations(sources, runs, variance))
     figures = {
         "shared_share": share,
         "shared_length_mm": length_mm,
         "effective_readings": float(np.median(sums.count[sums.count > 0])) / _inflation(runs, variance * readings),
-        "shared_frames": float(sum(len(run.whole) for run in runs)),
+        "shared_frames": float(sum(len(run.error) for run in runs)),
     }
     if share < LEAST_SHARE:
         del figures["shared_length_mm"]
     return {name: float(f"{value:.6g}") for name, value in figures.items()}
 
 
-def _sampled(source: Source, of_frames: int) -> list[slice]:
-    """Runs of successive used frames of a scan, its part of `RUNS`, evenly spaced."""
+def _sampled(source: FrameSource, all_frames: int) -> list[slice]:
+    """Evenly spaced runs of successive used frames of a scan: its part of `RUNS` over scans of `all_frames`."""
     frames = len(source.projection)
-    length = min(RUN_FRAMES, of_frames // LEAST_RUNS, frames)
+    length = min(RUN_FRAMES, all_frames // LEAST_RUNS, frames)
     if not length:
         return []
-    number = min(round(RUNS * frames / of_frames), frames // length)
+    number = min(round(RUNS * frames / all_frames), frames // length)
     starts = np.linspace(0, frames - length, number).astype(int)
     return [slice(start, start + length) for start in starts.tolist()]
 
@@ -404,59 +380,60 @@ def _sampled(source: Source, of_frames: int) -> list[slice]:
 class _Run(Record, eq=False):
     """Errors of one run of frames; (f, k) arrays, 0 where not known."""
 
-    source: Source  #: Which of the sources.
-    cell: NDArray[np.int64]
-    size: int
-    """`cell`, `size`: Where each reading lies in the block of cells that the run covers, and how many those are."""
-    whole: FloatArray
-    others: FloatArray
-    """`whole`, `others`: Errors about the map, and about the map without this run."""
-    known: BoolArray  #: Valid readings in cells that enough readings of other frames fell into.
+    source: FrameSource  #: Scan of the run.
+    cell: NDArray[np.int64]  #: Cell of each reading in the block of cells that the run covers.
+    size: int  #: Number of cells of the block.
+    error: FloatArray  #: Readings less the map.
+    error_without: FloatArray  #: Readings less the map of the other frames.
+    known: BoolArray  #: Mask of the valid readings in cells with enough readings of other frames.
 
     @classmethod
-    def of(cls, source: Source, level: FloatArray, sums: cells.CellSums, run: slice) -> _Run:
-        """The errors of the frames `run` of a source."""
+    def of(cls, source: FrameSource, level: FloatArray, sums: cells.CellSums, run: slice) -> _Run:
         pressure, valid = source.selection.pressure_kpa(source.frames[run])
         value = pressure / level[run, None]
-        fine = np.ones(value.shape, dtype=bool) if valid is None else valid
+        if valid is None:
+            valid = np.ones(value.shape, dtype=bool)
         projection = source.projection.part(run)
         first, shape = projection.block()
         cell, window = projection.flat(first, shape), sums.window(first, shape)
         count, total = sums.count[window].ravel(), sums.total[window].ravel() * cells.VALUE_STEP
-        rest = count - np.bincount(cell[fine], minlength=len(count))
-        rest_total = total - np.bincount(cell[fine], value[fine], len(count))
-        enough = rest >= FEW_READINGS
-        known = fine & enough[cell]
+        other_count = count - np.bincount(cell[valid], minlength=len(count))
+        other_total = total - np.bincount(cell[valid], value[valid], len(count))
+        enough = other_count >= FEW_READINGS
+        known = valid & enough[cell]
         mean = np.divide(total, count, out=np.zeros(len(count)), where=enough)
-        without = np.divide(rest_total, rest, out=np.zeros(len(count)), where=enough)
-        whole, others = (np.where(known, value - middle[cell], 0.0) for middle in (mean, without))
-        return cls(source, cell, len(count), whole, others, known)
+        other_mean = np.divide(other_total, other_count, out=np.zeros(len(count)), where=enough)
+        error, error_without = (np.where(known, value - expected[cell], 0.0) for expected in (mean, other_mean))
+        return cls(source, cell, len(count), error, error_without, known)
 
 
 def _correlations(
-    sources: Sequence[Source], runs: Sequence[_Run], variance: float
+    sources: Sequence[FrameSource], runs: Sequence[_Run], variance: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Distance (mm), correlation and pairs of taxels within a frame, in bins of one pitch; empty bins are left out."""
     totals = np.zeros((3, REACH_PITCHES + 1))
     for source in sources:
-        mine = [run for run in runs if run.source is source]
-        if not mine:
+        of_source = [run for run in runs if run.source is source]
+        if not of_source:
             continue
         place = source.projection.taxels[:3]
         distance = np.sqrt(sum((axis[:, None] - axis) ** 2 for axis in place))
         bins = np.minimum(np.rint(distance / source.selection.scan.head.pitch_mm).astype(int), REACH_PITCHES + 1)
-        # Every other frame will do: one has 86,000 pairs.
-        whole, others = (np.concatenate([getattr(run, name)[::2] for run in mine]) for name in ("whole", "others"))
-        known = np.concatenate([run.known[::2] for run in mine]).astype(np.float32)
+        # every other frame is enough: one has 86,000 pairs
+        error, error_without, known = (
+            np.concatenate([getattr(run, name)[::2] for run in of_source])
+            for name in ("error", "error_without", "known")
+        )
+        known = known.astype(np.float32)
         pairs = (known.T @ known).astype(np.float64)
-        for row, weight in enumerate((pairs * distance, whole.T @ others, pairs)):
+        for row, weight in enumerate((pairs * distance, error.T @ error_without, pairs)):
             totals[row] += np.bincount(bins.ravel(), weight.ravel(), REACH_PITCHES + 2)[: REACH_PITCHES + 1]
     filled = np.flatnonzero(totals[2, 1:] > 0) + 1
     distance_mm, products, pairs = totals[:, filled]
     return distance_mm / pairs, products / pairs / variance, pairs
 
 
-def _decay(distance_mm: FloatArray, correlation: FloatArray, pairs: FloatArray) -> tuple[float, float]:
+def _fit_decay(distance_mm: FloatArray, correlation: FloatArray, pairs: FloatArray) -> tuple[float, float]:
     """Share and length of ``share exp(-d / length)``, by least squares over the bins; no shorter than one pitch."""
     if not len(distance_mm):
         return 0.0, float("nan")
@@ -469,19 +446,20 @@ def _decay(distance_mm: FloatArray, correlation: FloatArray, pairs: FloatArray) 
 
 
 def _inflation(runs: Sequence[_Run], square: float) -> float:
-    """Variance of a cell's mean over that of as many independent readings, at least 1.
+    """Variance of a cell's mean over that of as many independent readings, at least 1; `square` sums their variances.
 
-    Products between frames n apart are seen in a share 1 - n / `RUN_FRAMES` of a run; the others are made up for.
+    A run has only a share 1 - n / `RUN_FRAMES` of the products between frames n apart, and they are weighted for that.
     """
-    more = 0.0
+    covariance = 0.0
     for run in runs:
-        frames = len(run.whole)
+        frames = len(run.error)
         place = (run.cell + np.arange(frames)[:, None] * run.size).ravel()
         sums = [
             np.bincount(place, error.ravel(), frames * run.size).reshape(frames, -1)
-            for error in (run.whole, run.others)
+            for error in (run.error, run.error_without)
         ]
-        between = sums[0] @ sums[1].T
+        products = sums[0] @ sums[1].T
         apart = np.abs(np.subtract.outer(np.arange(frames), np.arange(frames)))
-        more += float((between * (frames / (frames - apart))).sum() - np.einsum("fk,fk->", run.whole, run.others))
-    return max(1.0, 1.0 + more / square)
+        own = np.einsum("fk,fk->", run.error, run.error_without)
+        covariance += float((products * (frames / (frames - apart))).sum() - own)
+    return max(1.0, 1.0 + covariance / square)

@@ -1,4 +1,4 @@
-"""From a scan to a map (paper steps i to iii): the passes in order, and the map's quality."""
+"""Map of one or several scans (paper steps i to iii): the steps in order, and the map's quality."""
 
 from __future__ import annotations
 
@@ -23,16 +23,15 @@ from tactile_bayes.options import MapOptions
 from tactile_bayes.progress import Progress, no_progress
 from tactile_bayes.scans import HeadShape, Scan
 
-# --- Frames near the mass, to which the paper fits its plane.
+# --- Frames near the lump, to which the paper fits its plane.
 
-# The mass is looked for in cells of this side: its place matters to a few mm.
-_CELL_MM = 2.0
-_WIDER = 1.5
+_CELL_MM = 2.0  #: Side of the cells for the search: a few mm are close enough.
+_WIDENING = 1.5  #: Factor by which a radius grows whose frames span no plane.
 
 
-def find_mass(selections: Sequence[SelectedFrames], plane: Plane) -> FloatArray:
-    """(2,) place of the highest point of the smoothed map on `plane`, mm."""
-    sources = accumulate.sources_of(selections, plane_from_base=plane.plane_from_base, cell_mm=_CELL_MM)
+def highest_point_mm(selections: Sequence[SelectedFrames], plane: Plane) -> FloatArray:
+    """(2,) highest point of the smoothed map on `plane`."""
+    sources = accumulate.frame_sources(selections, plane_from_base=plane.plane_from_base, cell_mm=_CELL_MM)
     levels = [source.selection.level_kpa[source.selection.used] for source in sources]
     sums = accumulate.add_all(sources, levels, cell_mm=_CELL_MM).trimmed()
     count, total = smooth(sums.count), smooth(sums.total)
@@ -44,17 +43,17 @@ def find_mass(selections: Sequence[SelectedFrames], plane: Plane) -> FloatArray:
 def local_plane(
     selections: Sequence[SelectedFrames], plane: Plane, *, radius_mm: float | None
 ) -> tuple[Plane, dict[str, float]]:
-    """Best-fit plane of the frames whose array is centred within `radius_mm` of the mass, and its figures.
+    """Best-fit plane of the frames whose array is centred within `radius_mm` of the highest point, and its figures.
 
-    None takes half the diagonal of the array, within which an array reaches the mass, and widens it while those frames
-    span no plane. A given radius without frames, or whose frames span no plane, is a `BadDataError`.
+    None takes half the diagonal of the array, within which it reaches the point, and widens it while the frames span no
+    plane. A stated radius without frames, or whose frames span no plane, is a `BadDataError`.
     """
-    mass, distances = find_mass(selections, plane), []
+    highest, distances = highest_point_mm(selections, plane), []
     for part in selections:
         head = part.scan.head
         middle = apply(inverse(head.scanhead_from_tracker), head.surface_mm.reshape(-1, 3).mean(axis=0))
         centre = apply(plane.plane_from_base, part.poses.places_mm(middle))
-        distances.append(np.linalg.norm(centre[:, :2] - mass, axis=1))
+        distances.append(np.linalg.norm(centre[:, :2] - highest, axis=1))
     radius = radius_mm or max(
         float(np.hypot(*np.ptp(part.scan.head.surface_mm[..., :2].reshape(-1, 2), axis=0))) / 2 for part in selections
     )
@@ -69,22 +68,22 @@ def local_plane(
         except BadDataError:
             if radius_mm is not None or radius > 500.0:
                 raise
-            radius *= _WIDER
+            radius *= _WIDENING
 
 
-def _moments(selections: Sequence[SelectedFrames], frames: Sequence[BoolArray]) -> HeadMoments:
-    """Of the (n,) frames chosen of each scan."""
-    pairs = zip(selections, frames, strict=True)
-    return sum((head_moments(part.scan.head, part.poses.part(some)) for part, some in pairs), HeadMoments())
+def _moments(selections: Sequence[SelectedFrames], masks: Sequence[BoolArray]) -> HeadMoments:
+    """Moments over the frames of each scan that its (n,) mask chooses."""
+    pairs = zip(selections, masks, strict=True)
+    return sum((head_moments(part.scan.head, part.poses.part(mask)) for part, mask in pairs), HeadMoments())
 
 
 # --- Figures of a map's report: motion of the head, coverage of the cells.
 
 
 def plane_figures(selections: Sequence[SelectedFrames], plane: Plane) -> dict[str, float]:
-    """Motion of the head on the plane (tilt, yaw, reach of the strokes), and how well the plane is determined.
+    """Figures of the head's motion on the plane (tilt, yaw, reach of the strokes) and of the plane's fit.
 
-    ``plane_condition`` is the longest over the second spread of the taxel centres: large for strokes along a line.
+    ``plane_condition`` is the ratio of the two largest spreads of the taxel centres, large for strokes along a line.
     """
     place_mm, axes = map(np.concatenate, zip(*(motion(part, plane) for part in selections), strict=True))
     x, y, z = axes[:, :, 2].sum(axis=0)
@@ -100,41 +99,38 @@ def plane_figures(selections: Sequence[SelectedFrames], plane: Plane) -> dict[st
 
 
 def cell_figures(sums: CellSums) -> dict[str, float]:
-    """Coverage of the cells, and unusual readings in them."""
-    hit = sums.count > 0
+    """Figures of the cells' coverage, and numbers of unusual readings."""
+    filled = sums.count > 0
     return {
         "coverage": float((sums.count >= FEW_READINGS).mean()),
-        "median_count": float(np.median(sums.count[hit])),
-        "few_cells": float(np.count_nonzero(hit & (sums.count < FEW_READINGS))),
+        "median_count": float(np.median(sums.count[filled])),
+        "few_cells": float(np.count_nonzero(filled & (sums.count < FEW_READINGS))),
         "clipped_values": float(sums.clipped),
         "negative_readings": float(sums.negative),
     }
 
 
 def stroke_figures(strokes: Sequence[latency.StrokeShift]) -> dict[str, float]:
-    """Shift of each stroke, and the mobility that they add up to."""
+    """Figures of each stroke's shift, and of the lump's mobility."""
     if not strokes:
         return {}
-    moved, sd = latency.mobility(strokes)
+    mobility_mm, sd_mm = latency.mobility(strokes)
     figures = {
         "strokes": float(len(strokes)),
-        "strokes_known": float(sum(one.known for one in strokes)),
-        "mobility_mm": moved,
-        "mobility_sd_mm": sd,
+        "strokes_known": float(sum(stroke.known for stroke in strokes)),
+        "mobility_mm": mobility_mm,
+        "mobility_sd_mm": sd_mm,
     }
-    for number, one in enumerate(strokes, start=1):
-        if one.known:
-            figures |= {f"stroke_{number}_shift_x_mm": one.shift_mm, f"stroke_{number}_sd_x_mm": one.sd_mm}
+    for number, stroke in enumerate(strokes, start=1):
+        if stroke.known:
+            figures |= {f"stroke_{number}_shift_x_mm": stroke.shift_mm, f"stroke_{number}_sd_x_mm": stroke.sd_mm}
     return {name: value for name, value in figures.items() if np.isfinite(value)}
 
 
 # --- Building of a tactile map from scans.
 
-# Landmarks of one examination further apart than this (mm) mean that the patient or the tracker was moved.
-MAX_LANDMARK_SHIFT_MM = 20.0
-
-# Scans that differ in one of these session facts are not of one examination.
-_SHARED_FACTS = ("subject", "side", "posture")
+MAX_LANDMARK_SHIFT_MM = 20.0  #: Landmarks of one examination lie nearer to their mean, or patient or tracker moved.
+_SHARED_FACTS = ("subject", "side", "posture")  #: Facts of the session that scans of one examination have in common.
 
 
 def build_map(
@@ -144,104 +140,115 @@ def build_map(
     progress: Progress = no_progress,
     **options: Any,
 ) -> TactileMap:
-    """Build the tactile map of one scan, or of several scans of one examination on a common plane.
+    """Tactile map of one scan, or of several scans of one examination on a common plane.
 
     Between scans the tracker's base and the patient must not have moved. Frames between two distinct poses further
     apart than `max_pose_gap_ms` are left out; `options` are those of `options.MapOptions`. Wellman & Howe (1999),
     section 2.2: (i) fit the plane, (ii) drop frames outside the pressure range and divide the rest by their mean, (iii)
-    project and average. All sums are over whole numbers: the order of frames and scans does not change a bit of the
-    map.
+    project and average. The order of frames and scans does not change a bit of the map (record 0017).
     """
-    how = MapOptions(**options)
+    settings = MapOptions(**options)
     check_number("max_pose_gap_ms", max_pose_gap_ms, 0, open_ends=True)
-    given = [scans] if isinstance(scans, Scan) else list(scans)
-    parts = [select.every_nth(scan, how.every) for scan in given]
-    _check_same_examination(parts)
-    figures: dict[str, float] = {} if how.every == 1 else {"frames_every": float(how.every)}
-    late_ms = 0.0 if isinstance(how.latency_ms, str) else float(how.latency_ms)
-    selections = _selected(parts, how, late_ms, max_pose_gap_ms)
+    every_frame = [scans] if isinstance(scans, Scan) else list(scans)
+    thinned = [select.every_nth(scan, settings.every) for scan in every_frame]
+    _check_same_examination(thinned)
+    figures: dict[str, float] = {} if settings.every == 1 else {"frames_every": float(settings.every)}
+    late_ms = 0.0 if isinstance(settings.latency_ms, str) else float(settings.latency_ms)
+    selections = _select(thinned, settings, late_ms, max_pose_gap_ms)
     figures |= exam_figures(selections)
-    of_scans = _numbered([select.scan_findings(scan) for scan in given])
+    findings = _numbered([select.scan_findings(scan) for scan in every_frame])
     try:
-        return _built(of_scans, selections, how, figures, late_ms=late_ms, gap_ms=max_pose_gap_ms, progress=progress)
+        return _build(
+            findings, selections, settings, figures, late_ms=late_ms, gap_ms=max_pose_gap_ms, progress=progress
+        )
     except BadDataError as error:
-        raise with_cause(error, (*of_scans, *exam_findings(figures))) from None
+        raise with_cause(error, (*findings, *exam_findings(figures))) from None
 
 
-def _built(
-    of_scans: tuple[Finding, ...],
+def _build(
+    scan_findings: tuple[Finding, ...],
     selections: list[SelectedFrames],
-    how: MapOptions,
+    settings: MapOptions,
     figures: dict[str, float],
     *,
     late_ms: float,
     gap_ms: float,
     progress: Progress,
 ) -> TactileMap:
-    """The map from the frames that are used, whose `figures` it adds to."""
-    findings = of_scans + _of_arrangement(selections, late_ms, figures, refuse=not how.as_stated)
+    """Map of the selected frames; adds its figures to `figures`."""
+    findings = scan_findings + _arrangement_findings(selections, late_ms, figures, refuse=not settings.as_stated)
     figures |= head_profile_figures(selections)
-    if how.flat_field:
-        used = [part for part in selections if part.used.any()]
-        flats = [accumulate.flat_field(part) for part in used]
-        figures["flat_field_frames"] = float(sum(frames for _, frames in flats))
-        figures["flat_field_sd"] = float(np.mean([response.std() for response, _ in flats]))
-        even = [accumulate.divided(part.scan, response) for (response, _), part in zip(flats, used, strict=True)]
-        selections = _selected(even, how, late_ms, gap_ms)
-    if how.latency_ms == "auto":
-        found = latency.estimate_latency(
-            selections, plane=_plane(selections), cell_mm=how.cell_mm, max_pose_gap_ms=gap_ms
+    if settings.flat_field:
+        selections = _select(_flattened(selections, figures), settings, late_ms, gap_ms)
+    if settings.latency_ms == "auto":
+        estimate = latency.estimate_latency(
+            selections, plane=_plane(selections), cell_mm=settings.cell_mm, max_pose_gap_ms=gap_ms
         )
-        figures |= {"latency_sd_ms": found.sd_ms, "latency_bound_ms": found.bound_ms}
-        late_ms, figures["latency_frames"] = found.latency_ms, float(found.frames)
-        selections = _selected([part.scan for part in selections], how, late_ms, gap_ms)
+        figures |= {"latency_sd_ms": estimate.sd_ms, "latency_bound_ms": estimate.bound_ms}
+        late_ms, figures["latency_frames"] = estimate.latency_ms, float(estimate.frames)
+        selections = _select([part.scan for part in selections], settings, late_ms, gap_ms)
     figures |= check_convention(selections)
     plane = _plane(selections)
-    if how.plane_radius_mm != "all":
-        radius = None if how.plane_radius_mm == "auto" else how.plane_radius_mm
-        plane, near = local_plane(selections, plane, radius_mm=radius)
-        figures.update(near)
-    sources = accumulate.sources_of(selections, plane_from_base=plane.plane_from_base, cell_mm=how.cell_mm)
-    if how.register_strokes:
+    if settings.plane_radius_mm != "all":
+        radius = None if settings.plane_radius_mm == "auto" else settings.plane_radius_mm
+        plane, radius_figures = local_plane(selections, plane, radius_mm=radius)
+        figures |= radius_figures
+    sources = accumulate.frame_sources(selections, plane_from_base=plane.plane_from_base, cell_mm=settings.cell_mm)
+    if settings.register_strokes:
         sources, strokes = latency.register_strokes(sources)
-        figures.update(stroke_figures(strokes))
-    done = accumulate.accumulate(sources, cell_mm=how.cell_mm, normalise=how.normalise, progress=progress)
-    figures.update(accumulate.shared_frame_figures(sources, done.levels, done.sums))
+        figures |= stroke_figures(strokes)
+    cells = accumulate.accumulate(sources, cell_mm=settings.cell_mm, normalise=settings.normalise, progress=progress)
+    figures |= accumulate.shared_frame_figures(sources, cells.levels, cells.sums)
     figures |= evenness_figures(selections, plane) | latency.stroke_lag_figures(sources)
     figures["stroke_count"] = float(latency.stroke_count(sources))
-    low, high = map(float, how.pressure_window_kpa)
+    low, high = map(float, settings.pressure_window_kpa)
     recipe = MapRecipe(
-        "scan", how.normalise, float(how.cell_mm), (low, high), late_ms, how.flat_field, how.register_strokes
+        "scan",
+        settings.normalise,
+        float(settings.cell_mm),
+        (low, high),
+        late_ms,
+        settings.flat_field,
+        settings.register_strokes,
     )
-    return _as_map(done, selections, plane, recipe, figures, findings=findings)
+    return _as_map(cells, selections, plane, recipe, figures, findings=findings)
 
 
-def _of_arrangement(
+def _flattened(selections: list[SelectedFrames], figures: dict[str, float]) -> list[Scan]:
+    """Scans with used frames, divided by the response of their taxels to an even pressure; adds to `figures`."""
+    used = [part for part in selections if part.used.any()]
+    flats = [accumulate.flat_field(part) for part in used]
+    figures["flat_field_frames"] = float(sum(frames for _, frames in flats))
+    figures["flat_field_sd"] = float(np.mean([response.std() for response, _ in flats]))
+    return [accumulate.divided(part.scan, response) for (response, _), part in zip(flats, used, strict=True)]
+
+
+def _arrangement_findings(
     selections: list[SelectedFrames], late_ms: float, figures: dict[str, float], *, refuse: bool
 ) -> tuple[Finding, ...]:
-    """Findings on how each scan is arranged; where another arrangement than the one stated is sure, it is refused."""
+    """Findings on each scan's arrangement; `BadDataError` if `refuse` and another arrangement is sure."""
     findings = []
-    for number, one in enumerate(selections, start=1):
-        check = check_arrangement(one, latency_ms=late_ms, thorough=False)
+    for number, selection in enumerate(selections, start=1):
+        check = check_arrangement(selection, latency_ms=late_ms, thorough=False)
         if refuse and check.refused:
             which = f"scan {number}: " if len(selections) > 1 else ""
             raise BadDataError(f"{which}{check.words}", way_out=f"{check.remedy}, or map it with --as-stated")
         if not check.too_short:
             figures["arrangement_log_odds"] = max(check.log_odds, figures.get("arrangement_log_odds", 0.0))
-        findings.append(check.findings_of(one.scan))
+        findings.append(check.findings_of(selection.scan))
     return findings[0] if all(one == findings[0] for one in findings) else _numbered(findings)
 
 
 def _numbered(findings: list[tuple[Finding, ...]]) -> tuple[Finding, ...]:
-    """Findings of each scan, by its number where there are several."""
+    """Findings of all scans, each with its scan's number where there are several."""
     if len(findings) == 1:
         return findings[0]
-    return tuple(one.labelled(f"scan {number}") for number, some in enumerate(findings, start=1) for one in some)
+    return tuple(one.labelled(f"scan {number}") for number, ones in enumerate(findings, start=1) for one in ones)
 
 
-def _selected(scans: list[Scan], how: MapOptions, late_ms: float, gap_ms: float) -> list[SelectedFrames]:
+def _select(scans: list[Scan], settings: MapOptions, late_ms: float, gap_ms: float) -> list[SelectedFrames]:
     """Select the used frames of every scan; an error if none is left in any of them."""
-    window = how.pressure_window_kpa
+    window = settings.pressure_window_kpa
     selections = [
         select.select_frames(scan, pressure_window_kpa=window, latency_ms=late_ms, max_pose_gap_ms=gap_ms)
         for scan in scans
@@ -261,6 +268,7 @@ def _plane(selections: list[SelectedFrames]) -> Plane:
 
 
 def _check_same_examination(scans: list[Scan]) -> None:
+    """Raise `BadDataError` for no scan, and for scans whose sessions differ."""
     if not scans:
         raise BadDataError("no scan was given", way_out="give at least one")
     for name in (*_SHARED_FACTS, "reference"):
@@ -274,7 +282,7 @@ def _check_same_examination(scans: list[Scan]) -> None:
 
 
 def _as_map(
-    done: accumulate.Accumulated,
+    cells: accumulate.Accumulated,
     selections: list[SelectedFrames],
     plane: Plane,
     recipe: MapRecipe,
@@ -282,7 +290,7 @@ def _as_map(
     *,
     findings: tuple[Finding, ...],
 ) -> TactileMap:
-    sums, scans = done.sums.trimmed(), [part.scan for part in selections]
+    sums, scans = cells.sums.trimmed(), [part.scan for part in selections]
     patient, nipple, spread = _landmarks(scans, plane)
     parts = [(f"scan {number} " if len(scans) > 1 else "", part) for number, part in enumerate(selections, start=1)]
     quality = {
@@ -293,16 +301,12 @@ def _as_map(
         **cell_figures(sums),
         **spread,
         **figures,
-        "gain_passes": float(done.passes),
-        "gain_last_change": done.last_change,
-        "gain_unsettled": float(not done.last_change <= accumulate.GAIN_TOLERANCE),
+        "gain_passes": float(cells.passes),
+        "gain_last_change": cells.last_change,
+        "gain_unsettled": float(not cells.last_change <= accumulate.GAIN_TOLERANCE),
     }
     tactile_map = TactileMap(
-        mean=sums.mean() / done.scale,
-        variance=sums.variance() / done.scale**2,
-        count=sums.count,
-        x_mm=sums.x_mm(),
-        y_mm=sums.y_mm(),
+        **sums.map_arrays(cells.scale),
         recipe=recipe,
         plane_from_base=plane.plane_from_base,
         patient_from_plane=patient,
@@ -313,12 +317,16 @@ def _as_map(
         masked_taxels=tuple(f"{which}{fault}" for which, part in parts for fault in part.faults),
         head=_head(scans),
     )
-    of_map = (*convention_findings(quality, findings), *broken_assumptions(quality), *handling_findings(quality))
-    return replace(tactile_map, findings=by_severity((*map_findings(tactile_map), *of_map, *findings)))
+    quality_findings = (
+        *convention_findings(quality, findings),
+        *broken_assumptions(quality),
+        *handling_findings(quality),
+    )
+    return replace(tactile_map, findings=by_severity((*map_findings(tactile_map), *quality_findings, *findings)))
 
 
 def _head(scans: list[Scan]) -> HeadShape:
-    """Shape of the scans' head; an error where they are of different ones."""
+    """Shape of the scans' head; `BadDataError` where they are of different ones."""
     first, *others = [HeadShape.of(scan.head.surface_mm, scan.head.pitch_mm) for scan in scans]
     for number, other in enumerate(others, start=2):
         if first.differences(other):
@@ -330,7 +338,7 @@ def _head(scans: list[Scan]) -> HeadShape:
 
 
 def _landmarks(scans: list[Scan], plane: Plane) -> tuple[FloatArray | None, FloatArray | None, dict[str, float]]:
-    """Patient frame and nipple in the plane, from the mean landmarks of the scans, and the distance between repeats."""
+    """Patient frame and nipple in the plane, by the scans' mean landmarks, and the figure of the repeats' distance."""
     touched = [scan.landmarks for scan in scans if scan.landmarks is not None]
     if not touched:
         return None, None, {}
@@ -352,7 +360,7 @@ def _landmarks(scans: list[Scan], plane: Plane) -> tuple[FloatArray | None, Floa
 
 
 def _mean_point(points_mm: list[FloatArray]) -> tuple[FloatArray, float]:
-    """Mean of points, and the largest distance from it."""
+    """Mean of points, and their largest distance from it."""
     points = np.stack(points_mm)
     mean = np.sort(points, axis=0).mean(axis=0)  # sorted, so that the order of the scans leaves no trace
     return mean, float(np.linalg.norm(points - mean, axis=1).max())

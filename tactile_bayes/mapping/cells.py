@@ -1,9 +1,10 @@
-"""Where frames lie: poses at their times, the best-fit plane, and the cells of a map on it."""
+"""Poses at the frames' times, the best-fit plane, and exact sums of readings in the cells of a map on it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from operator import add
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,19 +28,18 @@ from tactile_bayes.scans import CountArray, ElementCalibration, HeadGeometry, Tr
 # --- Poses of the head at the frames' times, interpolated from the tracker's.
 
 MAX_POSE_GAP_MS = 50.0
-# A place, or a rotation, that repeats itself and then leaps by so much (mm; difference of quaternions, 2 degrees) was
-# an old one. One that never leaps may be a head that rests, or a rig that does not turn.
+# A repeated place or rotation is an old one where it ends in a leap of this size (mm; quaternions, 2 degrees): without
+# a leap the head may rest, or a rig may not turn.
 _LEAP_MM, _LEAP_TURN = 2.0, 0.0175
 
 
 class FramePoses(Record, eq=False):
-    """The pose of the tracker's sensor at each frame."""
+    """Pose of the tracker's sensor at each frame."""
 
     position_mm: FloatArray  #: (n, 3) array: Tracker sensor in `base`.
     rotation: FloatArray  #: (n, 3, 3) array: ``p_base = position + rotation @ p_tracker``.
     known: BoolArray
-    """(n,) bool array: False where the tracker said nothing close enough; position and rotation are then meaningless
-    but finite."""
+    """(n,) bool array: False without poses near in time; position and rotation are then meaningless but finite."""
 
     def part(self, frames: slice | BoolArray | IndexArray) -> FramePoses:
         """A subset of the frames."""
@@ -53,28 +53,30 @@ class FramePoses(Record, eq=False):
 def distinct_poses(poses: TrackerPoses) -> TrackerPoses:
     """Poses without repeats, with quaternion signs unrolled and times strictly rising.
 
-    Trackers repeat their last sample when asked faster than they measure. A repeat is an old pose with a new time
-    stamp: it would drag the head behind, so only the first of a run stays. So does one of which the place alone, or the
-    rotation alone, stood still.
+    A repeat is an old pose with a new time stamp, from a tracker that is read faster than it measures: the first of a
+    run stays. A repeated place, or rotation, alone is one where it then leaps.
     """
     quaternion = unroll_quaternion_signs(poses.quaternion_wxyz)
     new = np.ones(len(poses), dtype=bool)
     new[1:] = (np.diff(poses.position_mm, axis=0) != 0).any(axis=1) | (np.diff(quaternion, axis=0) != 0).any(axis=1)
     new[1:] &= np.diff(poses.time_s) > 0
     time_s, place_mm, quaternion = poses.time_s[new], poses.position_mm[new], quaternion[new]
-    old = _stood_still(time_s, place_mm, leap=_LEAP_MM, at_end=True)
-    old |= _stood_still(time_s, quaternion, leap=_LEAP_TURN, at_end=False)
+    old = _outdated(time_s, place_mm, leap=_LEAP_MM, at_end=True)
+    old |= _outdated(time_s, quaternion, leap=_LEAP_TURN, at_end=False)
     return TrackerPoses(time_s[~old], place_mm[~old], quaternion[~old])
 
 
 def leaps(poses: TrackerPoses) -> BoolArray:
-    """(n - 1,) True where the next pose lies far from one."""
+    """(n - 1,) True where place or rotation leaps to the next pose."""
     far = np.linalg.norm(np.diff(poses.position_mm, axis=0), axis=1) >= _LEAP_MM
     return np.asarray(far | (np.linalg.norm(np.diff(poses.quaternion_wxyz, axis=0), axis=1) >= _LEAP_TURN))
 
 
-def _stood_still(time_s: FloatArray, values: FloatArray, *, leap: float, at_end: bool) -> BoolArray:
-    """(n,) True where (n, k) values repeat the one before, in a run that ends in a leap; `at_end`: in a gap or none."""
+def _outdated(time_s: FloatArray, values: FloatArray, *, leap: float, at_end: bool) -> BoolArray:
+    """(n,) True for (n, k) values that repeat the one before in a run that ends in a leap.
+
+    A long run that ends in a gap, or is the last, is outdated too if `at_end`.
+    """
     old, step, gap_s = np.zeros(len(values), dtype=bool), np.diff(values, axis=0), MAX_POSE_GAP_MS / 1000.0
     edges = np.flatnonzero(np.diff(np.concatenate([[0], (step == 0).all(axis=1), [0]])))
     for first, last in edges.reshape(-1, 2).tolist():
@@ -88,25 +90,23 @@ def _stood_still(time_s: FloatArray, values: FloatArray, *, leap: float, at_end:
 def poses_at(
     poses: TrackerPoses, time_s: FloatArray, *, latency_ms: float = 0.0, max_gap_ms: float = MAX_POSE_GAP_MS
 ) -> FramePoses:
-    """Interpolate the poses, distinct ones, to the (n,) times of the frames on the poses' clock.
+    """Interpolate distinct poses linearly to the (n,) times of the frames; a pose stamped t is one at ``t - latency``.
 
-    A pose stamped t was measured at ``t - latency``. Frames between two poses further apart than `max_gap_ms` have no
-    pose; nor have frames before the first pose or after the last: a head is not extrapolated. Positions are
-    interpolated linearly, rotations by normalised linear interpolation of neighbouring quaternions, which departs from
-    the great arc by less than (angle between poses)^3 / 60: nothing at tracker rates.
+    Frames have no pose before the first, after the last, or between two further apart than `max_gap_ms`. Normalised
+    quaternions depart from the great arc by less than (angle between poses)^3 / 60: nothing at tracker rates.
     """
-    moments_s = poses.time_s - latency_ms / 1000.0
+    measured_s = poses.time_s - latency_ms / 1000.0
     if len(poses) == 0:
-        nothing = np.zeros((len(time_s), 3))
-        return FramePoses(nothing, np.broadcast_to(np.eye(3), (len(time_s), 3, 3)), np.zeros(len(time_s), dtype=bool))
-    after = np.clip(np.searchsorted(moments_s, time_s, side="left"), 0, len(poses) - 1)
+        zeros = np.zeros((len(time_s), 3))
+        return FramePoses(zeros, np.broadcast_to(np.eye(3), (len(time_s), 3, 3)), np.zeros(len(time_s), dtype=bool))
+    after = np.clip(np.searchsorted(measured_s, time_s, side="left"), 0, len(poses) - 1)
     before = np.clip(after - 1, 0, None)
-    exact = moments_s[after] == time_s
-    inside = (time_s >= moments_s[0]) & (time_s <= moments_s[-1])
-    near = moments_s[after] - moments_s[before] <= max_gap_ms / 1000.0 + 1e-9
+    exact = measured_s[after] == time_s
+    inside = (time_s >= measured_s[0]) & (time_s <= measured_s[-1])
+    near = measured_s[after] - measured_s[before] <= max_gap_ms / 1000.0 + 1e-9
     return FramePoses(
-        _interpolated(time_s, moments_s, poses.position_mm),
-        rotation_from_quaternion(_interpolated(time_s, moments_s, poses.quaternion_wxyz)),
+        _interpolated(time_s, measured_s, poses.position_mm),
+        rotation_from_quaternion(_interpolated(time_s, measured_s, poses.quaternion_wxyz)),
         exact | (inside & near),
     )
 
@@ -124,16 +124,16 @@ _SPREAD_STEP = 2.0**-24
 _AXIS_STEP = 2.0**-30
 _STEPS = np.repeat([_POSITION_STEP, _SPREAD_STEP, _AXIS_STEP], [3, 9, 6])[:, None]
 _FARTHEST_STEPS = 2.0**52
-# Mean directions shorter than this (of 1) are no direction: the head was turned by over 90 degrees (SD).
+# Least length of a mean of unit vectors that has a direction: below it the head was turned by over 90 degrees (SD).
 _LEAST_RESULTANT = 0.3
 
 
 class HeadMoments(Record, eq=False):
-    """First two moments of all taxel centres over frames, in whole steps; add two with ``+``."""
+    """First two moments of all taxel centres over frames, in whole steps, which add with ``+``."""
 
     sums: tuple[int, ...] = (0,) * 28
-    """28 whole numbers: frames (1), and sums over them: of the mean taxel centre in `base` (3), of its outer products
-    (9), of the covariance of the taxels about their mean (9), of the head's x axis and of its normal (6)."""
+    """Number of frames (1), and sums over them: of the mean taxel centre in `base` (3), of its outer products (9), of
+    the covariance of the taxels about their mean (9), and of the head's x axis and its normal (6)."""
 
     def __add__(self, other: HeadMoments) -> HeadMoments:
         return HeadMoments(tuple(map(add, self.sums, other.sums)))
@@ -144,10 +144,7 @@ class HeadMoments(Record, eq=False):
         return self.sums[0]
 
     def plane(self) -> Plane:
-        """Best-fit plane of the taxel centres, see `tactile_bayes.geometry.fit_plane`.
-
-        A head that was turned all round, so that its x axis has no mean direction, is a `BadDataError`.
-        """
+        """Best-fit plane of the taxel centres (`geometry.fit_plane`); `BadDataError` for a head turned all round."""
         n, *sums = self.sums
         x, product, spread, axes = np.split(np.array(sums, dtype=object), [3, 12, 21])
         # whole numbers up to the division: positions far from the base lose nothing
@@ -165,12 +162,11 @@ class HeadMoments(Record, eq=False):
 
 
 def head_moments(head: HeadGeometry, poses: FramePoses) -> HeadMoments:
-    """Moments of the taxel centres at the known ones of `poses`.
+    """Moments of all taxel centres, of faulty taxels too, at the known ones of `poses`.
 
-    Every taxel counts, working or not: where the head was does not depend on what it read. A head so far from the
-    tracker's base that steps would have gaps is a `BadDataError`.
+    A head so far from the tracker's base that steps would have gaps is a `BadDataError`.
     """
-    steps = np.rint(np.array(_values(head, poses.part(poses.known))) * (1.0 / _STEPS))
+    steps = np.rint(np.array(_pose_moments(head, poses.part(poses.known))) * (1.0 / _STEPS))
     farthest = float(np.abs(steps[:3]).max(initial=0.0))
     if not farthest <= _FARTHEST_STEPS:
         raise BadDataError(
@@ -183,7 +179,7 @@ def head_moments(head: HeadGeometry, poses: FramePoses) -> HeadMoments:
     return HeadMoments((steps.shape[1], *sums))
 
 
-def _values(head: HeadGeometry, poses: FramePoses) -> list[FloatArray]:
+def _pose_moments(head: HeadGeometry, poses: FramePoses) -> list[FloatArray]:
     """Mean taxel centre (3), covariance of the taxels (9) and axes (6) in `base` at n poses, (n,) each.
 
     Term by term and not by matrix products: the bits of a frame do not depend on how many others there are.
@@ -192,10 +188,10 @@ def _values(head: HeadGeometry, poses: FramePoses) -> list[FloatArray]:
     tracker_from_head = inverse(head.scanhead_from_tracker)
     taxels = apply(tracker_from_head, head.surface_mm.reshape(-1, 3))
     middle = taxels.mean(axis=0)
-    across = ((taxels - middle).T @ (taxels - middle) / len(taxels)).T.tolist()
+    covariance = ((taxels - middle).T @ (taxels - middle) / len(taxels)).T.tolist()
     m0, m1, m2 = middle.tolist()
     centre = [x + (a * m0 + b * m1 + c * m2) for x, (a, b, c) in zip(p, r, strict=True)]
-    turned = [[a * x + b * y + c * z for x, y, z in across] for a, b, c in r]
+    turned = [[a * x + b * y + c * z for x, y, z in covariance] for a, b, c in r]
     spread = [x * a + y * b + z * c for x, y, z in turned for a, b, c in r]
     directions = tracker_from_head[:3, [0, 2]].T.tolist()
     axes = [a * x + b * y + c * z for x, y, z in directions for a, b, c in r]
@@ -209,7 +205,7 @@ VALUE_STEP = 2.0**-12
 VALUE_LIMIT = 64.0
 LIMIT_STEPS = VALUE_LIMIT / VALUE_STEP
 READINGS_PER_CALL = 2**16
-# Count and sum of a call travel as one number, count x 2^36 + sum: 2^16 sums of at most 2^18 steps stay below 2^34.
+# Count and sum of a call are packed in one number, count x 2^36 + sum: 2^16 sums of at most 2^18 steps are below 2^34.
 _PACK_BITS = 36
 MAX_CELLS = 2**22
 _GROWTH = 16
@@ -231,9 +227,7 @@ class CellSums:
     """`count`, `total`, `square`: (ny, nx) int64 arrays of readings, their sum in `VALUE_STEP` and the sum of their
     squares in `VALUE_STEP` squared."""
     clipped: int = 0  #: Readings beyond `VALUE_LIMIT` that were added at the limit.
-    negative: int = 0
-    """Readings below 0, which noise about nothing gives. They are added as they are: cut off at 0, they would lift the
-    mean."""
+    negative: int = 0  #: Readings below 0, by noise; they are added as they are, or the mean would be too high.
 
     def add_steps(self, first: tuple[int, int], shape: tuple[int, int], flat: IntArray, steps: FloatArray) -> None:
         """Add at most `READINGS_PER_CALL` values in whole steps to cells of the block `first`, `shape`; overwrites
@@ -259,8 +253,8 @@ class CellSums:
 
     def trimmed(self) -> CellSums:
         """A copy without the empty rows and columns around the data."""
-        held = self.count > 0
-        rows, columns = np.flatnonzero(held.any(axis=1)), np.flatnonzero(held.any(axis=0))
+        filled = self.count > 0
+        rows, columns = np.flatnonzero(filled.any(axis=1)), np.flatnonzero(filled.any(axis=0))
         if not len(rows):
             return CellSums(self.cell_mm, clipped=self.clipped, negative=self.negative)
         window = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
@@ -279,12 +273,17 @@ class CellSums:
         return np.maximum(spread, 0.0, out=spread)
 
     def x_mm(self) -> FloatArray:
-        """Centres of the columns."""
+        """(nx,) centres of the columns."""
         return np.asarray((self.first[1] + np.arange(self.count.shape[1])) * self.cell_mm, dtype=np.float64)
 
     def y_mm(self) -> FloatArray:
-        """Centres of the rows."""
+        """(ny,) centres of the rows."""
         return np.asarray((self.first[0] + np.arange(self.count.shape[0])) * self.cell_mm, dtype=np.float64)
+
+    def map_arrays(self, scale: float = 1.0) -> dict[str, Any]:
+        """Keyword arguments of a `TactileMap`: centres, counts, and mean and variance of the values over `scale`."""
+        mean, variance = self.mean() / scale, self.variance() / scale**2
+        return {"mean": mean, "variance": variance, "count": self.count, "x_mm": self.x_mm(), "y_mm": self.y_mm()}
 
     def _per_reading(self, sums: IntArray, step: float) -> FloatArray:
         ratio = np.full(sums.shape, np.nan)
@@ -293,27 +292,31 @@ class CellSums:
         return ratio
 
     def window(self, first: tuple[int, int], shape: tuple[int, int]) -> tuple[slice, slice]:
-        """Slices of a block of the lattice in the arrays."""
+        """Slices of the arrays for a block of the lattice."""
         top, left = first[0] - self.first[0], first[1] - self.first[1]
         return slice(top, top + shape[0]), slice(left, left + shape[1])
 
     def _make_room(self, first: tuple[int, int], shape: tuple[int, int]) -> None:
         """Grow the arrays, with a margin, to contain a block of the lattice."""
         (top, left), (bottom, right) = first, (first[0] + shape[0], first[1] + shape[1])
-        held, before = self.count.shape, self.first
+        (rows, columns), (old_top, old_left) = self.count.shape, self.first
         if self.count.size:
-            held_bottom, held_right = before[0] + held[0], before[1] + held[1]
-            if top >= before[0] and left >= before[1] and bottom <= held_bottom and right <= held_right:
+            old_bottom, old_right = old_top + rows, old_left + columns
+            if top >= old_top and left >= old_left and bottom <= old_bottom and right <= old_right:
                 return
-            top, left = min(top, before[0]), min(left, before[1])
-            bottom, right = max(bottom, held_bottom), max(right, held_right)
+            top, left, bottom, right = (
+                min(top, old_top),
+                min(left, old_left),
+                max(bottom, old_bottom),
+                max(right, old_right),
+            )
         refuse_vast(bottom - top, right - left, self.cell_mm)
         self.first = (top - _GROWTH, left - _GROWTH)
         for name in ("count", "total", "square"):
-            roomy = np.zeros((bottom - top + 2 * _GROWTH, right - left + 2 * _GROWTH), dtype=np.int64)
-            if held[0]:
-                roomy[self.window(before, (held[0], held[1]))] = getattr(self, name)
-            setattr(self, name, roomy)
+            larger = np.zeros((bottom - top + 2 * _GROWTH, right - left + 2 * _GROWTH), dtype=np.int64)
+            if rows:
+                larger[self.window((old_top, old_left), (rows, columns))] = getattr(self, name)
+            setattr(self, name, larger)
 
 
 def refuse_vast(rows: int, columns: int, cell_mm: float, *, most: int = MAX_CELLS) -> None:
@@ -340,18 +343,14 @@ _MOST_CELLS = 2**15
 
 
 class Projection(Record, eq=False):
-    """Frames' taxels on the lattice of cells: ``uv = turn @ taxel + shift``, frame by frame; the cell is floor(uv).
-
-    The face of the head is curved, so its true surface is used: two rows of each frame's rotation against three
-    coordinates of each taxel.
-    """
+    """Taxels of frames on the lattice of cells: ``uv = matrix @ taxels``, whose floor is the cell."""
 
     taxels: FloatArray
-    """(4, k) array: Centres of the taxels in the tracker's axes, mm about their middle, over a row of ones, by which a
-    shift is one more term of a product."""
+    """(4, k) array: Centres of the taxels on the curved face, in the tracker's axes, mm about their middle, over a row
+    of ones."""
     matrix: FloatArray
-    """(n, 2, 4) array: First two rows of the rotation from the tracker to the plane, in cells a mm; and beside them
-    where the taxels' middle lies on the lattice, in cells. Half a cell is added, so that cell k is centred on k."""
+    """(n, 2, 4) array: First two rows of the rotation from the tracker to the plane, in cells per mm, beside the place
+    of the taxels' middle on the lattice, in cells. Half a cell is added, so that cell k is centred on k."""
     cell_mm: float  #: Side of a cell.
 
     def __len__(self) -> int:
@@ -363,7 +362,7 @@ class Projection(Record, eq=False):
         return self.matrix[:, :, 3]
 
     def part(self, frames: slice | IndexArray | BoolArray) -> Projection:
-        """A subset of the frames."""
+        """The projection of some of the frames."""
         return Projection(self.taxels, self.matrix[frames], self.cell_mm)
 
     def moved(self, cells: FloatArray) -> Projection:
@@ -373,13 +372,12 @@ class Projection(Record, eq=False):
         return Projection(self.taxels, matrix, self.cell_mm)
 
     def block(self) -> tuple[tuple[int, int], tuple[int, int]]:
-        """First row and column, and shape, of the block of the lattice that contains every reading.
+        """First row and column, and shape, of the block of the lattice with every reading.
 
-        A block so wide that cells could not be told exactly is a `BadDataError`.
+        A block too wide for exact cells is a `BadDataError`.
         """
         reach = np.append(np.abs(self.taxels[:3]).max(axis=1, initial=0.0), 0.0)
-        # Of two dimensions, for which numpy has a fast product.
-        reach = (np.abs(self.matrix).reshape(-1, 4) @ reach).reshape(-1, 2)
+        reach = (np.abs(self.matrix).reshape(-1, 4) @ reach).reshape(-1, 2)  # numpy's product is fast in 2 dimensions
         left, top = np.floor((self.shift - reach).min(axis=0)).tolist()
         right, bottom = np.floor((self.shift + reach).max(axis=0)).tolist()
         columns, rows = right - left + 1, bottom - top + 1
@@ -406,7 +404,7 @@ class Projector(Record, eq=False):
 
     head: HeadGeometry
     plane_from_base: FloatArray
-    taxels: BoolArray  #: (rows, columns): Those to project.
+    taxels: BoolArray  #: (rows, columns) mask of those to project.
     cell_mm: float
 
     def at(self, poses: FramePoses) -> Projection:
@@ -438,7 +436,7 @@ class Projector(Record, eq=False):
 # --- Conversion of counts to pressures in whole multiples of a tiny step, so that sums have no rounding error.
 
 # Gains and offsets are rounded to this (kPa): 6e-11. Counts below 2^16 times such a gain, plus such an offset, and the
-# sum of a thousand of them fit float64 exactly, so a frame's level does not depend on who adds it up and how.
+# sum of a thousand of them fit float64 exactly: a frame's level does not depend on the order of addition.
 PRESSURE_STEP_KPA = 2.0**-34
 
 
@@ -454,7 +452,7 @@ class Readout(Record, eq=False):
 
     @classmethod
     def of(cls, calibration: ElementCalibration, good: BoolArray) -> Readout:
-        """Prepare for the good taxels of an array."""
+        """Readout of the good taxels of an array."""
         gain, offset = (
             np.rint(values[good] / PRESSURE_STEP_KPA) * PRESSURE_STEP_KPA
             for values in (calibration.gain_kpa_per_count, calibration.offset_kpa)
@@ -467,9 +465,9 @@ class Readout(Record, eq=False):
         return np.ascontiguousarray(flat if len(self.taxels) == self.size else flat[:, self.taxels])
 
     def pressure_kpa(self, counts: CountArray) -> tuple[FloatArray, BoolArray | None]:
-        """Pressures (f, k) of (f, k) counts, and which of them are valid; None where all are.
+        """Pressures (f, k) of (f, k) counts, and a mask of the unsaturated ones; None where all are.
 
-        A saturated reading (full count, or the sensor's 34 kPa) is invalid.
+        A reading is saturated at the full count, or at the sensor's 34 kPa.
         """
         pressure = np.multiply(counts, self.gain_kpa, dtype=np.float64)
         pressure += self.offset_kpa
@@ -477,8 +475,8 @@ class Readout(Record, eq=False):
         return pressure, None if valid.all() else valid
 
     def levels(self, pressure: FloatArray, valid: BoolArray | None) -> tuple[FloatArray, FloatArray]:
-        """Mean over the valid taxels (n,), NaN without any, and the share of the whole array that is valid (n,)."""
-        # Sums of whole steps: any order of adding gives the same bits, so a matrix product may do it.
+        """(n,) mean over the valid taxels, NaN without any, and (n,) share of the whole array that is valid."""
+        # sums of whole steps have the same bits in any order, so a matrix product may add
         number = np.full(len(pressure), len(self.taxels)) if valid is None else valid.sum(axis=1)
         total = (pressure if valid is None else np.where(valid, pressure, 0.0)) @ np.ones(len(self.taxels))
         level = np.full(len(total), np.nan)
@@ -490,16 +488,16 @@ class Readout(Record, eq=False):
 
 
 def chunk_frames(taxels: int) -> int:
-    """Frames per call whose sums are exact."""
+    """Number of frames per call, few enough for exact sums."""
     return max(1, min(128, READINGS_PER_CALL // max(1, taxels)))
 
 
 def add_frames(
     sums: CellSums, pressure_kpa: FloatArray, valid: BoolArray | None, *, projection: Projection, level: FloatArray
 ) -> None:
-    """Add the valid ones of (f, k) pressures, each over its frame's `level`, to the cells where `projection` puts them.
+    """Add the valid ones of (f, k) pressures, each over its frame's `level`, to their cells; overwrites the pressures.
 
-    `pressure_kpa` and `valid` are as of `Readout.pressure_kpa`; the pressures are overwritten.
+    `pressure_kpa` and `valid` come from `Readout.pressure_kpa`.
     """
     if not pressure_kpa.size:
         return

@@ -11,7 +11,7 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, Plane
 from tactile_bayes.mapping import convention
-from tactile_bayes.mapping.accumulate import Source
+from tactile_bayes.mapping.accumulate import FrameSource
 from tactile_bayes.mapping.cells import Projector, poses_at
 from tactile_bayes.mapping.convention import CoarseFrames
 from tactile_bayes.mapping.map import smooth
@@ -370,7 +370,7 @@ class StrokeShift(Record):
     known: bool = False  #: True where the stroke crossed a lump or an edge that fixes a shift; else the shift is 0.
 
 
-def find_strokes(sources: Sequence[Source]) -> list[StrokeShift]:
+def find_strokes(sources: Sequence[FrameSource]) -> list[StrokeShift]:
     """Runs of the scans' used frames in one direction along x, their shifts unknown yet; a turn ends a run."""
     return [
         StrokeShift(start, stop, number, direction)
@@ -381,7 +381,7 @@ def find_strokes(sources: Sequence[Source]) -> list[StrokeShift]:
     ]
 
 
-def stroke_count(sources: Sequence[Source]) -> int:
+def stroke_count(sources: Sequence[FrameSource]) -> int:
     """Number of strokes along x; runs less than half as long as the longest are turns or corrections."""
     lengths = [
         float(np.ptp(sources[run.scan].projection.shift[run.start : run.stop, 0])) for run in find_strokes(sources)
@@ -390,7 +390,7 @@ def stroke_count(sources: Sequence[Source]) -> int:
     return sum(length >= longest / 2 for length in lengths)
 
 
-def register_strokes(sources: Sequence[Source]) -> tuple[list[Source], list[StrokeShift]]:
+def register_strokes(sources: Sequence[FrameSource]) -> tuple[list[FrameSource], list[StrokeShift]]:
     """Scans with their strokes shifted onto each other along x, and the shifts, whose mean is 0.
 
     The regression of `ShiftFit` with one unknown per stroke, a few rounds (record 0097). `BadDataError` when fewer than
@@ -467,7 +467,7 @@ class _StrokeFrames(Record, eq=False):
 
 
 def _stroke_frames(
-    sources: Sequence[Source], strokes: Sequence[StrokeShift], every: Sequence[int]
+    sources: Sequence[FrameSource], strokes: Sequence[StrokeShift], every: Sequence[int]
 ) -> list[_StrokeFrames]:
     """Averages of the scans with used frames, over every `every`-th stretch of each."""
     parts = []
@@ -541,8 +541,8 @@ def _block_inflation(design: FloatArray, residual: FloatArray, block: IndexArray
     return float(inflation * scores.shape[1] / free)
 
 
-def _shifted_back(source: Source, strokes: list[StrokeShift]) -> Source:
-    """Source with its strokes moved back by their shifts."""
+def _shifted_back(source: FrameSource, strokes: list[StrokeShift]) -> FrameSource:
+    """FrameSource with its strokes moved back by their shifts."""
     shift = np.zeros_like(source.projection.shift)
     for stroke in strokes:
         shift[stroke.start : stroke.stop, 0] = -stroke.shift_mm
@@ -558,7 +558,7 @@ def _shifted_back(source: Source, strokes: list[StrokeShift]) -> Source:
 LAG_FRAMES = 160  #: Averaged frames, spread evenly: more would cost as much as the map itself.
 
 
-def stroke_lag_figures(sources: Sequence[Source]) -> dict[str, float]:
+def stroke_lag_figures(sources: Sequence[FrameSource]) -> dict[str, float]:
     """Figures ``stroke_lag_mm``, half the distance between the lump as strokes to +x and to -x see it, and its ``_sd``.
 
     Above 0 strokes see the lump ahead, as if dragged along; a pose that is late by t gives -v t. Empty where strokes

@@ -20,7 +20,7 @@ from tactile_bayes.scans import HeadShape
 
 
 def smooth(values: NDArray[np.generic], *, passes: int = 4) -> FloatArray:
-    """Binomial smoothing along both axes; four passes are two cells (SD 1.4) wide."""
+    """Binomial smoothing along both axes; four passes have an SD of 1.4 cells."""
     smooth = np.asarray(values, dtype=np.float64)
     for _ in ("y", "x"):
         for _ in range(passes):
@@ -32,21 +32,22 @@ def smooth(values: NDArray[np.generic], *, passes: int = 4) -> FloatArray:
 
 # --- The tactile map, with the recipe by which it was built.
 
-FEW_READINGS = 10  #: A cell with fewer readings than this is flagged: its mean is noisy, and its variance says little.
+FEW_READINGS = 10  #: Number of readings below which a cell is flagged: its mean is noisy, its variance even more so.
 
 
 class MapRecipe(Record):
-    """How a map was built; a size calibration fits only maps of its own recipe."""
+    """Settings by which a map was built; a size calibration fits only maps of its own recipe."""
 
     source: str  #: ``"scan"`` or ``"grid"`` (a map imported as it is).
     normalise: Annotated[str, Meta(pattern="^(mean|gain|none)$", extra={"words": "mean, gain or none"})]
     cell_mm: Annotated[float, Meta(gt=0)]  #: Side of the square cells.
     pressure_window_kpa: tuple[float, float] | None = None  #: The gate on the frame's mean; None for an imported grid.
-    latency_ms: float = 0.0  #: By how much a pose's stamp is late against the frames.
-    flat_field: bool = False  #: True where the head's own response was taken off.
+    latency_ms: float = 0.0  #: Delay of a pose's stamp against the frames.
+    flat_field: bool = False  #: True where readings were divided by the head's own response.
     registered: bool = False  #: True where the strokes were shifted onto each other.
-    units: str = ""
-    """Units of an imported grid's values, as the user named them; empty where unknown. A scan's are kPa."""
+    units: str = (
+        ""  #: Units of an imported grid's values, as the user named them; empty where unknown. A scan's are kPa.
+    )
 
     @property
     def value_unit(self) -> str:
@@ -57,7 +58,7 @@ class MapRecipe(Record):
 
     @property
     def value_words(self) -> str:
-        """The map's values in a few words, for the label of a colour bar."""
+        """Label of a colour bar for the map's values."""
         if self.normalise == "none":
             name = "mean pressure" if self.source == "scan" else "value"
             return f"{name} ({self.value_unit or 'unit unknown'})"
@@ -85,15 +86,14 @@ class TactileMap(Record, eq=False):
     plane_from_base: FloatArray | None = None  #: (4, 4) array or None: None for an imported grid.
     patient_from_plane: FloatArray | None = None  #: (4, 4) array or None: None without landmarks.
     background: float | None = 1.0
-    """Level far from the lump that normalising defines (1 in the paper's Eqs 5 and 7); None when it is not known."""
-    frame_count: int = 0
-    """Frames that went in. Cells share frames, so a map has fewer independent errors than readings."""
+    """Level far from the lump that normalising defines (1 in the paper's Eqs 5 and 7); None where it is not known."""
+    frame_count: int = 0  #: Frames in the map. Cells share frames: there are fewer independent errors than readings.
     quality: Mapping[str, float] = field(default_factory=dict)
     """Counts and figures for the report (frames dropped low/high, tilt, rms...)."""
     masked_taxels: tuple[str, ...] = ()  #: Taxels that were left out, one line each: ``"row 3 column 7 dead"``.
     head: HeadShape | None = None  #: Shape of the head that made the scan; None for an imported grid.
     nipple_mm: FloatArray | None = None  #: (3,) array or None: The nipple in `plane`; None where it was not touched.
-    findings: tuple[Finding, ...] = ()  #: Findings against sizes from it.
+    findings: tuple[Finding, ...] = ()  #: Findings against the map's sizes.
 
     def __post_init__(self) -> None:
         shape = (len(self.y_mm), len(self.x_mm))
@@ -116,16 +116,13 @@ class TactileMap(Record, eq=False):
 
     @property
     def fingerprint(self) -> int:
-        """First 64 bits of a hash of the cells and their values, which seed random numbers whatever file the map is in.
-
-        Where the map came from, where it lies in the patient and what the file says of it are no part of it.
-        """
+        """First 64 bits of a hash of the cells and their values alone, to seed random numbers: the same in any file."""
         digest = hashlib.sha256(np.array(self.mean.shape, dtype="<i8").tobytes())
         covered = self.covered
         for values in (self.mean, self.variance, self.count):
             # NaN has many bit patterns: cells without data count as one value
-            held = np.where(covered & np.isfinite(values), values, 0.0)
-            digest.update(np.ascontiguousarray(held, dtype="<f8").tobytes())
+            defined = np.where(covered & np.isfinite(values), values, 0.0)
+            digest.update(np.ascontiguousarray(defined, dtype="<f8").tobytes())
         for axis in (self.x_mm, self.y_mm):
             digest.update(np.ascontiguousarray(axis, dtype="<f8").tobytes())
         return int.from_bytes(digest.digest()[:8], "big")
@@ -137,7 +134,7 @@ class TactileMap(Record, eq=False):
 
     @property
     def counts_known(self) -> bool:
-        """True where `count` is the number of readings per cell: an imported grid without counts has 1 everywhere."""
+        """True if `count` is the number of readings per cell; an imported grid without counts has 1 everywhere."""
         return self.recipe.source == "scan" or bool((self.count > 1).any())
 
     @property
@@ -155,9 +152,9 @@ MANY_CELLS: Final = 20_000  #: In a window: 0.25 mm in the default one, up to fi
 
 
 def many_cells(tactile_map: TactileMap, radius_mm: float) -> str | None:
-    """Notice for a fit window of `MANY_CELLS` or more: its cost, and which cells would do; None where it holds fewer.
+    """Notice on the cost of a fit window of `MANY_CELLS` or more, and on cells that are fine enough; None for fewer.
 
-    Counts the cells of a covered disc of `radius_mm`, or all that the map has where these are fewer.
+    Counts the cells of a covered disc of `radius_mm`, or all of the map's where these are fewer.
     """
     cell = tactile_map.recipe.cell_mm
     cells = min(int(tactile_map.covered.sum()), int(math.pi * radius_mm**2 / cell**2))
@@ -173,10 +170,10 @@ def many_cells(tactile_map: TactileMap, radius_mm: float) -> str | None:
     )
 
 
-# --- What a map's figures say against the assumptions of a size: even layers, flat skin, a lump that stays where it is.
+# --- Findings against the assumptions of a size (even layers, flat skin, a lump that stays where it is).
 #
-# Bodies simulated with one of these broken decide the limits (docs/decisions/0103): a flag is silent on bodies
-# without stress, and a caution stands where sizes lay outside their intervals more often than they say.
+# The limits come from simulated bodies that break one of them (record 0103): none is passed by bodies that break none,
+# and a caution stands where intervals of the size cover too seldom.
 
 MOST_PROFILE_CHANGE = 0.01
 """Change of the second order across the head, over 30 mm: fat that deepens by 1 mm in 20 changes it by 0.01 to 0.06."""
@@ -196,31 +193,26 @@ _ERRORS = 2.5  #: Standard errors by which a figure must exceed 0, besides its l
 
 
 def broken_assumptions(quality: Mapping[str, float]) -> Iterator[Finding]:
-    """Findings from a map's `quality` figures (of evenness and stroke lag) against the assumptions of a size.
-
-    Missing figures say nothing.
-    """
+    """Findings from a map's `quality` figures against the assumptions of a size; missing figures give none."""
     if lag := _beyond(quality, "stroke_lag_mm", "stroke_lag_sd_mm", MOST_LAG_MM):
         cause = "each dragged it along" if lag > 0 else "the tracker's positions came late"
         text = (
             f"strokes in opposite directions see the lump some {2 * abs(lag):.0f} mm apart, as if {cause}: the size "
             "may be off by more than its interval"
         )
+        kind, option, again = "late_poses", "--latency-ms auto", "with the tracker's delay estimated"
         if lag > 0:
-            remedy, again = "--register-strokes", "with its strokes aligned to each other"
-        else:
-            remedy, again = "--latency-ms auto", "with the tracker's delay estimated"
-        kind = "lump_dragged" if lag > 0 else "late_poses"
-        yield finding(kind, text, f"map again with {remedy}", f"have the scan mapped again {again}")
+            kind, option, again = "lump_dragged", "--register-strokes", "with its strokes aligned to each other"
+        yield finding(kind, text, f"map again with {option}", f"have the scan mapped again {again}")
     if change := _beyond(quality, "profile_change", "profile_change_sd", MOST_PROFILE_CHANGE):
-        far = change > BROKEN_PROFILE_CHANGE  # so far that sizes fail
-        end = "the size may be off by more than its interval" if far else "the size is for even fat"
+        broken = change > BROKEN_PROFILE_CHANGE
+        end = "the size may be off by more than its interval" if broken else "the size is for even fat"
         text = (
             f"the head presses differently in one part of the map than in another (by {change:.3f} in 30 mm, as the "
             "pressure falls off from the head's middle): the fat is of uneven depth, "
             f"or a rib or another lump lies near; {end}"
         )
-        yield finding("uneven_fat" if far else "slightly_uneven_fat", text)
+        yield finding("uneven_fat" if broken else "slightly_uneven_fat", text)
     curvature = quality.get("skin_curvature_per_m", 0.0)
     if abs(curvature) > MOST_CURVATURE_PER_M:
         text = (
@@ -239,7 +231,7 @@ def broken_assumptions(quality: Mapping[str, float]) -> Iterator[Finding]:
 
 
 def handling_findings(quality: Mapping[str, float]) -> Iterator[Finding]:
-    """Findings from a map's `quality` figures against how the head was held and the array read."""
+    """Findings from a map's `quality` figures on how the head was held and the array read."""
     if quality.get("saturated_readings"):
         number = f"{quality['saturated_readings']:.0f} readings"
         text = f"{number} were pressed beyond the array's range and left out: the map is too low there"
@@ -266,7 +258,7 @@ def handling_findings(quality: Mapping[str, float]) -> Iterator[Finding]:
 
 
 def skewed(quality: Mapping[str, float]) -> str:
-    """A sentence on skin that the head drags along; no size moved by it, so it is a matter of technique."""
+    """Sentence on skin that the head drags along, or none; it moves no size and is a matter of technique."""
     skew = _beyond(quality, "stroke_skew", "stroke_skew_sd", MOST_SKEW)
     if skew is None:
         return ""
@@ -274,7 +266,7 @@ def skewed(quality: Mapping[str, float]) -> str:
 
 
 def _beyond(quality: Mapping[str, float], name: str, sd_name: str, limit: float) -> float | None:
-    """The figure, where it exceeds its limit and its standard error by enough."""
+    """The figure if it exceeds its limit and `_ERRORS` standard errors; else None."""
     value, sd = quality.get(name, 0.0), quality.get(sd_name, 0.0)
     return value if abs(value) > max(limit, _ERRORS * sd) else None
 
@@ -282,11 +274,9 @@ def _beyond(quality: Mapping[str, float], name: str, sd_name: str, limit: float)
 # --- Largest cell that measures the map's highest bump well, and what finer cells would cost.
 
 _FWHM = 2.3548  # of a Gaussian, in sigmas
-# Cells of up to this many sigmas moved no width by more than one posterior SD (record 0074).
-_CELL_PER_SIGMA = 0.5
+_CELL_PER_SIGMA = 0.5  #: Largest cell, in sigmas, that moved no width by more than one posterior SD (record 0074).
 _SMOOTHED_CELLS = 2.0  # variance that `smooth` adds, in cells squared
-# A peak lower than this many times the spread of the smoothed map (by its quartiles) is no bump to take a width from.
-_LEAST_RISE = 4.0
+_LEAST_RISE = 4.0  #: Least height of a peak that has a width, over half the smoothed map's distance of quartiles.
 
 
 class CellAdvice(Record):
@@ -294,11 +284,11 @@ class CellAdvice(Record):
 
     sigma_mm: float  #: Width of the narrower side of the map's highest bump, from its half height.
     coarsest_mm: float  #: Largest cell that leaves its widths within one posterior SD of those by cells of 1 mm.
-    cell_mm: float  #: The map's own.
-    readings: float  #: Median readings a cell.
+    cell_mm: float  #: Side of the map's cells.
+    readings: float  #: Median readings per cell.
 
     def text(self) -> str:
-        """One line: which cells measure the bump, and what cells of half the present size would cost."""
+        """Line on the cells that measure the bump, and on the cost of cells of half the present size."""
         half = self.cell_mm / 2
         head = f"bump of sigma {self.sigma_mm:.1f} mm: measured well by cells of up to {self.coarsest_mm:.1f} mm"
         if self.cell_mm > self.coarsest_mm:
@@ -307,15 +297,10 @@ class CellAdvice(Record):
 
 
 def advise_cell(tactile_map: TactileMap) -> CellAdvice | None:
-    """Advise on the cell from a map's highest bump; None where nothing stands out.
-
-    The rule is h <= 0.5 sigma_min, from how the widths of simulated bodies change with the cell (record 0074). For a
-    Gaussian bump the fit, which integrates its model over the cells, is exact to 0.1 % at 0.75 sigma; but lumps are not
-    quite Gaussian, and errors of the map change with the cell as well.
-    """
+    """Advice on the cell from a map's highest bump, h <= 0.5 sigma_min (record 0074); None where nothing stands out."""
     # the map smoothed with its counts as weights, where readings are not few
-    held = np.where(tactile_map.covered, tactile_map.count, 0).astype(np.float64)
-    weight, total = smooth(held), smooth(np.where(tactile_map.covered, tactile_map.mean, 0.0) * held)
+    count = np.where(tactile_map.covered, tactile_map.count, 0).astype(np.float64)
+    weight, total = smooth(count), smooth(np.where(tactile_map.covered, tactile_map.mean, 0.0) * count)
     known = tactile_map.covered & ~tactile_map.few & (weight > 0)
     mean = np.divide(total, weight, out=np.full(weight.shape, np.nan), where=known)
     if np.count_nonzero(known) < 25:
@@ -331,30 +316,30 @@ def advise_cell(tactile_map: TactileMap) -> CellAdvice | None:
     cell = tactile_map.recipe.cell_mm
     variances = [(extent * cell / _FWHM) ** 2 - _SMOOTHED_CELLS * cell**2 - cell**2 / 12 for extent in extents]
     sigma = float(np.sqrt(max(min(variances), (cell / 2) ** 2)))
-    count = tactile_map.count[tactile_map.covered]
-    return CellAdvice(sigma, _CELL_PER_SIGMA * sigma, cell, float(np.median(count)))
+    readings = float(np.median(tactile_map.count[tactile_map.covered]))
+    return CellAdvice(sigma, _CELL_PER_SIGMA * sigma, cell, readings)
 
 
-def _extent(excess: FloatArray, at: int) -> float:
-    """Full width at half height about an index, in cells, by linear interpolation; NaN where it reaches the rim."""
-    half = excess[at] / 2
+def _extent(excess: FloatArray, peak: int) -> float:
+    """Full width at half height about the peak's index, in cells, interpolated; NaN where it reaches the rim."""
+    half = excess[peak] / 2
     width = 0.0
-    for way in (1, -1):
-        i = at
-        while 0 <= i + way < len(excess) and excess[i + way] > half:
-            i += way
-        if not 0 <= i + way < len(excess) or not np.isfinite(excess[i + way]):
+    for step in (1, -1):
+        i = peak
+        while 0 <= i + step < len(excess) and excess[i + step] > half:
+            i += step
+        if not 0 <= i + step < len(excess) or not np.isfinite(excess[i + step]):
             return float("nan")
-        width += abs(i - at) + float((excess[i] - half) / (excess[i] - excess[i + way]))
+        width += abs(i - peak) + float((excess[i] - half) / (excess[i] - excess[i + step]))
     return width
 
 
-def block_sums(values: FloatArray, times: int) -> FloatArray:
-    """Sums over blocks of `times` by `times` cells; what is left at the ends is filled up with zeros."""
-    ny, nx = (-(-n // times) for n in values.shape)
-    padded = np.zeros((ny * times, nx * times))
+def block_sums(values: FloatArray, side: int) -> FloatArray:
+    """Sums over blocks of `side` by `side` cells; blocks at the ends are padded with zeros."""
+    ny, nx = (-(-n // side) for n in values.shape)
+    padded = np.zeros((ny * side, nx * side))
     padded[: values.shape[0], : values.shape[1]] = values
-    summed: FloatArray = padded.reshape(ny, times, nx, times).sum(axis=(1, 3))
+    summed: FloatArray = padded.reshape(ny, side, nx, side).sum(axis=(1, 3))
     return summed
 
 
@@ -372,7 +357,7 @@ _PATIENT_SIDES: Final = {
 
 
 class Orientation(Record):
-    """Which axes of the plane point right and up on the screen."""
+    """Axes of the plane that point right and up on the screen."""
 
     right: str
     up: str
@@ -397,12 +382,12 @@ class Orientation(Record):
 
     @property
     def sentence(self) -> str:
-        """The orientation with what the letters at the edges stand for, for pages."""
+        """Sentence for pages: the orientation, and the meaning of the letters at the edges."""
         sides = "; R, L: the patient's right and left; H: head, F: feet" if self.notch is not None else ""
         return f"{capitalised(self.words)}{sides}."
 
     def side_words(self, axis: str) -> str:
-        """Name a side of the map ("+x", "-x", "+y", "-y"): the patient's with landmarks, else the picture's."""
+        """Name of a side of the map ("+x", "-x", "+y", "-y"): the patient's with landmarks, else the picture's."""
         screen = {self.right: "right", _opposite(self.right): "left", self.up: "top", _opposite(self.up): "bottom"}
         side = screen[axis]
         words = f"the picture's {side}" if self.notch is None else _PATIENT_SIDES[self.edges[side]]
@@ -429,12 +414,10 @@ class Orientation(Record):
 
 
 def orientation_of(tactile_map: TactileMap) -> Orientation:
-    """Orientation in which a map is shown.
+    """Orientation of a map on the screen, seen along z, into the tissue (record 0076).
 
-    The viewer looks along z, into the tissue, as an examiner does who faces the patient. With landmarks the plane is
-    shown by the quarter turn that brings the sternal notch nearest to straight up; the patient's left is then on the
-    viewer's right. Without landmarks y, along the scan head, is up, and x runs to the left. A grid that was imported
-    has no outside and is shown as its file reads: first row on top, first column on the left.
+    With landmarks by the quarter turn that brings the sternal notch nearest to straight up; without them with y up and
+    x to the left; an imported grid as its file reads.
     """
     if tactile_map.patient_from_plane is None and tactile_map.plane_from_base is None:
         return Orientation("+x", "-y", GRID_WORDS)
@@ -448,7 +431,7 @@ def orientation_of(tactile_map: TactileMap) -> Orientation:
     return Orientation(_RIGHT_OF_UP[up], up, PATIENT_WORDS, (along[_RIGHT_OF_UP[up]], along[up]))
 
 
-# What runs to the right when an axis is up and z points away from the viewer.
+# Axis to the right for each axis that is up, where z points away from the viewer.
 _RIGHT_OF_UP: Final = {"+y": "-x", "-y": "+x", "+x": "+y", "-x": "-y"}
 
 

@@ -1,8 +1,6 @@
-"""What a scan is held against: what the data of an exam can be, and what a map needs to show a lump.
+"""Comparison of scans and maps with what an exam's data can be, and with what a map needs to show a lump (record 0137).
 
-A map without a lump says that there is none only where the data could have shown one. Figures of the readings, clocks,
-places and landmarks go into a map's quality, so that whoever has the map can judge them; see decision 0137 for the
-limits.
+Figures of the readings, clocks, places and landmarks go into a map's quality, where they can be judged later.
 """
 
 from __future__ import annotations
@@ -21,37 +19,35 @@ from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
 from tactile_bayes.mapping.select import SelectedFrames, chunks, frame_figures, refuse_without_frames, timing_figures
 from tactile_bayes.scans import HeadShape, Landmarks
 
-RATE_HZ: Final = (5.0, 2000.0)  #: Of frames.
+RATE_HZ: Final = (5.0, 2000.0)  #: Rate of frames.
 LEAST_FRAMES, LEAST_USED_SHARE = 30, 0.05
-LEAST_AREA: Final = 1.5  #: Of a map, in areas of the array: a head that stood still covers its own and its noise.
-MOST_SPAN_MM: Final = 600.0  #: Of the places along one axis: a chest is narrower.
+LEAST_AREA: Final = 1.5  #: Area of a map in areas of the array: a head that stood still covers its own and its noise.
+MOST_SPAN_MM: Final = 600.0  #: Range of the places along one axis: a chest is narrower.
 IMPOSSIBLE_MM: Final = 3000.0
-SIDE_MM: Final = (5.0, 200.0)  #: Of an array.
-MOST_RATIO: Final = 1.5  #: Of the distance between taxels to the pitch, or of the pitch to the distance.
+SIDE_MM: Final = (5.0, 200.0)  #: Sides of an array.
+MOST_RATIO: Final = 1.5  #: Ratio of the distance between taxels to the pitch, or the inverse.
 MOST_ZIGZAG_MM: Final = 3.0  #: Median distance of a pose from the middle of the two beside it.
-FROZEN_S, MOST_FROZEN = 0.3, 0.1
-"""Frames that repeat each other for so long are the array's last one; their share among those used."""
-MOST_FLICKER: Final = 0.7  #: Of `_flicker`: 0.2 at most in 466 right scans, 1 in noise.
-_STILL_TAXELS: Final = 0.01  #: Share of the taxels that may change in a frame that repeats the last one.
-MOST_REPEATED: Final = 0.4  # where each frame is there twice, half of them repeat the one before
+FROZEN_S, MOST_FROZEN = 0.3, 0.1  #: Duration of repeats from which an array is frozen, and share of such frames.
+MOST_FLICKER: Final = 0.7  #: `_flicker` is 0.2 at most in 466 right scans, and 1 in noise.
+_REPEAT_TAXELS: Final = 0.01  #: Share of the taxels that may change in a frame that repeats the last one.
+MOST_REPEATED: Final = 0.4  #: Share of frames that repeat the one before: half where each frame is there twice.
 PLATEAU: Final = 30
 TAXEL_PLATEAU: Final = 10
 """Readings at the highest count, of the array and of one taxel, that are a plateau if those of the three counts below
 it are fewer: 66 right scans have up to 5 of one taxel."""
 MOST_SATURATED, MOST_DROPPED = 0.02, 0.2
-"""Share of the readings at full scale, and of the frames with too many taxels that are, or are faulty."""
-COARSEST_COUNT: Final = 0.1  #: A count over the mean pressure: a lump's rise is a few tenths of it.
-WRAPPED: Final = 2000  #: So far below 65,536 a reading is one below 0, or stands for none.
-LANDMARKS_MM: Final = (80.0, 350.0)  #: From the sternal notch to the xiphoid.
-MOST_REACH_MM: Final = 500.0  #: From the xiphoid to the head.
+"""Share of the readings at full scale, and of the frames left out for saturated or faulty taxels."""
+COARSEST_COUNT: Final = 0.1  #: One count over the mean pressure: a lump's rise is a few tenths of it.
+WRAPPED: Final = 2000  #: Readings this near to 65,536 are below 0, or no value.
+LANDMARKS_MM: Final = (80.0, 350.0)  #: Distance from the sternal notch to the xiphoid.
+MOST_REACH_MM: Final = 500.0  #: Distance from the xiphoid to the head.
 LEAST_GAP, LEAST_RANGE = 0.4, 12.0
-"""Cells are far outside the rest where so large a share of the values' range is empty, in a range of so many quartile
-distances."""
-_MOST_LEVELS: Final = 9.0  # of a value that is taken for one: fill values would cover the rest
-LEAST_GRID_CM2: Final = 4.0  #: Of a grid whose head is not known.
+"""Least empty share of the values' range, and least range in quartile distances, of cells far outside the rest."""
+_MOST_LEVELS: Final = 9.0  #: Values are clipped to this many levels: fill values would hide the rest.
+LEAST_GRID_CM2: Final = 4.0  #: Area of a grid whose head is not known.
 DIP_MM, LEAST_DIP, DIP_OVER_RISE = 6.0, 0.15, 1.5
-"""A map that in means of so large squares dips by so much of its level, and so many times what it rises by, is of
-readings that fall where pressure rises: right ones dip by less than they rise, or by 0.1."""
+"""Side of the squares whose means dip, least dip in levels, and its least ratio to the rise, where readings fall as
+pressure rises: right maps dip by less than they rise, or by 0.1."""
 _CHUNK: Final = 4096
 _SAMPLE_FRAMES: Final = 500
 
@@ -63,12 +59,12 @@ def exam_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
     """Figures of the readings, poses and landmarks of scans, by which `exam_findings` judges them."""
     figures: dict[str, float] = {"plateau_readings": 0.0, "wrapped_readings": 0.0}
     for part in selections:
-        places, counts, still = part.poses.position_mm[part.used], part.scan.frames.counts, _still(part)
+        places, counts, repeats = part.poses.position_mm[part.used], part.scan.frames.counts, _repeats(part)
         spread = float(np.ptp(places, axis=0).max()) if len(places) else 0.0
-        if spread > IMPOSSIBLE_MM:  # no map of them can be held
+        if spread > IMPOSSIBLE_MM:  # a map of them would not fit in memory
             way_out = "positions are in mm; leave out poses that stand for a tool out of sight"
             raise BadDataError(f"the places of the head spread over {spread:,.0f} mm", way_out=way_out)
-        readings, count = _plateau(part, np.flatnonzero(part.used & ~still))
+        readings, count = _plateau(part, np.flatnonzero(part.used & ~repeats))
         figures["plateau_readings"] += readings
         if readings:
             figures["plateau_count"] = float(count)
@@ -76,15 +72,15 @@ def exam_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
         wrapped = float((counts >= 65536 - WRAPPED).sum())
         if wrapped and not ((counts >= 32768) & (counts < 65536 - WRAPPED)).any():
             figures["wrapped_readings"] += wrapped
-        for name, value in (*_stillness(part, still), *_flicker(part), *_geometry(part)):
+        for name, value in (*_repeat_shares(part, repeats), *_flicker(part), *_geometry(part)):
             figures[name] = max(value, figures.get(name, 0.0))
     return figures
 
 
 def _plateau(part: SelectedFrames, frames: IndexArray) -> tuple[int, int]:
-    """Readings of frames at the highest count of the array or of their taxel that are too many, and the count.
+    """Number of readings in a plateau at the highest count, of the array or of taxels, and the count; 0 without one.
 
-    Looked for in a sample of the frames, and counted in all of them.
+    It is sought in a sample of the frames, and its readings are counted in all.
     """
     if not len(frames):
         return 0, 0
@@ -92,38 +88,38 @@ def _plateau(part: SelectedFrames, frames: IndexArray) -> tuple[int, int]:
     counts = part.scan.frames.counts.reshape(len(part.used), -1)
     end = part.scan.element_calibration.saturation_count
     sample = counts[frames[:: max(1, len(frames) // _SAMPLE_FRAMES)]][:, good]
-    heap = np.bincount(sample.ravel(), minlength=4)
-    heap[end:] = 0
-    present = np.flatnonzero(heap)
+    histogram = np.bincount(sample.ravel(), minlength=4)
+    histogram[end:] = 0
+    present = np.flatnonzero(histogram)
     if len(present) < 4:
         return 0, 0
     highest, step = int(present[-1]), int(np.gcd.reduce(np.diff(present)))
-    if heap[highest] >= PLATEAU and heap[highest] > heap[present[-4:-1]].sum():
+    if histogram[highest] >= PLATEAU and histogram[highest] > histogram[present[-4:-1]].sum():
         return int((counts[np.ix_(frames, good)] == highest).sum()), highest
     top = sample.max(axis=0)
-    at, near = (sample == top).sum(axis=0), (sample + np.uint16(3 * step) >= top).sum(axis=0)
-    piled = (at >= TAXEL_PLATEAU) & (2 * at > near) & (top < end)
-    if not piled.any():
+    at_top, near_top = (sample == top).sum(axis=0), (sample + np.uint16(3 * step) >= top).sum(axis=0)
+    clipped = (at_top >= TAXEL_PLATEAU) & (2 * at_top > near_top) & (top < end)
+    if not clipped.any():
         return 0, 0
-    return int((counts[np.ix_(frames, good[piled])] == top[piled]).sum()), int(np.median(top[piled]))
+    return int((counts[np.ix_(frames, good[clipped])] == top[clipped]).sum()), int(np.median(top[clipped]))
 
 
-def _still(part: SelectedFrames) -> BoolArray:
+def _repeats(part: SelectedFrames) -> BoolArray:
     """(n,) True for frames that repeat the one before."""
     counts = part.scan.frames.counts
-    still = np.zeros(len(counts), dtype=bool)
-    for here in chunks(len(counts) - 1, _CHUNK):
-        still[1:][here] = (counts[1:][here] != counts[:-1][here]).mean(axis=(1, 2)) <= _STILL_TAXELS
-    return still
+    repeats = np.zeros(len(counts), dtype=bool)
+    for chunk in chunks(len(counts) - 1, _CHUNK):
+        repeats[1:][chunk] = (counts[1:][chunk] != counts[:-1][chunk]).mean(axis=(1, 2)) <= _REPEAT_TAXELS
+    return repeats
 
 
-def _stillness(part: SelectedFrames, still: BoolArray) -> Iterator[tuple[str, float]]:
-    """Share of used frames that repeat the one before, and of those that do so for long."""
+def _repeat_shares(part: SelectedFrames, repeats: BoolArray) -> Iterator[tuple[str, float]]:
+    """Share of used frames that repeat the one before, and of those in runs of `FROZEN_S`."""
     time_s, used = part.scan.frames.time_s, int(part.used.sum())
     if len(time_s) < 2 or not used:
         return
-    yield "repeated_share", float((still & part.used).sum()) / used
-    edges = np.flatnonzero(np.diff(still, prepend=False, append=False))
+    yield "repeated_share", float((repeats & part.used).sum()) / used
+    edges = np.flatnonzero(np.diff(repeats, prepend=False, append=False))
     frozen = np.zeros(len(time_s), dtype=bool)
     for first, last in edges.reshape(-1, 2).tolist():
         if time_s[last - 1] - time_s[first - 1] >= FROZEN_S:
@@ -132,28 +128,25 @@ def _stillness(part: SelectedFrames, still: BoolArray) -> Iterator[tuple[str, fl
 
 
 def _flicker(part: SelectedFrames) -> Iterator[tuple[str, float]]:
-    """Variance between neighbouring frames over that among all, of their means and of what is left: the smaller.
+    """Variance between neighbouring frames over that among all, of means or of the pattern about them: the smaller.
 
-    Both are 1 in noise. A hand's pressure changes steadily; a bench holds the mean, and a flat phantom leaves nothing
-    else, but what a head feels on it is the same from frame to frame.
+    Both are 1 in noise. A hand's pressure changes steadily; on a bench the mean is constant, but the pattern is too.
     """
-    numbers = np.flatnonzero(part.used)
-    if len(numbers) < LEAST_FRAMES:
+    used = np.flatnonzero(part.used)
+    if len(used) < LEAST_FRAMES:
         return
-    level = part.level_kpa[numbers]
-    first = np.unique(np.linspace(0, len(numbers) - 2, _SAMPLE_FRAMES).astype(int))
-    frames = np.stack([numbers[first], numbers[first + 1]])
+    level = part.level_kpa[used]
+    sample = np.unique(np.linspace(0, len(used) - 2, _SAMPLE_FRAMES).astype(int))
+    frames = np.stack([used[sample], used[sample + 1]])
     pressure = part.scan.element_calibration.linear_kpa(part.scan.frames.counts[frames])
-    one, following = pressure - pressure.mean(axis=(-2, -1), keepdims=True)
-    if level.std() and one.any():
-        pattern = np.mean((following - one) ** 2) / np.mean(one**2)
+    first, second = pressure - pressure.mean(axis=(-2, -1), keepdims=True)
+    if level.std() and first.any():
+        pattern = np.mean((second - first) ** 2) / np.mean(first**2)
         yield "frame_flicker", float(min(np.mean(np.diff(level) ** 2) / np.var(level), pattern)) / 2
 
 
 def _geometry(part: SelectedFrames) -> Iterator[tuple[str, float]]:
-    """How far poses zigzag; length of the array over that by its pitch; distance of the landmarks, and of the head from
-    the xiphoid; a step of the counts over the mean pressure.
-    """
+    """Figures of the poses' zigzag, the array's length over its pitch, the landmarks' distances, and a count's size."""
     head, level, path_mm = part.scan.head, part.level_kpa[part.used], part.fresh.position_mm
     if len(path_mm) >= 3:
         off_mm = path_mm[1:-1] - (path_mm[2:] + path_mm[:-2]) / 2
@@ -175,19 +168,16 @@ def _geometry(part: SelectedFrames) -> Iterator[tuple[str, float]]:
 
 
 def scan_doubts(selection: SelectedFrames, *, pressure_window_kpa: tuple[float, float]) -> tuple[Finding, ...]:
-    """Findings against a scan's readings, clocks, poses and landmarks, of which no map has to be made.
-
-    A scan without a frame that can be used is a `BadDataError`.
-    """
+    """Findings on a scan's readings, clocks, poses and landmarks; `BadDataError` without a frame that can be used."""
     refuse_without_frames([selection], pressure_window_kpa=pressure_window_kpa)
     figures = frame_figures([selection]) | timing_figures([selection.scan]) | exam_figures([selection])
-    given, places = selection.scan.head, selection.poses.position_mm[selection.used]
-    head = HeadShape.of(given.surface_mm, given.pitch_mm)
-    # the largest area that an array can have passed over that went so far along and across its way
-    (side, other), (_, *reach_mm) = head.sides_mm, np.ptp(places @ principal_axes(places), axis=0)
-    felt_mm2 = float(max((side + a) * (other + b) for a, b in (reach_mm, reach_mm[::-1])))
-    at_rest = _at_rest(felt_mm2, head, "the frames cover")
-    still = [_finding("unlike_an_exam", *told) for told in at_rest if figures["frames_used"] >= LEAST_FRAMES]
+    geometry, places = selection.scan.head, selection.poses.position_mm[selection.used]
+    head = HeadShape.of(geometry.surface_mm, geometry.pitch_mm)
+    # the largest area that an array can pass over by moving so far along and across its path
+    (width, length), (_, *reach_mm) = head.sides_mm, np.ptp(places @ principal_axes(places), axis=0)
+    area_mm2 = float(max((width + a) * (length + b) for a, b in (reach_mm, reach_mm[::-1])))
+    enough = figures["frames_used"] >= LEAST_FRAMES
+    still = _findings("unlike_an_exam", _at_rest(area_mm2, head, "the frames cover") if enough else ())
     return (*still, *exam_findings(figures, head))
 
 
@@ -195,21 +185,23 @@ def scan_doubts(selection: SelectedFrames, *, pressure_window_kpa: tuple[float, 
 
 
 def exam_findings(quality: Mapping[str, float], head: HeadShape | None = None) -> tuple[Finding, ...]:
-    """Findings from the figures of scans, or of a map, against what an exam can be; missing figures say nothing."""
-    unlike = [_finding("unlike_an_exam", *told) for told in _unlike(quality, head)]
-    return (*unlike, *(_finding("unusual_scan", *told) for told in _unusual(quality)))
+    """Findings from the figures of scans, or of a map, against what an exam can be; missing figures give none."""
+    return _findings("unlike_an_exam", _unlike(quality, head)) + _findings("unusual_scan", _unusual(quality))
 
 
 def map_findings(tactile_map: TactileMap) -> tuple[Finding, ...]:
-    """The same with those of a map's cells, which hold for a grid from elsewhere as well."""
-    cells = [_finding("unlike_an_exam", *told) for told in _of_cells(tactile_map)]
-    return (*exam_findings(tactile_map.quality, tactile_map.head), *cells)
+    """Findings from a map's figures and cells; those of the cells are for imported grids as well."""
+    cells = _findings("unlike_an_exam", _cell_doubts(tactile_map))
+    return exam_findings(tactile_map.quality, tactile_map.head) + cells
 
 
-def _finding(kind: str, text: str, remedy: str) -> Finding:
-    """A finding whose remedy is the examiner's, or for those who look after the devices."""
-    own = not remedy or remedy.startswith(("press ", "scan "))
-    return finding(kind, text, remedy, remedy if own else "have the sensor, the tracker and the recording checked")
+def _findings(kind: str, doubts: Iterable[tuple[str, str]]) -> tuple[Finding, ...]:
+    """Findings of sentences with remedies, each the examiner's own or for those who look after the devices."""
+    clinical = "have the sensor, the tracker and the recording checked"
+    return tuple(
+        finding(kind, text, remedy, remedy if not remedy or remedy.startswith(("press ", "scan ")) else clinical)
+        for text, remedy in doubts
+    )
 
 
 def _unlike(quality: Mapping[str, float], head: HeadShape | None) -> Iterator[tuple[str, str]]:
@@ -294,7 +286,7 @@ def _unusual(quality: Mapping[str, float]) -> Iterator[tuple[str, str]]:
         yield f"the head came no nearer to the xiphoid than {reach:.0f} mm: places on the breast may be wrong", in_base
 
 
-def _of_cells(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
+def _cell_doubts(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
     """Sentence and remedy for a map's area and for cells that no tissue explains."""
     covered, cell = tactile_map.covered, tactile_map.recipe.cell_mm
     if not covered.any():
@@ -319,13 +311,13 @@ def _of_cells(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
         )
         yield text, "check whether the readings fall where pressure rises, and leave out what lies off the tissue"
     count = tactile_map.count[covered]
-    yield from _of_values(tactile_map.mean[covered][count >= FEW_READINGS * float(tactile_map.counts_known)])
+    yield from _value_doubts(tactile_map.mean[covered][count >= FEW_READINGS * float(tactile_map.counts_known)])
 
 
 def _extremes(tactile_map: TactileMap) -> tuple[float, float]:
-    """How far the map goes below and above its median, over it, in means of covered squares of `DIP_MM`.
+    """Depth below and height above the map's median, in medians, of means over covered squares of `DIP_MM`.
 
-    A slope has no dips: what lies below the median has to lie below a trend of second degree, too.
+    Both also about a trend of second degree: a slope has no dips.
     """
     side = min(max(1, round(DIP_MM / tactile_map.recipe.cell_mm)), *tactile_map.mean.shape)
 
@@ -333,14 +325,14 @@ def _extremes(tactile_map: TactileMap) -> tuple[float, float]:
         total = np.pad(values.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
         return np.asarray(total[side:, side:] - total[:-side, side:] - total[side:, :-side] + total[:-side, :-side])
 
-    held = sums(tactile_map.covered.astype(np.float64))
-    whole = held > 0.9 * side**2
+    covered = sums(tactile_map.covered.astype(np.float64))
+    full = covered > 0.9 * side**2
     level = float(np.median(tactile_map.mean[tactile_map.covered]))
-    if not whole.any() or not level > 0:
+    if not full.any() or not level > 0:
         return 0.0, 0.0
     relative = np.clip(np.where(tactile_map.covered, tactile_map.mean / level, 0.0), -_MOST_LEVELS, _MOST_LEVELS)
-    means = sums(relative)[whole] / held[whole]
-    y, x = np.nonzero(whole) / np.max(whole.shape, initial=1)
+    means = sums(relative)[full] / covered[full]
+    y, x = np.nonzero(full) / np.max(full.shape, initial=1)
     trend = np.column_stack([np.ones_like(x), x, y, x * x, x * y, y * y])
     flat = means - trend @ np.linalg.lstsq(trend, means)[0]
     both = np.stack([means - 1.0, flat - np.median(flat)])
@@ -355,8 +347,8 @@ def _at_rest(area_mm2: float, head: HeadShape, covers: str) -> Iterator[tuple[st
         yield text, "scan with strokes side by side; if it did move, check the poses and their unit"
 
 
-def _of_values(values: FloatArray) -> Iterator[tuple[str, str]]:
-    """Values far outside the rest, and a plateau at the highest."""
+def _value_doubts(values: FloatArray) -> Iterator[tuple[str, str]]:
+    """Sentence and remedy for values far outside the rest, and for a plateau at the highest."""
     if len(values) < 2:
         return
     ordered = np.sort(values)
@@ -370,9 +362,9 @@ def _of_values(values: FloatArray) -> Iterator[tuple[str, str]]:
         number = widest + 1 if below else len(ordered) - widest - 1
         ends = ordered[: widest + 1] if below else ordered[widest + 1 :]
         rest = ordered[widest + 1 :] if below else ordered[: widest + 1]
-        told = f"{ends[0]:.4g}" if ends[0] == ends[-1] else f"{ends[0]:.4g} to {ends[-1]:.4g}"
+        values_there = f"{ends[0]:.4g}" if ends[0] == ends[-1] else f"{ends[0]:.4g} to {ends[-1]:.4g}"
         text = (
-            f"{number} of {len(ordered)} cells lie far outside the rest ({told}; the others {rest[0]:.4g} to "
+            f"{number} of {len(ordered)} cells lie far outside the rest ({values_there}; the others {rest[0]:.4g} to "
             f"{rest[-1]:.4g}): dead lines, or values that stand for none"
         )
         yield text, "mark them as missing"
@@ -386,23 +378,19 @@ def _of_values(values: FloatArray) -> Iterator[tuple[str, str]]:
 
 
 BLOCKING: Final = frozenset({"unlike_an_exam", "frames_contradict", "poses_jump"})
-"""Kinds of findings under which a map without a lump does not say that there is none.
-
-Rotations that seem to be of another convention are none of them: 2 of 60 right exams of our own have them.
-"""
-SURE_ODDS: Final = 1e4
-"""From these odds on another arrangement than the one stated is refused, and stands against "no lump"."""
+"""Kinds of findings under which a map without a lump does not say that there is none (record 0137)."""
+SURE_ODDS: Final = 1e4  #: Odds from which another arrangement is refused, and stands against "no lump".
 
 
 def against_no_lump(tactile_map: TactileMap) -> list[Finding]:
-    """Findings of a map, its own and those it was made with, that stand against "there is no lump"."""
+    """Findings from a map's figures and cells, and those it was made with, that stand against "there is no lump"."""
     sure = tactile_map.quality.get("arrangement_log_odds", 0.0) >= log(SURE_ODDS)
     kinds = BLOCKING | {"wrong_arrangement", "late_poses"} if sure else BLOCKING
     return [one for one in (*map_findings(tactile_map), *tactile_map.findings) if one.kind in kinds]
 
 
 def with_cause(error: BadDataError, findings: Iterable[Finding]) -> BadDataError:
-    """The error of a map that cannot be made, with what is unlike an exam in its scans as the likelier cause."""
+    """Error of a map that cannot be made, with the first finding unlike an exam in its scans as the likely cause."""
     causes = [one for one in findings if one.kind in ("poses_jump", "unlike_an_exam")]
     if not causes:
         return error

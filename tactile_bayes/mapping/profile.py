@@ -1,4 +1,4 @@
-"""The head's own profile, how evenly it presses, and how well its places are known."""
+"""Profile of the head's pressure beside lumps, its change over the scan, and the tracker position error."""
 
 from __future__ import annotations
 
@@ -13,10 +13,8 @@ from tactile_bayes.mapping.convention import directions_along
 from tactile_bayes.mapping.select import SelectedFrames, chunks
 from tactile_bayes.presets import HEAD_PROFILE, POSE_NOISE
 
-# --- Reproducible random choice of frames by a hash of their levels, independent of order and portions.
-#
-# A statistic that needs no more than some thousand frames is taken from those with the smallest marks. The choice
-# depends on the set of frames alone.
+# --- Random choice of frames by the smallest hashes of their levels: it depends on the set of frames alone, not on
+# their order or portions (record 0085).
 
 NO_LIMIT = np.uint64(2**64 - 1)
 _ROUNDS = ((np.uint64(30), np.uint64(0xBF58476D1CE4E5B9)), (np.uint64(27), np.uint64(0x94D049BB133111EB)))
@@ -24,9 +22,9 @@ _LAST_SHIFT = np.uint64(31)
 
 
 def frame_marks(level_kpa: FloatArray) -> NDArray[np.uint64]:
-    """(f,) hashes of the frames' exact mean levels; equal levels have equal hashes, whatever computes them.
+    """(f,) hashes of the frames' exact mean levels, by SplitMix64's mixing function.
 
-    The mixing function of SplitMix64 (Steele, Lea & Flood 2014, Fast splittable pseudorandom number generators).
+    Steele, Lea & Flood (2014), Fast splittable pseudorandom number generators.
     """
     mark = np.ascontiguousarray(level_kpa).view(np.uint64)
     for shift, factor in _ROUNDS:
@@ -35,10 +33,7 @@ def frame_marks(level_kpa: FloatArray) -> NDArray[np.uint64]:
 
 
 def marks_limit(marks: NDArray[np.uint64], most: int) -> np.uint64:
-    """Limit that at most `most` marks lie below; equal marks are chosen together or not at all.
-
-    The limit of a growing set can be found from the marks under the limits before, of which the least counts.
-    """
+    """Limit below which at most `most` marks lie; a growing set needs only the marks below its earlier limits."""
     if len(marks) <= most:
         return NO_LIMIT
     return np.uint64(np.partition(marks, most)[most])
@@ -49,24 +44,23 @@ def marks_limit(marks: NDArray[np.uint64], most: int) -> np.uint64:
 # A curved head on a thin soft layer presses hardest in its middle, on a deep one at its rim (Wellman & Howe 1999,
 # Eq 1: the width of the homogeneous profile goes with the thickness of the tissue).
 
-# Frames that are read, chosen by their marks; those of a scan of 10 s at 200 Hz are read all.
-MOST_FRAMES = 2048
+MOST_FRAMES = 2048  #: Frames that are read, chosen by their marks: all of a scan of 10 s at 200 Hz.
 _CHUNK = 128
 _STEP = 2.0**-32  #: The figures are means of whole multiples of this.
-# A frame is called lump-free when what is left of it beside a smooth profile is within this factor of the smoothest
-# tenth's, and there must be this many of them.
+# A frame is lump-free when its residual about a smooth profile is within this factor of the tenth percentile; there
+# must be this many of them.
 SMOOTH_FACTOR = 1.1
 LEAST_FRAMES = 50
-# Orders across and along the head, those of `HEAD_PROFILE` first. Odd and mixed ones take up how the head was tilted.
-# The fourth across hangs on the head's very rim: two simulations with one body differ in it by half its range.
+# Orders across and along the head, those of `HEAD_PROFILE` first. Odd and mixed ones absorb the head's tilt. The fourth
+# across depends on the head's very rim: two simulations with one body differ in it by half its range.
 _ORDERS = ((2, 0), (0, 2), (0, 4), (0, 0), (4, 0), (1, 0), (0, 1), (1, 1), (2, 2))
-SKEW = _ORDERS.index((1, 0))  #: Which coefficient is the first order across the head.
+SKEW = _ORDERS.index((1, 0))  #: Index of the coefficient of first order across the head.
 _HIGHEST = 4
 _COLUMNS = len(_ORDERS) + 1
 
 
 def head_profile_figures(selections: Sequence[SelectedFrames]) -> dict[str, float]:
-    """The map's figures `HEAD_PROFILE`, and ``head_profile_frames``; none where too few frames are free of a lump."""
+    """The map's figures `HEAD_PROFILE`, and ``head_profile_frames``; none where too few frames are lump-free."""
     marked = [_marked(part) for part in selections]
     limit = marks_limit(np.concatenate([marks for _, marks in marked]), MOST_FRAMES)
     pairs = zip(selections, marked, strict=True)
@@ -74,28 +68,24 @@ def head_profile_figures(selections: Sequence[SelectedFrames]) -> dict[str, floa
 
 
 def _marked(part: SelectedFrames) -> tuple[IndexArray, NDArray[np.uint64]]:
-    """Frames of a scan that can be read, in the order of time, and their marks."""
-    frames = np.flatnonzero(part.used & _whole(part.level_kpa, part.valid_share, part.good_taxels))
+    """Complete used frames of a scan, in the order of time, and their marks."""
+    frames = np.flatnonzero(part.used & _complete(part.level_kpa, part.valid_share, part.good_taxels))
     return frames, frame_marks(part.level_kpa[frames])
 
 
-def _whole(level_kpa: FloatArray, valid_share: FloatArray, good: BoolArray) -> BoolArray:
-    """Which frames can be read: those with all good taxels valid and a mean above 0."""
+def _complete(level_kpa: FloatArray, valid_share: FloatArray, good: BoolArray) -> BoolArray:
+    """(n,) mask of the frames with all good taxels valid and a mean above 0."""
     return np.asarray((valid_share == np.count_nonzero(good) / good.size) & (level_kpa > 0))
 
 
 def profile_figures(rows: FloatArray) -> dict[str, float]:
-    """Figures from the (f, 10) rows of `ProfileReader`, in any order: the mean over the lump-free frames.
-
-    A lump, or the edge of a rib, is no smooth profile: the residual of a frame shows it, also where most frames feel
-    one. Rows of NaN, from an array without a profile, give no figures.
-    """
+    """Means over the lump-free frames, from the (f, 10) rows of `ProfileReader` in any order; none for rows of NaN."""
     if len(rows) < LEAST_FRAMES:
         return {}
     smooth = rows[_lump_free(rows), : len(HEAD_PROFILE)]
     if len(smooth) < LEAST_FRAMES:
         return {}
-    # Sums of whole steps have no rounding: neither the order of the frames nor a matrix product leaves a trace.
+    # sums of whole steps have the same bits in any order
     mean = np.ones(len(smooth)) @ np.rint(smooth / _STEP) * (_STEP / len(smooth))
     return {
         **{name: float(value) for name, value in zip(HEAD_PROFILE, mean, strict=True)},
@@ -104,16 +94,15 @@ def profile_figures(rows: FloatArray) -> dict[str, float]:
 
 
 def _lump_free(rows: FloatArray) -> BoolArray:
-    """(f,) which of at least two frames feel no lump, by the residuals of their smooth profiles."""
+    """(f,) mask of the frames without a lump or a rib's edge, by the residuals about their smooth profiles."""
     return np.asarray(rows[:, -1] <= SMOOTH_FACTOR * np.quantile(rows[:, -1], 0.1))
 
 
 def _read(part: SelectedFrames, frames: IndexArray) -> FloatArray:
-    """(f, 10) rows of frames, read in portions that fit the processor's cache."""
+    """(f, 10) rows of frames, read in chunks that fit the processor's cache."""
     reader, rows = ProfileReader.of(part.good_taxels), np.empty((len(frames), _COLUMNS))
-    for chosen in chunks(len(frames), _CHUNK):
-        some = frames[chosen]
-        rows[chosen] = reader.read(part.pressure_kpa(some)[0], part.level_kpa[some])
+    for chunk in chunks(len(frames), _CHUNK):
+        rows[chunk] = reader.read(part.pressure_kpa(frames[chunk])[0], part.level_kpa[frames[chunk]])
     return rows
 
 
@@ -127,34 +116,34 @@ class GrowingProfile:
     def add(self, pressure_kpa: FloatArray, level_kpa: FloatArray, valid_share: FloatArray) -> None:
         """Add frames: (f, k) pressures of the used taxels, (f,) means in kPa, (f,) valid shares of all taxels."""
         marks = frame_marks(level_kpa)
-        chosen = (marks < self._limit) & _whole(level_kpa, valid_share, self._good)
+        chosen = (marks < self._limit) & _complete(level_kpa, valid_share, self._good)
         self._marks = np.concatenate([self._marks, marks[chosen]])
         self._rows = np.concatenate([self._rows, self._reader.read(pressure_kpa[chosen], level_kpa[chosen])])
         if len(self._marks) > 2 * MOST_FRAMES:
             self._thin_out()
 
     def figures(self) -> dict[str, float]:
-        """As `profile_figures`."""
+        """`profile_figures` of the frames so far."""
         self._thin_out()
         return profile_figures(self._rows)
 
     def _thin_out(self) -> None:
         self._limit = min(self._limit, marks_limit(self._marks, MOST_FRAMES))
-        kept = self._marks < self._limit
-        self._marks, self._rows = self._marks[kept], self._rows[kept]
+        below = self._marks < self._limit
+        self._marks, self._rows = self._marks[below], self._rows[below]
 
 
 class ProfileReader(Record, eq=False):
-    """Fits smooth pressure profiles to frames."""
+    """Least-squares fit of smooth pressure profiles to frames."""
 
     solve: FloatArray
-    """(9, taxels) array: Takes readings to coefficients of Legendre polynomials at the good taxels, by least squares;
-    no taxel where too few rows or columns have one to tell the polynomials apart."""
+    """(9, taxels) array: Matrix from readings at the good taxels to coefficients of Legendre polynomials; no taxel
+    where too few rows or columns have a good one to distinguish the polynomials."""
     gram: FloatArray  #: (9, 9) array: Inner products of the polynomials.
 
     @classmethod
     def of(cls, good: BoolArray) -> ProfileReader:
-        """Prepare for the good taxels of an array, True in (rows, columns)."""
+        """Reader for the good taxels of an array, True in (rows, columns)."""
         # at the taxels' centres, the array's ends at -1 and 1
         across, along = (_legendre((2.0 * np.arange(n) + 1.0) / n - 1.0) for n in good.shape)
         terms = np.stack([np.outer(across[i], along[j])[good] for i, j in _ORDERS], axis=1)
@@ -163,24 +152,22 @@ class ProfileReader(Record, eq=False):
         return cls(np.ascontiguousarray(np.linalg.pinv(terms)), terms.T @ terms)
 
     def read(self, pressure_kpa: FloatArray, level_kpa: FloatArray) -> FloatArray:
-        """(f, 10) coefficients of frames, those of `HEAD_PROFILE` first, and residuals, all over the frames' means.
+        """(f, 10) coefficients of frames, those of `HEAD_PROFILE` first, and RMS residuals, all over the frames' means.
 
-        From (f, taxels) pressures, all valid, and (f,) means above 0.
-
-        The residual is the root mean square of what the nine terms leave. NaN where the array has too few rows or
-        columns. A frame's bits do not depend on the frames read with it.
+        From (f, taxels) pressures, all valid, and (f,) means above 0; NaN where the array has too few rows or columns.
+        A frame's bits do not depend on the frames read with it.
         """
         terms = len(_ORDERS)
         if not self.solve.size:
             return np.full((len(pressure_kpa), terms + 1), np.nan)
-        # One matrix times vector per frame: a product of all frames would be rounded by how many there are.
+        # one product of matrix and vector per frame: the rounding of a product of all depends on their number
         coefficients = np.matmul(self.solve, pressure_kpa[:, :, None])[:, :, 0]
-        # The residual's square by Pythagoras: the residual itself would cost as much as the map.
+        # the residual's square by Pythagoras: the residual itself would cost as much as the map
         fitted = np.matmul(self.gram, coefficients[:, :, None])[:, :, 0]
         square = np.einsum("ft,ft->f", pressure_kpa, pressure_kpa) - np.einsum("fi,fi->f", coefficients, fitted)
-        left = np.sqrt(np.maximum(square, 0.0) / self.solve.shape[1])
+        residual = np.sqrt(np.maximum(square, 0.0) / self.solve.shape[1])
         rows = np.empty((len(coefficients), terms + 1))
-        rows[:, :-1], rows[:, -1] = coefficients, left
+        rows[:, :-1], rows[:, -1] = coefficients, residual
         rows /= level_kpa[:, None]
         return rows
 
@@ -193,36 +180,32 @@ def _legendre(x: FloatArray) -> list[FloatArray]:
     return values
 
 
-# --- Figures of how even a scan's surroundings were: the head's profile from place to place and stroke to stroke.
+# --- Figures of evenness: change of the head's profile with place and direction of the stroke (record 0103).
 #
-# Where no lump is felt, the profile of the head depends on the layers below it
-# (`HEAD_PROFILE`). A profile that changes with the head's place means layers whose depth
-# changes; one that is skewed along the stroke, to the other side in strokes the other way, means that the skin is
-# dragged along. How the head's normal turns as it moves is the curvature of the skin, to which an examiner keeps
-# the head square.
+# Away from lumps the profile depends on the layers below the head (`HEAD_PROFILE`): it changes with the place where
+# their depth does, and is skewed along the stroke where the skin is dragged along. An examiner keeps the head square to
+# the skin, so its normal turns by the skin's curvature.
 
 SPAN_MM = 30.0  #: Distance over which a change of the profile is stated.
-# Neighbouring frames share errors: standard errors come from leaving out every tenth stretch of this many seconds.
+# Standard errors come from leaving out every tenth stretch of this many seconds: neighbouring frames share errors.
 _STRETCH_S = 0.5
 _GROUPS = 10
-_LEAST_SPREAD_MM = 3.0  #: A direction that the head moved in by less than this (SD, mm) tells no change.
+_LEAST_SPREAD_MM = 3.0  #: Least motion (SD, mm) in a direction for a change along it.
 # Columns of the regression.
-_X, _Y, _WAY = 1, 2, 3
+_X, _Y, _DIRECTION = 1, 2, 3
 
 
 def evenness_figures(selections: Sequence[SelectedFrames], plane: Plane) -> dict[str, float]:
-    """Figures of the map's evenness, with standard errors where they come from a regression.
+    """Figures of the map's evenness; those of the profile with ``_sd``, and missing for few lump-free frames.
 
-    ``skin_curvature_per_m`` is by how much the head's normal turned outwards as it moved outwards, rad per m; above 0
-    on convex skin. ``profile_change`` and its ``_sd`` are the change of `head_profile_x2` over `SPAN_MM` in the
-    direction in which it changes most. ``stroke_skew`` and its ``_sd`` are the first-order coefficient of the profile
-    along the strokes, half the difference between strokes towards +x and towards -x; missing where all strokes went one
-    way. The last four are missing where too few frames are free of a lump or the head hardly moved.
+    ``skin_curvature_per_m`` is the turn of the head's normal over its motion, rad per m, above 0 on convex skin;
+    ``profile_change`` the largest change of `head_profile_x2` over `SPAN_MM`; ``stroke_skew`` half the difference of
+    the first-order coefficient between strokes towards +x and -x, missing where all went one way.
     """
     parts = [part for part in selections if part.used.any()]
     motions = [motion(part, plane) for part in parts]
     profiles = [_profiles(part, *motion) for part, motion in zip(parts, motions, strict=True)]
-    rows, designs, groups = (np.concatenate(some) for some in zip(*profiles, strict=True))
+    rows, designs, groups = (np.concatenate(arrays) for arrays in zip(*profiles, strict=True))
     place = np.concatenate([place_mm[:, :2] - place_mm[:, :2].mean(axis=0) for place_mm, _ in motions])
     normal = np.concatenate([axes[:, :2, 2] - axes[:, :2, 2].mean(axis=0) for _, axes in motions])
     figures, moved = {}, float(np.sum(place**2))
@@ -242,12 +225,13 @@ def motion(part: SelectedFrames, plane: Plane) -> tuple[FloatArray, FloatArray]:
 def _profiles(
     part: SelectedFrames, place_mm: FloatArray, axes: FloatArray
 ) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
-    """(f, 10) profiles of the readable frames, the (f, 7) terms of their regression, and (f,) stretches of time."""
+    """(f, 10) profiles of complete frames, the (f, 7) terms of their regression, and (f,) groups for the jackknife."""
     frames, marks = _marked(part)
     chosen = frames[marks < marks_limit(marks, MOST_FRAMES)]
-    among = np.searchsorted(np.flatnonzero(part.used), chosen)
-    way, level = directions_along(place_mm[:, 0])[among, None], np.log(part.level_kpa[chosen])[:, None]
-    design = np.hstack([np.ones_like(way), place_mm[among, :2] / SPAN_MM, way, level, axes[among, 2, :2]])
+    among_used = np.searchsorted(np.flatnonzero(part.used), chosen)
+    direction, level = directions_along(place_mm[:, 0])[among_used, None], np.log(part.level_kpa[chosen])[:, None]
+    place = place_mm[among_used, :2] / SPAN_MM
+    design = np.hstack([np.ones_like(direction), place, direction, level, axes[among_used, 2, :2]])
     stretch = np.floor(part.scan.frames.time_s[chosen] / _STRETCH_S).astype(np.int64) % _GROUPS
     return _read(part, chosen), design, stretch
 
@@ -263,19 +247,17 @@ def _profile_changes(rows: FloatArray, design: FloatArray, group: NDArray[np.int
     design = design - design.mean(axis=0) * (np.arange(design.shape[1]) > 0)
     if min(np.std(design[:, _X]), np.std(design[:, _Y])) * SPAN_MM < _LEAST_SPREAD_MM:
         return {}
-    both_ways = np.std(design[:, _WAY]) > 0
-    kept = np.flatnonzero(np.std(design, axis=0) > 0)
-    columns = np.concatenate([[0], kept])
+    columns = [0, *np.flatnonzero(np.std(design, axis=0) > 0).tolist()]
     coefficients, errors = _regression(design[:, columns], rows[:, :-1], group)
-    at = {int(column): i for i, column in enumerate(columns)}
-    slope, slope_error = (values[[at[_X], at[_Y]], 0] for values in (coefficients, errors))
+    slope, slope_error = (values[[columns.index(_X), columns.index(_Y)], 0] for values in (coefficients, errors))
     change = float(np.hypot(*slope))
     figures = {
         "profile_change": change,
         "profile_change_sd": float(np.sqrt(np.sum((slope * slope_error) ** 2)) / change) if change > 0 else 0.0,
     }
-    if both_ways:
-        figures |= {"stroke_skew": float(coefficients[at[_WAY], SKEW]), "stroke_skew_sd": float(errors[at[_WAY], SKEW])}
+    if _DIRECTION in columns:
+        skew = columns.index(_DIRECTION), SKEW
+        figures |= {"stroke_skew": float(coefficients[skew]), "stroke_skew_sd": float(errors[skew])}
     return figures
 
 
@@ -283,39 +265,38 @@ def _regression(design: FloatArray, rows: FloatArray, group: NDArray[np.int64]) 
     """(c, k) coefficients of (n, k) rows on an (n, c) design, and their standard errors by a grouped jackknife."""
     normal = np.stack([design[group == g].T @ design[group == g] for g in range(_GROUPS)])
     right = np.stack([design[group == g].T @ rows[group == g] for g in range(_GROUPS)])
-    used = np.flatnonzero(normal[:, 0, 0] > 0)
-    whole = _solved(normal.sum(axis=0), right.sum(axis=0))
-    without = np.stack([_solved(normal.sum(axis=0) - normal[g], right.sum(axis=0) - right[g]) for g in used])
-    error = np.sqrt((len(used) - 1) / len(used) * np.sum((without - without.mean(axis=0)) ** 2, axis=0))
-    return whole, np.asarray(error)
+    filled = np.flatnonzero(normal[:, 0, 0] > 0)
+    coefficients = _least_squares(normal.sum(axis=0), right.sum(axis=0))
+    left_out = np.stack([_least_squares(normal.sum(axis=0) - normal[g], right.sum(axis=0) - right[g]) for g in filled])
+    error = np.sqrt((len(filled) - 1) / len(filled) * np.sum((left_out - left_out.mean(axis=0)) ** 2, axis=0))
+    return coefficients, np.asarray(error)
 
 
-def _solved(normal: FloatArray, right: FloatArray) -> FloatArray:
+def _least_squares(normal: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.lstsq(normal, right, rcond=1e-10)[0])
 
 
 # --- Tracker position error from frame to frame, estimated from the poses; it blurs the map.
 #
-# A bump of width sigma is mapped with sigma^2 + s^2, s the SD of a frame's place along that axis. Only errors that
-# neighbouring poses do not share can be told from the head's motion, and only those are in the figures.
+# A bump of width sigma is mapped with sigma^2 + s^2, s the SD of a frame's place along that axis. Errors that
+# neighbouring poses share cannot be distinguished from the head's motion and are not in the figures.
 
 LEAST_POSES = 50
-MOST_MM = 1.5
-"""Poses further than this from the path through their neighbours are no tracker's noise: the head itself jumps."""
+MOST_MM = 1.5  #: Largest SD that is a tracker's noise: above it the head itself jumps.
 KEPT = 0.9  #: Share of the departures that count, the smallest: at turning points the head itself leaves the path.
 # A normal distribution's mean square within its inner nine tenths, over its variance: 1 - 2 c phi(c) / 0.9.
 _INNER_SQUARE = 0.6230155
 
 
 def pose_noise_figures(selections: Sequence[SelectedFrames], plane: Plane, *, cell_mm: float) -> dict[str, float]:
-    """The figures `POSE_NOISE` of the frames used; empty where the tracker gave too few poses.
+    """Figures `POSE_NOISE` of the used frames, by the poses' departures from cubics through their four neighbours.
 
-    The noise is what a pose departs by from the cubic through the two poses before and the two after it.
+    Empty where the tracker gave too few poses, or the head jumps.
     """
-    scans = [one for part in selections if (one := _place_noise(part, plane)) is not None]
+    scans = [noise for part in selections if (noise := _place_noise(part, plane)) is not None]
     if not scans:
         return {}
-    variances, frames, independent = (np.array(some) for some in zip(*scans, strict=True))
+    variances, frames, independent = (np.array(values) for values in zip(*scans, strict=True))
     variance = np.average(variances, axis=0, weights=frames)
     if variance.max() > MOST_MM**2:
         return {}
@@ -326,10 +307,9 @@ def pose_noise_figures(selections: Sequence[SelectedFrames], plane: Plane, *, ce
 
 
 def _place_noise(part: SelectedFrames, plane: Plane) -> tuple[FloatArray, int, float] | None:
-    """(2,) variance of a used frame's place along the plane's axes, mm^2, the number of used frames, and how many with
-    errors of their own would have a mean known as well: those between two poses share theirs.
+    """(2,) variance of a used frame's place along the plane's axes, mm^2, and numbers of used and of effective frames.
 
-    None where a scan has too few poses.
+    Frames between two poses share their errors. None where a scan has too few poses.
     """
     frames_s = part.scan.frames.time_s[part.used]
     poses = part.fresh
@@ -345,7 +325,7 @@ def _place_noise(part: SelectedFrames, plane: Plane) -> tuple[FloatArray, int, f
 
 
 def _departures(time_s: FloatArray, place_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(n - 4, 2) distances of positions from a cubic through their neighbours, and their variance over a position's."""
+    """(n - 4, 2) departures of positions from a cubic through four neighbours, and their variance over a position's."""
     n = len(time_s) - 4
     near = [time_s[k : k + n] - time_s[2 : 2 + n] for k in (0, 1, 3, 4)]
     departure, variance = place_mm[2 : 2 + n].copy(), np.ones(n)
@@ -360,13 +340,13 @@ def _departures(time_s: FloatArray, place_mm: FloatArray) -> tuple[FloatArray, F
 
 
 def _interpolation(frames_s: FloatArray, poses_s: FloatArray) -> tuple[float, float]:
-    """Mean variance of linear interpolation between independent poses at the frames' times, over a pose's.
+    """Mean variance of linear interpolation between independent poses at the frames, over a pose's.
 
-    And how many independent frames of that variance have a mean of the same variance as these have.
+    And the number of independent frames of that variance whose mean has the variance of these frames' mean.
     """
     place = np.interp(frames_s, poses_s, np.arange(len(poses_s)))
     before = np.minimum(place.astype(np.int64), len(poses_s) - 2)
     share = place - before
     factor = float(np.mean(share**2 + (1.0 - share) ** 2))
-    taken = np.bincount(before, 1.0 - share, len(poses_s)) + np.bincount(before + 1, share, len(poses_s))
-    return factor, float(len(frames_s) ** 2 * factor / np.sum(taken**2))
+    weight = np.bincount(before, 1.0 - share, len(poses_s)) + np.bincount(before + 1, share, len(poses_s))
+    return factor, float(len(frames_s) ** 2 * factor / np.sum(weight**2))

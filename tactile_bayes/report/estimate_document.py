@@ -384,7 +384,7 @@ def _mass_reports(
                 reason=why if mass.estimate.size is None else "",
                 reason_code=cast("reports.ReasonCode", mass.estimate.code),
                 advice=mass.estimate.advice,
-                position=None if place is None else place.told(probability),
+                position=None if place is None else place.as_position(probability),
             )
         )
     return tuple(mass_reports)
@@ -471,7 +471,7 @@ def estimate_report(
         supposing=suppositions(size, quantities.get("max_size_mm")),
         centre_mm=point("centre_mm"),
         centre_patient_mm=point("centre_patient_mm"),
-        position=None if place is None else place.told(probability),
+        position=None if place is None else place.as_position(probability),
         detected_probability=estimate.probability,
         variance_share=None if size is None else dict(size.variance_share),
         scene=None if estimate.scene is None else rounded(scene_report(estimate.scene), 6),

@@ -110,7 +110,7 @@ def test_so_near_that_the_direction_is_unknown_it_is_behind_the_nipple():
     near = position(70, "left", up_mm=3.0, left_mm=0.0)
     assert near.hours_between(0.95) is None
     assert "behind the nipple" in near.text()
-    assert near.told(0.95).clock_hours.median is None
+    assert near.as_position(0.95).clock_hours.median is None
     assert near.distance_between(0.95)[0] == 0.0
 
 
@@ -118,14 +118,14 @@ def test_so_near_that_the_direction_is_unknown_it_is_behind_the_nipple():
 def test_what_the_json_says_of_a_place_gives_the_place_back(place):
     up_mm, left_mm = place
     found = position(25.0, "left", up_mm=up_mm, left_mm=left_mm)
-    again = ClockPosition.of(found.told(0.9))
+    again = ClockPosition.of(found.as_position(0.9))
     assert again is not None
     assert again.text() == found.text()
     for name in ("distance_mm", "distance_sd_mm", "angle_deg", "angle_sd_deg"):
         assert getattr(again, name) == pytest.approx(getattr(found, name), rel=1e-4)
     assert ClockPosition.of(None) is None
     behind = position(25.0, "left", up_mm=1.0, left_mm=1.0)
-    assert ClockPosition.of(behind.told(0.9)) is None  # no direction is kept
+    assert ClockPosition.of(behind.as_position(0.9)) is None  # no direction is kept
 
 
 def covered(found: ClockPosition, touch_sd_mm: float, rng: np.random.Generator) -> tuple[float, float]:
