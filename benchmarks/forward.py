@@ -34,7 +34,7 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from benchmarks.measure import environment
-from tactile_bayes.forward.contact import ContactStiffness, Head, solve_contact
+from tactile_bayes.forward.contact import ContactStiffness, HeadSection, solve_contact
 from tactile_bayes.forward.mesh import Mesh, body_mesh
 from tactile_bayes.forward.plane import (
     build_line,
@@ -174,8 +174,8 @@ class PlainBody:
 
     def press(self, x_c: float, *, total: float) -> int:
         """Press the head at one position; the number of factorisations it took."""
-        under = np.flatnonzero(np.abs(self.x - x_c) < Head().half_width_mm)
-        profile = Head().profile_mm(self.x[under] - x_c)
+        under = np.flatnonzero(np.abs(self.x - x_c) < HeadSection().half_width_mm)
+        profile = HeadSection().profile_mm(self.x[under] - x_c)
         touching = np.ones(len(under), dtype=bool)
         for count in range(1, 30):
             vertical = 2 * self.skin[under[touching]] + 1
@@ -246,7 +246,7 @@ class ReusedBody:
 
     def press(self, x_c: float) -> np.ndarray[Any, np.dtype[np.float64]]:
         """The frame at one position."""
-        profile = Head().cell_profile_mm(REUSED_CELL_MM)
+        profile = HeadSection().cell_profile_mm(REUSED_CELL_MM)
         first = round((x_c - 12.0 + 72.0) / REUSED_CELL_MM)
         mine = self.average[first : first + len(profile)]
         load = np.zeros((self.unknowns, len(profile)))

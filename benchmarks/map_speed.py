@@ -25,7 +25,7 @@ import numpy as np
 from benchmarks.last import Comparison
 from benchmarks.map_peers import BINCOUNT_FRAMES, BOOST, BOOST_FRAMES, Job, bincount
 from tactile_bayes.forward.scene import Head, Scene, Strokes
-from tactile_bayes.forward.simulate import head_positions
+from tactile_bayes.forward.simulate import head_poses
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.cells import (
@@ -61,7 +61,7 @@ class Frames:
 
     def poses(self, start: int, stop: int) -> FramePoses:
         """Poses of frames `start` to `stop`: the strokes of 7 s again and again."""
-        rotation, position = head_positions(self.scene, np.arange(start, stop) / RATE_HZ % self.scene.duration_s)
+        rotation, position = head_poses(self.scene, np.arange(start, stop) / RATE_HZ % self.scene.duration_s)
         return FramePoses(position, rotation, np.ones(stop - start, dtype=bool))
 
     def counts(self, start: int, stop: int) -> Any:

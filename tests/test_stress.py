@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_bayes.forward.scene import Scene, Strokes, head_positions, level_kpa
+from tactile_bayes.forward.scene import Scene, Strokes, head_poses, level_kpa
 from tactile_bayes.forward.simulate import frames_at_poses
 from tactile_bayes.forward.tissue import Layers, SceneBody, SolidLump
 from validation.stress import CONTROL, STRESSES, jobs
@@ -31,7 +31,7 @@ def fat(slope: float) -> Physics:
 @pytest.fixture(scope="module")
 def plain() -> np.ndarray:
     level = level_kpa(SCENE.background, TIMES)
-    return frames_at_poses(SCENE, *head_positions(SCENE, TIMES), mean_kpa=level)[0]
+    return frames_at_poses(SCENE, *head_poses(SCENE, TIMES), mean_kpa=level)[0]
 
 
 @pytest.mark.long_repeats

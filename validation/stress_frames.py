@@ -31,7 +31,7 @@ import numpy as np
 from tactile_bayes.declarations import replace
 from tactile_bayes.forward.axisymmetric import skin_flexibility, taxel_compliance
 from tactile_bayes.forward.contact import Contact, ContactStiffness
-from tactile_bayes.forward.scene import Scene, frame_times, head_positions, level_kpa, record, rotation_from_vector
+from tactile_bayes.forward.scene import Scene, frame_times, head_poses, level_kpa, record, rotation_from_vector
 from tactile_bayes.forward.simulate import (
     SkinPerturbation,
     SolidHead,
@@ -93,7 +93,7 @@ def stressed_scan(scene: Scene, physics: Physics, *, empty: bool = False) -> Sca
     pressure, depth = stressed_frames(scene, time, physics, empty=empty)
     done = record(
         scene,
-        felt=lambda at: pressure[np.searchsorted(time, at)],
+        pressure=lambda at: pressure[np.searchsorted(time, at)],
         depth=lambda at: np.interp(at, time, depth),
         truth={"lumps": []},
         rng=np.random.default_rng(scene.seed),
@@ -123,7 +123,7 @@ def stressed_frames(
     scene: Scene, time_s: FloatArray, physics: Physics, *, empty: bool = False
 ) -> tuple[FloatArray, FloatArray]:
     """Pressures (n, rows, columns) and depths (n,) as `frames_at_poses` returns them, by the changed physics."""
-    rotation, origin = head_positions(scene, time_s)
+    rotation, origin = head_poses(scene, time_s)
     level = level_kpa(scene.background, time_s)
     way = np.tanh(np.gradient(origin[:, 0], time_s) / _SLOW_MM_S)
     model = _Model.of(scene, physics, level)

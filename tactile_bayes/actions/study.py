@@ -34,9 +34,9 @@ from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.size_json import DEFAULT, read_size_calibration, size_calibration_path
 from tactile_bayes.files.tables import csv_text, read_table
 from tactile_bayes.findings import finding_lines
-from tactile_bayes.forward.contact import Head
+from tactile_bayes.forward.contact import HeadSection
 from tactile_bayes.forward.plane import outside_range
-from tactile_bayes.forward.scene import Head as Array
+from tactile_bayes.forward.scene import Head
 from tactile_bayes.forward.tissue import parse_seat
 from tactile_bayes.mapping.select import scan_findings
 from tactile_bayes.options import CaseOptions, FieldCosines, SbcOptions, SectionOptions, StudyOptions
@@ -139,15 +139,15 @@ def study_settings(study: StudyOptions, section: SectionOptions) -> paper.StudyS
             option = "--background free" if study.background == "free" else "--flat-field"
             raise UsageError(f"{option} is for --model solid: in two dimensions Eq 5 is fitted with a background of 1")
         return paper.StudySettings(head=head, **case)
-    array = Array(radius_mm=section.head_radius_mm, rim_mm=section.shoulder_mm).with_shoulders(head.shoulders)
+    array = Head(radius_mm=section.head_radius_mm, rim_mm=section.shoulder_mm).with_shoulders(head.shoulders)
     solid: dict[str, Any] = {"background": study.background or "free", "flat_field": study.flat_field is not False}
     return SolidSettings(head=array, **case, **solid)
 
 
-def _section_head(section: SectionOptions, shoulders: str | None) -> Head:
+def _section_head(section: SectionOptions, shoulders: str | None) -> HeadSection:
     """The head of a cross-section; its shoulders lie inside the sensing width by default."""
     shoulders = shoulders or SHOULDERS_INSIDE
-    return Head(radius_mm=section.head_radius_mm, shoulder_mm=section.shoulder_mm, shoulders=shoulders)
+    return HeadSection(radius_mm=section.head_radius_mm, shoulder_mm=section.shoulder_mm, shoulders=shoulders)
 
 
 def read_grid(path: Path, *, seat: float) -> list[paper.Geometry]:
@@ -222,7 +222,9 @@ def tables_action(*, seat: str, head: str | None, search: bool, workers: int, as
     click.echo(RESEARCH_USE)
 
 
-def run_tables(seat: float, *, heads: Sequence[Head], workers: int) -> tuple[laboratory.ByHead, laboratory.ByHead]:
+def run_tables(
+    seat: float, *, heads: Sequence[HeadSection], workers: int
+) -> tuple[laboratory.ByHead, laboratory.ByHead]:
     """Agreement of both models over the cases of the tables, and over the phantoms, under each head."""
     lumps, phantoms = table_scenes(seat), phantom_scenes(seat)
     work = partial(compare_heads, settings=paper.StudySettings(), heads=heads)

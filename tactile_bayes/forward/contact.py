@@ -15,7 +15,7 @@ from tactile_bayes.presets import HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS, HEAD
 # --- The head's cross-section.
 
 
-class Head(Record):
+class HeadSection(Record):
     """The head's cross-section: an arc with rounded shoulders.
 
     The paper has "nearly a section of a circular cylinder" of 24 mm (section 2.1); radius and shoulders are assumed.

@@ -12,7 +12,7 @@ from scipy.optimize import minimize_scalar
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.axisymmetric import skin_flexibility
-from tactile_bayes.forward.contact import ContactStiffness, Head, solve_contact
+from tactile_bayes.forward.contact import ContactStiffness, HeadSection, solve_contact
 from tactile_bayes.forward.mesh import CondensedHole, Mesh, Part, body_mesh, quadrature, stiffness_factor
 from tactile_bayes.forward.tissue import Body, Layers
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
@@ -180,7 +180,7 @@ def condense(
 # the whole width, each once, and its mean is the mean of a frame: 1 after normalising, without a correction.
 
 POSITIONS_MM = (-60.0, 60.0, 0.5)
-_NOMINAL_HEAD = Head()
+_NOMINAL_HEAD = HeadSection()
 
 
 class LineFrames(Record, eq=False):
@@ -228,7 +228,7 @@ def press(
     stiffness_ratio: float | None,
     x_c_mm: FloatArray,
     *,
-    head: Head = _NOMINAL_HEAD,
+    head: HeadSection = _NOMINAL_HEAD,
     mean_kpa: float | FloatArray = MEAN_KPA,
 ) -> LineFrames:
     """Frames of a head pressed with given force at positions `x_c_mm`; the mean pressure over the sensing width is one
@@ -256,7 +256,11 @@ def press(
 
 
 def press_layers(
-    layers: Layers, *, head: Head = _NOMINAL_HEAD, mean_kpa: float | FloatArray = MEAN_KPA, cell_mm: float = CELL_MM
+    layers: Layers,
+    *,
+    head: HeadSection = _NOMINAL_HEAD,
+    mean_kpa: float | FloatArray = MEAN_KPA,
+    cell_mm: float = CELL_MM,
 ) -> LineFrames:
     """Frames of a body without a lump, P1, one per mean pressure; they do not depend on the head's position."""
     profile, senses = head.cell_profile_mm(cell_mm), head.sensing_cells(cell_mm)
@@ -285,7 +289,7 @@ def slide(
     surface: SurfaceCompliance,
     stiffness_ratio: float | None,
     *,
-    head: Head = _NOMINAL_HEAD,
+    head: HeadSection = _NOMINAL_HEAD,
     mean_kpa: float = MEAN_KPA,
     positions_mm: tuple[float, float, float] = POSITIONS_MM,
 ) -> LineFrames:

@@ -1,4 +1,4 @@
-"""A scene (a body, a lump and an exam to simulate), and the simulated instrument that records it, with its truth."""
+"""Scene of a simulation (body, lumps, exam), and the simulated instrument that records it with its truth."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from tactile_bayes import presets
 from tactile_bayes.declarations import Meta, Record, as_dict, check_record, described, field, replace
 from tactile_bayes.errors import BadDataError, require
-from tactile_bayes.forward.contact import Head as Section
+from tactile_bayes.forward.contact import HeadSection
 from tactile_bayes.forward.tissue import Diameter, Layers, Place, Rib, SceneBody, SolidLump, check_solid, fat_thickness
 from tactile_bayes.geometry import (
     FloatArray,
@@ -110,20 +110,19 @@ class Head(Record):
 
     @property
     def shoulders(self) -> str:
-        """Which of `presets.HEADS` this is in three dimensions."""
+        """One of `presets.HEADS`: place of the shoulders in three dimensions."""
         return presets.SHOULDERS_INSIDE if self.shoulder_mm > 0 else presets.SHOULDERS_OUTSIDE
 
     def with_shoulders(self, shoulders: str) -> Head:
-        """Copy of the head with its shoulders placed as `shoulders` says, one of `presets.HEADS`."""
+        """Copy of the head with its shoulders placed by one of `presets.HEADS`."""
         edge = self.section(shoulders).shoulder_mm
         inside = shoulders == presets.SHOULDERS_INSIDE
         return replace(self, shoulder_mm=edge if inside else 0.0, rim_mm=0.0 if inside else edge)
 
-    def section(self, shoulders: str) -> Section:
-        """Section across the head, with shoulders of this head's radius placed as `shoulders`, one of `presets.HEADS`,
-        says."""
+    def section(self, shoulders: str) -> HeadSection:
+        """Section across the head, with shoulders of this head's radius placed by one of `presets.HEADS`."""
         edge = self.shoulder_mm if self.shoulder_mm > 0 else self.rim_mm
-        return Section(self.rows * self.pitch_mm, self.radius_mm, edge, shoulders)
+        return HeadSection(self.rows * self.pitch_mm, self.radius_mm, edge, shoulders)
 
 
 class Noise(Record):
@@ -289,7 +288,7 @@ def _rigid(rotation_deg: Rotation, offset_mm: tuple[float, float, float]) -> Flo
 
 
 def tissue_truth(scene: Scene) -> dict[str, Any]:
-    """The body and its lumps as plain data; the balls of a rib do not count as lumps."""
+    """Body and lumps as plain data; the balls of a rib are no lumps."""
     body, fat = scene.body or SceneBody(), scene.layers.fat_mm
     return {
         "lumps": [
@@ -319,10 +318,10 @@ _WOBBLE_HZ: Final = {"x": 0.31, "y": 0.43, "z": 0.23, "roll": 0.37, "pitch": 0.2
 _CHUNK: Final = 512
 
 
-# Pressures in kPa, (n, rows, columns), that the taxels feel at (n,) times from 0, before any noise.
-Felt = Callable[[FloatArray], FloatArray]
-# Depth in mm of the head's apex below the undisturbed skin, (n,), at such times.
-Depth = Callable[[FloatArray], FloatArray]
+# (n, rows, columns) pressures in kPa, without noise, at (n,) times from 0.
+PressureAt = Callable[[FloatArray], FloatArray]
+# (n,) depths in mm of the head's apex below the undisturbed skin at such times.
+DepthAt = Callable[[FloatArray], FloatArray]
 
 
 class SimulatedScan(Record, eq=False):
@@ -338,25 +337,29 @@ class SimulatedScan(Record, eq=False):
 
 
 def record(
-    scene: Scene, *, felt: Felt, truth: Mapping[str, Any], rng: np.random.Generator, depth: Depth | None = None
+    scene: Scene,
+    *,
+    pressure: PressureAt,
+    truth: Mapping[str, Any],
+    rng: np.random.Generator,
+    depth: DepthAt | None = None,
 ) -> SimulatedScan:
-    """Simulate the recording of a scan from the pressures on the head, of which `felt` gives up to 512 frames at once,
-    in order.
+    """Simulate the recording of a scan from the pressures on the head, up to 512 frames at a time, in order.
 
-    What lies below the skin of `scene` is not used; `truth` is what the model of the tissue adds to the truth, where
-    `lumps` is a list of mappings with `x_mm` and `y_mm`. Without a `depth` the head wanders about 5 mm.
+    The scene's tissue is not used. `truth` is the tissue's part of the truth, with `lumps` a list of mappings with
+    `x_mm` and `y_mm`. Without a `depth` the head wanders about 5 mm.
     """
     gain_rng, element_rng, tracker_rng = rng.spawn(3)
     true_gain, calibration = _calibration(scene, rng=gain_rng)
     scan = Scan(
-        frames=_frames(scene, felt, true_gain, rng=element_rng),
+        frames=_frames(scene, pressure, true_gain, rng=element_rng),
         poses=_poses(scene, depth, rng=tracker_rng),
         head=HeadGeometry(scene.head.surface_mm(), scene.head.pitch_mm, scene.tracker.scanhead_from_tracker()),
         element_calibration=calibration,
         landmarks=_landmarks(scene),
         session={"source": "simulated", "side": "phantom", "posture": "phantom"},
     )
-    return SimulatedScan(scan, _whole_truth(scene, truth))
+    return SimulatedScan(scan, _complete_truth(scene, truth))
 
 
 def frame_times(scene: Scene) -> FloatArray:
@@ -370,9 +373,11 @@ def _times(duration_s: float, rate_hz: float) -> FloatArray:
     return np.asarray(np.rint(k / rate_hz * 1e9) / 1e9, dtype=np.float64)
 
 
-def head_positions(scene: Scene, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """True pose of the head in the scene's `plane` at times from 0: ``p_plane = rotation @ p_scanhead + origin`` with
-    (n, 3, 3) rotations and (n, 3) origins in mm."""
+def head_poses(scene: Scene, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(n, 3, 3) rotations and (n, 3) origins, mm, of the head at times from 0.
+
+    ``p_plane = rotation @ p_scanhead + origin``.
+    """
     x, y = _stroke(scene.strokes, time_s / scene.duration_s)
     phase = {name: 2 * np.pi * hz * time_s for name, hz in _WOBBLE_HZ.items()}
     wander, tilt = scene.strokes.wander_mm, np.radians(scene.strokes.tilt_deg)
@@ -384,7 +389,7 @@ def head_positions(scene: Scene, time_s: FloatArray) -> tuple[FloatArray, FloatA
         ],
         axis=-1,
     )
-    # Yaw stays at half: turning about the normal smears a lump's widths, rocking hardly does.
+    # half the yaw: turning about the normal smears a lump's widths, rocking hardly does
     turn = np.stack([np.sin(phase["roll"]), np.sin(phase["pitch"] + 0.5), 0.5 * np.sin(phase["yaw"] + 1.5)], axis=-1)
     yaw = rotation_from_vector(np.array([0.0, 0.0, np.radians(scene.strokes.yaw_deg)]))
     return yaw @ rotation_from_vector(tilt * turn), origin
@@ -409,13 +414,13 @@ def level_kpa(background: Background, time_s: FloatArray) -> FloatArray:
     return np.asarray(level * ramp, dtype=np.float64)
 
 
-def _frames(scene: Scene, felt: Felt, true_gain: FloatArray, *, rng: np.random.Generator) -> PressureFrames:
+def _frames(scene: Scene, pressure: PressureAt, true_gain: FloatArray, *, rng: np.random.Generator) -> PressureFrames:
     time = frame_times(scene)
     chunks = []
     for start in range(0, len(time), _CHUNK):
-        pressure = felt(time[start : start + _CHUNK])
-        pressure = pressure + scene.noise.element_kpa * rng.standard_normal(pressure.shape)
-        chunks.append(np.clip(np.rint(pressure / true_gain), 0, FULL_SCALE_COUNT).astype(np.uint16))
+        exact = pressure(time[start : start + _CHUNK])
+        noisy = exact + scene.noise.element_kpa * rng.standard_normal(exact.shape)
+        chunks.append(np.clip(np.rint(noisy / true_gain), 0, FULL_SCALE_COUNT).astype(np.uint16))
     counts = np.concatenate(chunks)
     for faulty, reading in ((scene.taxels.dead, 0), (scene.taxels.saturated, FULL_SCALE_COUNT)):
         for row, column in faulty:
@@ -427,16 +432,16 @@ def _calibration(scene: Scene, *, rng: np.random.Generator) -> tuple[FloatArray,
     """True gains, and the calibration that a bladder would give."""
     shape = (scene.head.rows, scene.head.columns)
     nominal = presets.PRESSURE_RANGE_KPA[1] / FULL_SCALE_COUNT
-    # Four standard deviations out, a gain could turn negative at the widest spread allowed.
+    # beyond four standard deviations a gain could be negative at the widest spread allowed
     spread, error = np.clip(rng.standard_normal((2, *shape)), -4.0, 4.0)
     true_gain = nominal * (1 + scene.noise.gain_spread * spread)
     measured = true_gain * (1 + scene.noise.gain_share * error)
     return true_gain, ElementCalibration(measured, np.zeros(shape), saturation_count=FULL_SCALE_COUNT)
 
 
-def _poses(scene: Scene, depth: Depth | None, *, rng: np.random.Generator) -> TrackerPoses:
+def _poses(scene: Scene, depth: DepthAt | None, *, rng: np.random.Generator) -> TrackerPoses:
     time = _times(scene.duration_s, scene.pose_rate_hz)
-    rotation, origin = head_positions(scene, time)
+    rotation, origin = head_poses(scene, time)
     if depth is not None:
         origin[:, 2] = depth(time)
     lever, base = scene.tracker.scanhead_from_tracker(), scene.tracker.base_from_plane()
@@ -445,7 +450,7 @@ def _poses(scene: Scene, depth: Depth | None, *, rng: np.random.Generator) -> Tr
     shift, turn = rng.standard_normal((2, len(time), 3))
     position = position + scene.noise.tracker_mm * shift
     attitude = attitude @ rotation_from_vector(np.radians(scene.noise.tracker_deg) * turn)
-    quaternion = np.array([quaternion_from_rotation(one) for one in attitude])
+    quaternion = np.array([quaternion_from_rotation(rotation) for rotation in attitude])
     late = np.rint((time + scene.tracker.latency_ms / 1000) * 1e9) / 1e9
     return TrackerPoses(late, position, quaternion)
 
@@ -461,8 +466,8 @@ def _landmarks(scene: Scene) -> Landmarks | None:
     )
 
 
-def _whole_truth(scene: Scene, model: Mapping[str, Any]) -> dict[str, Any]:
-    """The truth of a scan as plain data; `model` adds the tissue, beginning with the lumps."""
+def _complete_truth(scene: Scene, tissue: Mapping[str, Any]) -> dict[str, Any]:
+    """Truth of a scan as plain data, with the `tissue`'s part of it."""
     base_from_plane = scene.tracker.base_from_plane()
     landmarks = _landmarks(scene)
     patient_from_plane = None
@@ -471,15 +476,15 @@ def _whole_truth(scene: Scene, model: Mapping[str, Any]) -> dict[str, Any]:
         patient = patient_from_base(landmarks.sternal_notch_mm, landmarks.xiphoid_mm, normal=normal)
         patient_from_plane = patient @ base_from_plane
 
-    def placed(given: Mapping[str, Any]) -> dict[str, Any]:
-        point = np.array([given["x_mm"], given["y_mm"], 0.0])
+    def placed(lump: Mapping[str, Any]) -> dict[str, Any]:
+        point = np.array([lump["x_mm"], lump["y_mm"], 0.0])
         patient = None if patient_from_plane is None else apply(patient_from_plane, point).tolist()
-        return {**given, "base_mm": apply(base_from_plane, point).tolist(), "patient_mm": patient}
+        return {**lump, "base_mm": apply(base_from_plane, point).tolist(), "patient_mm": patient}
 
     return {
         "schema": TRUTH_SCHEMA,
-        **model,
-        "lumps": [placed(lump) for lump in model["lumps"]],
+        **tissue,
+        "lumps": [placed(lump) for lump in tissue["lumps"]],
         "background": as_dict(scene.background),
         "noise": as_dict(scene.noise),
         "latency_ms": scene.tracker.latency_ms,

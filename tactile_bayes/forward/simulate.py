@@ -1,4 +1,4 @@
-"""Simulation of a scan with known truth, by one of four forward models: bumps, Eqs 1 to 4, plane strain and solid."""
+"""Simulation of a scan with known truth by one of four forward models: bumps, Eqs 1 to 4, plane strain and solid."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ from tactile_bayes.declarations import Record, as_dict, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward import mesh, plane
 from tactile_bayes.forward.axisymmetric import CondensedLump, condense_lump, skin_spline, taxel_compliance
-from tactile_bayes.forward.contact import Contact, ContactStiffness, solve_contact
-from tactile_bayes.forward.contact import Head as Section
+from tactile_bayes.forward.contact import Contact, ContactStiffness, HeadSection, solve_contact
 from tactile_bayes.forward.scene import (
     Head,
     Scene,
     SimulatedScan,
     frame_times,
-    head_positions,
+    head_poses,
     level_kpa,
     normalised_pressure,
     record,
@@ -32,7 +31,7 @@ from tactile_bayes.presets import HEAD_PITCH_MM, SHOULDERS_INSIDE, SHOULDERS_OUT
 from tactile_bayes.progress import Progress, no_progress
 
 FIDELITIES: Final = ("empirical-gaussian", "empirical", "plane-strain", "solid")
-"""A bump's own formula; and for lumps of tissue Eqs 1 to 4, a body in two dimensions, and one in three."""
+"""Formula of Gaussian bumps; and for lumps of tissue Eqs 1 to 4, a body in two dimensions, and one in three."""
 
 
 def simulate(
@@ -43,66 +42,69 @@ def simulate(
     head: str | None = None,
     progress: Progress = no_progress,
 ) -> SimulatedScan:
-    """Make a scan from a scene: frames at ``k / frame_rate_hz``; poses at ``k / pose_rate_hz``, stamped late by the
-    latency.
+    """Simulated scan of a scene: frames at ``k / frame_rate_hz``, poses at ``k / pose_rate_hz`` stamped late.
 
-    The scene's own seed is not used; `rng` is split into independent streams, so that a longer scan of the same seed
-    keeps its gains and calibration. `fidelity` is one of `FIDELITIES`, by default the one the scene is written for.
-    `head`, one of `presets.HEADS`, says where the shoulders of the scene's head lie: by default as the scene gives them
-    in three dimensions, and inside the array in two. `progress` is called with frames done and frames in all; the bumps
-    alone are too quick to call it.
+    The scene's seed is not used; `rng` is split into independent streams, so that a longer scan of the same seed keeps
+    its gains and calibration. `fidelity` is one of `FIDELITIES`, by default the one the scene is written for. `head`,
+    one of `presets.HEADS`, places the shoulders of the scene's head, which by default are as in the scene for solid and
+    inside the array in two dimensions. `progress` is called with frames done and frames in all, but not for bumps.
     """
-    chosen, scene = _prepared(scene, fidelity, head)
-    if chosen == "empirical-gaussian":
+    model, scene = _checked(scene, fidelity, head)
+    if model == "empirical-gaussian":
         if head is not None:
             raise BadDataError(
                 "--head is given for the empirical-gaussian model, whose bumps do not depend on the head's shoulders",
                 way_out="leave --head out, or choose another --fidelity",
             )
 
-        def felt(time_s: FloatArray) -> FloatArray:
-            poses, level = head_positions(scene, time_s), level_kpa(scene.background, time_s)
+        def bumps(time_s: FloatArray) -> FloatArray:
+            poses, level = head_poses(scene, time_s), level_kpa(scene.background, time_s)
             return _gaussian_frames(scene, *poses, level, share_load=scene.background.load_sharing)
 
         lumps, background = [as_dict(lump) for lump in scene.lumps], as_dict(scene.background)
-        return record(scene, felt=felt, truth={"model": "gaussian", "lumps": lumps, "background": background}, rng=rng)
-    time = frame_times(scene)
-    poses, level = head_positions(scene, time), level_kpa(scene.background, time)
-    told = {"model": chosen, "head": scene.head.shoulders}
-    if chosen == "solid":
-        pressure, depth = frames_at_poses(scene, *poses, mean_kpa=level, progress=progress)
+        truth = {"model": "gaussian", "lumps": lumps, "background": background}
+        return record(scene, pressure=bumps, truth=truth, rng=rng)
+    time_s = frame_times(scene)
+    poses, level = head_poses(scene, time_s), level_kpa(scene.background, time_s)
+    if model == "solid":
+        description = {"model": model, "head": scene.head.shoulders}
+        frames, depth_mm = frames_at_poses(scene, *poses, mean_kpa=level, progress=progress)
     else:
-        told = {"model": chosen, "shape": _SHAPE, "head": head or SHOULDERS_INSIDE}
-        section = PlaneSection.of(scene, chosen, shoulders=head or SHOULDERS_INSIDE)
-        pressure = section.frames(*poses, level, reach_mm=_reach_of_strokes(section), progress=progress)
-    truth = told | tissue_truth(scene)
-    sunk = (lambda at: np.interp(at, time, depth)) if chosen == "solid" else None
-    return record(scene, felt=lambda at: pressure[np.searchsorted(time, at)], depth=sunk, truth=truth, rng=rng)
+        description = {"model": model, "shape": _SHAPE, "head": head or SHOULDERS_INSIDE}
+        section = PlaneSection.of(scene, model, shoulders=head or SHOULDERS_INSIDE)
+        frames = section.frames(*poses, level, reach_mm=_stroke_reach_mm(section), progress=progress)
+    return record(
+        scene,
+        pressure=lambda at_s: frames[np.searchsorted(time_s, at_s)],
+        depth=(lambda at_s: np.interp(at_s, time_s, depth_mm)) if model == "solid" else None,
+        truth=description | tissue_truth(scene),
+        rng=rng,
+    )
 
 
-def _prepared(scene: Scene, fidelity: str | None, head: str | None) -> tuple[str, Scene]:
-    """The model of a scene, which must give what the model needs, and the scene with the shoulders of its head placed.
+def _checked(scene: Scene, fidelity: str | None, head: str | None) -> tuple[str, Scene]:
+    """Model of a scene, and the scene with the shoulders of its head placed; `BadDataError` where they do not fit.
 
     In two dimensions shoulders inside the array are the section's default, and the scan has the scene's own head.
     """
-    chosen = scene.fidelity if fidelity is None else fidelity
-    if chosen not in FIDELITIES:
-        raise BadDataError(f"fidelity is {chosen!r}", way_out=f"choose {', '.join(FIDELITIES)}")
-    if chosen == "empirical-gaussian":
+    model = scene.fidelity if fidelity is None else fidelity
+    if model not in FIDELITIES:
+        raise BadDataError(f"fidelity is {model!r}", way_out=f"choose {', '.join(FIDELITIES)}")
+    if model == "empirical-gaussian":
         if scene.solid_lumps or scene.ribs:
             raise BadDataError(
                 "lump[0] gives depth_ratio and no amplitude" if scene.solid_lumps else "rib[0] is of tissue",
                 way_out="use --fidelity solid, or describe the bump with amplitude, sigma_x_mm and sigma_y_mm",
             )
-        return chosen, scene
+        return model, scene
     if scene.lumps:
         raise BadDataError(
             "lump[0] gives no depth_ratio",
-            way_out=f"the {chosen} model needs d_mm and depth_ratio; or use --fidelity empirical-gaussian",
+            way_out=f"the {model} model needs d_mm and depth_ratio; or use --fidelity empirical-gaussian",
         )
-    if head is not None and (chosen == "solid" or head != SHOULDERS_INSIDE):
+    if head is not None and (model == "solid" or head != SHOULDERS_INSIDE):
         scene = replace(scene, head=scene.head.with_shoulders(head))
-    return chosen, scene
+    return model, scene
 
 
 def felt_at_poses(
@@ -115,24 +117,23 @@ def felt_at_poses(
     head: str | None = None,
     progress: Progress = no_progress,
 ) -> FloatArray:
-    """Pressure in kPa, (n, rows, columns), that a model's head feels at given poses and mean pressures, without any
-    noise.
+    """(n, rows, columns) pressures in kPa at n poses of the head and mean pressures, without noise.
 
     Tissue and head of the scene are used; strokes, noise and tracker are not. Rotations (n, 3, 3) and origins (n, 3) of
     the head's face lead from `scanhead` to the scene's `plane`; the rest is as in `simulate`. In two dimensions tilts
-    are not followed and depths not used, and a pose beyond the skin that can be solved for is an error.
+    and depths are not used, and a pose beyond the skin that is solved for is a `BadDataError`.
     """
-    chosen, scene = _prepared(scene, fidelity, head)
-    if chosen == "empirical-gaussian":
+    model, scene = _checked(scene, fidelity, head)
+    if model == "empirical-gaussian":
         return _gaussian_frames(scene, rotation, origin_mm, mean_kpa, share_load=True)
-    if chosen == "solid":
+    if model == "solid":
         return frames_at_poses(scene, rotation, origin_mm, mean_kpa=mean_kpa, progress=progress)[0]
-    section = PlaneSection.of(scene, chosen, shoulders=head or SHOULDERS_INSIDE)
+    section = PlaneSection.of(scene, model, shoulders=head or SHOULDERS_INSIDE)
     place, most = section.places_mm(rotation, origin_mm), section.most_reach_mm
     reach = float(np.abs(place).max()) + section.half_face_mm + 1.0
     if reach > most:
         raise BadDataError(
-            f"the head gets {reach:.4g} mm from the lump", way_out=f"the {chosen} model reaches {most:g} mm"
+            f"the head gets {reach:.4g} mm from the lump", way_out=f"the {model} model reaches {most:g} mm"
         )
     return section.frames(rotation, origin_mm, mean_kpa, reach_mm=reach, progress=progress)
 
@@ -142,7 +143,7 @@ def _gaussian_frames(
 ) -> FloatArray:
     """(n, rows, columns) kPa of bumps; with `share_load` the frame's mean is the level, without it the background."""
     surface = scene.head.surface_mm()
-    # Only x and y of the plane are needed: the first two rows of each pose.
+    # of the plane only x and y matter: the first two rows of each pose
     xy = np.einsum("nij,rcj->nirc", rotation[:, :2], surface) + origin_mm[:, :2, None, None]
     shape = normalised_pressure(scene.lumps, xy[:, 0], xy[:, 1])
     if share_load:
@@ -152,24 +153,22 @@ def _gaussian_frames(
 
 # --- Scans in two dimensions of one lump of tissue: a cylinder along y under the head, solved or by Eqs 1 to 4.
 #
-# Nothing changes along y. Each column of taxels feels what a head of the same section feels at that column's place
-# across the lump: its profile is repeated along the head. The head stays level in this: tilts are in the poses, not in
-# the pressures, and how deep the head sinks is not followed. The plane-strain model solves the head's contact at each
-# place and force; the empirical one takes Eqs 1 to 4 as printed, fitted to two frames of the plane-strain model at the
-# nominal pressure, and scaled with the pressure.
+# Nothing changes along y: each column of taxels reads the profile of a head at that column's place across the lump.
+# Tilts are in the poses, not in the pressures, and the head's depth is not computed. The plane-strain model solves the
+# head's contact at each place and force; the empirical one takes Eqs 1 to 4 as printed, fitted to two frames of the
+# plane-strain model at the nominal pressure, and scaled with the pressure.
 
-Sections = Callable[[FloatArray, FloatArray], FloatArray]
-"""Profiles (m, rows) in kPa of a head at (m,) places from the lump's axis, with (m,) mean pressures in kPa."""
+Profiles = Callable[[FloatArray, FloatArray], FloatArray]
+"""(m, rows) pressures in kPa across a head at (m,) places from the lump's axis, with (m,) mean pressures in kPa."""
 
-# Contact cells per taxel, and how far apart the places of neighbouring sections of one head may be.
-_CELLS_A_TAXEL = 6
-_APART_MM = 0.25
+_CELLS_PER_TAXEL = 6  #: Cells of the contact.
+_SPACING_MM = 0.25  #: Largest distance between the places of neighbouring profiles of one head.
 _FRAMES_AT_ONCE = 100
 _SHAPE = "a cylinder along y: each frame's profile across the head is repeated along it"
 
 
-def _reach_of_strokes(section: PlaneSection) -> float:
-    """How far the head's edges get from the lump's axis, mm."""
+def _stroke_reach_mm(section: PlaneSection) -> float:
+    """Largest distance of the head's edges from the lump's axis; `BadDataError` beyond the mesh."""
     scene, half_mm, most = section.scene, section.half_face_mm, section.most_reach_mm
     stroke = scene.strokes.half_length_mm + scene.strokes.wander_mm + scene.head.columns * scene.head.pitch_mm / 2
     reach = stroke + abs(section.x_mm) + half_mm + 1.0
@@ -186,13 +185,13 @@ class PlaneSection(Record, eq=False):
     """A scene's section across the lump."""
 
     scene: Scene
-    fidelity: str  #: The contact problem (``"plane-strain"``) or Eqs 1 to 4.
-    head: Section  #: Section of the head: shoulders of the scene's `shoulder_mm`, or its `rim_mm` where that is 0.
-    lump: tuple[Body, float] | None  #: Below the skin, with its stiffness ratio; None for nothing.
+    fidelity: str  #: ``"plane-strain"``, which solves the contact, or ``"empirical"``, Eqs 1 to 4.
+    head: HeadSection  #: With shoulders of the scene's `shoulder_mm`, or its `rim_mm` where that is 0.
+    lump: tuple[Body, float] | None  #: Body with a lump, and the lump's stiffness ratio; None without a lump.
 
     @classmethod
     def of(cls, scene: Scene, fidelity: str, *, shoulders: str = SHOULDERS_INSIDE) -> PlaneSection:
-        """Prepare the section of a scene; a key that two dimensions cannot follow is an error."""
+        """Section of a scene; `BadDataError` for what two dimensions cannot represent."""
         many = "a rib" if scene.ribs else f"{len(scene.solid_lumps)} lumps" if len(scene.solid_lumps) > 1 else ""
         if many:
             way_out = f"the {fidelity} model has one lump and no rib; use --fidelity solid"
@@ -214,7 +213,7 @@ class PlaneSection(Record, eq=False):
     @property
     def cell_mm(self) -> float:
         """Width of the contact's cells."""
-        return self.scene.head.pitch_mm / _CELLS_A_TAXEL
+        return self.scene.head.pitch_mm / _CELLS_PER_TAXEL
 
     @property
     def half_face_mm(self) -> float:
@@ -223,7 +222,7 @@ class PlaneSection(Record, eq=False):
 
     @property
     def most_reach_mm(self) -> float:
-        """How far from the lump's axis the head's edges may get."""
+        """Largest distance of the head's edges from the lump's axis that the mesh allows."""
         return mesh.REACH_MM + self.scene.layers.thickness_mm
 
     def places_mm(self, rotation: FloatArray, origin_mm: FloatArray) -> FloatArray:
@@ -241,26 +240,26 @@ class PlaneSection(Record, eq=False):
         reach_mm: float,
         progress: Progress = no_progress,
     ) -> FloatArray:
-        """(n, rows, columns) kPa that the taxels feel at (n,) poses and mean pressures, before any noise.
+        """(n, rows, columns) pressures in kPa at (n,) poses and mean pressures, without noise.
 
-        A head turned about the normal has its columns at different places across the lump, up to `reach_mm` with its
-        edges. Sections are computed no more than 0.25 mm apart and interpolated between.
+        A head turned about the normal has its columns at different places across the lump, its edges within `reach_mm`;
+        profiles are computed no more than 0.25 mm apart and interpolated between.
         """
-        sections, place = self._sections(reach_mm), self.places_mm(rotation, origin_mm)
+        profiles, place = self._profiles(reach_mm), self.places_mm(rotation, origin_mm)
         pressure = np.zeros((len(level_kpa), self.scene.head.rows, self.scene.head.columns))
         pressed = np.flatnonzero(level_kpa > 0)
         for chunk in np.array_split(pressed, len(pressed) // _FRAMES_AT_ONCE or 1) if len(pressed) else ():
             ends = [(float(place[i].min()), float(place[i].max())) for i in chunk]
-            across = [np.linspace(low, high, 1 + int(np.ceil((high - low) / _APART_MM - 1e-9))) for low, high in ends]
-            many = [len(x) for x in across]
-            profile = sections(np.concatenate(across), np.repeat(level_kpa[chunk], many))
-            for i, x, mine in zip(chunk, across, np.split(profile, np.cumsum(many)[:-1]), strict=True):
-                pressure[i] = [np.interp(place[i], x, taxel) for taxel in mine.T]
+            across = [np.linspace(low, high, 1 + int(np.ceil((high - low) / _SPACING_MM - 1e-9))) for low, high in ends]
+            counts = [len(x) for x in across]
+            values = profiles(np.concatenate(across), np.repeat(level_kpa[chunk], counts))
+            for i, x, profile in zip(chunk, across, np.split(values, np.cumsum(counts)[:-1]), strict=True):
+                pressure[i] = [np.interp(place[i], x, taxel) for taxel in profile.T]
             progress(int(chunk[-1]) + 1, len(level_kpa))
         return pressure
 
-    def _sections(self, reach_mm: float) -> Sections:
-        """Sections at places whose edges get so far from the lump; without one the section is the same everywhere."""
+    def _profiles(self, reach_mm: float) -> Profiles:
+        """Profiles at places whose edges lie within `reach_mm` of the lump; without one they are alike everywhere."""
         if self.lump is None:
             return lambda _, mean_kpa: self._far(mean_kpa).pressure_kpa
         body, ratio = self.lump
@@ -276,7 +275,7 @@ class PlaneSection(Record, eq=False):
         return empirical
 
     def empirical_model(self, surface: plane.SurfaceCompliance) -> tuple[plane.EmpiricalModel, FloatArray]:
-        """Eqs 1 to 4 fitted to what taxels see far from and over the lump, and the taxels' places across the head."""
+        """Eqs 1 to 4 fitted to a frame far from the lump and one over it, and the taxels' places across the head."""
         assert self.lump is not None
         nominal = self.scene.background.mean_kpa
         far, over = self._far(nominal), self._over(surface, self.lump[1], np.zeros(1), nominal)
@@ -316,18 +315,16 @@ def _cylinder(lump: SolidLump, layers: Layers, fidelity: str) -> tuple[Body, flo
     return section, lump.stiffness_ratio
 
 
-# --- Frames of the head on a layered body with lumps, in three dimensions.
+# --- Frames of the head on a layered body with lumps, in three dimensions (record 0024).
 #
-# The skin's compliance under the head is the exact one of the layers without a lump, plus what each lump changes,
+# The skin's compliance under the head is the exact one of the layers without a lump, plus the change by each lump,
 # condensed to a few functions about the lump's vertical axis. Several lumps are summed as if each were alone.
 
-RANK_TOLERANCE: Final = 1e-5  #: Functions that carry less than this share of the largest are left out.
-# Step of the tables in r: linear interpolation between entries is then off by less than 1e-4 of a function.
-STEP_MM: Final = 0.05
+RANK_TOLERANCE: Final = 1e-5  #: Least share of the largest eigenvalue for a function that counts.
+STEP_MM: Final = 0.05  #: Step of the tables in r: linear interpolation errs by less than 1e-4 of a function.
 TABLE_MM: Final = 75.0  #: Largest r in the tables.
-# Functions with a sum of squares under the face below this share of a square's own compliance are left out of a frame.
-_LEAST_WEIGHT: Final = 1e-6
-_DIRECTIONS: Final = 24  #: Directions of the ring that stands for a square when a function is averaged over it.
+_LEAST_WEIGHT: Final = 1e-6  #: Least sum of squares under the face, over a square's own compliance, of such a function.
+_DIRECTIONS: Final = 24  #: Directions of the ring that represents a square when a function is averaged over it.
 
 
 class SkinPerturbation(Record, eq=False):
@@ -337,8 +334,8 @@ class SkinPerturbation(Record, eq=False):
     """
 
     table: FloatArray
-    """(t, k) array: functions of the distance from the lump's axis, every 0.05 mm, in mm (kPa mm^2)^(-1/2)."""
-    order: NDArray[np.int64]  #: (k,) array: angular order of each.
+    """(t, k) array: Functions of the distance from the lump's axis, every 0.05 mm, in mm (kPa mm^2)^(-1/2)."""
+    order: NDArray[np.int64]  #: (k,) array: Angular order of each function.
     sign: FloatArray  #: (k,) array: -1 where the lump stiffens.
     x_mm: float = 0.0
     y_mm: float = 0.0  #: `x_mm`, `y_mm`: Place of the lump's axis in the scene's `plane`.
@@ -353,20 +350,17 @@ class SkinPerturbation(Record, eq=False):
         below = np.minimum(distance.astype(np.int64), len(self.table) - 2)
         share = np.clip(distance - below, 0.0, 1.0)[:, None]
         value = (1.0 - share) * self.table[below] + share * self.table[below + 1]
-        angle = np.arctan2(y_mm, x_mm)
-        turns = np.arange(int(self.order.max(initial=0)) + 1)
-        phase = np.multiply.outer(angle, turns)
-        twice = self.order > 0
+        phase = np.multiply.outer(np.arctan2(y_mm, x_mm), np.arange(int(self.order.max(initial=0)) + 1))
+        angular = self.order > 0
         cosine = value * np.cos(phase)[:, self.order]
-        sine = value[:, twice] * np.sin(phase)[:, self.order[twice]]
-        return np.concatenate([cosine, sine], axis=1), np.concatenate([self.sign, self.sign[twice]])
+        sine = value[:, angular] * np.sin(phase)[:, self.order[angular]]
+        return np.concatenate([cosine, sine], axis=1), np.concatenate([self.sign, self.sign[angular]])
 
 
 def skin_perturbation(
     condensed: CondensedLump, lump_kpa: float, *, square_mm: float = HEAD_PITCH_MM, tolerance: float = RANK_TOLERANCE
 ) -> SkinPerturbation:
-    """Condense a lump's perturbation to its leading functions, those above a share `tolerance` of the largest
-    eigenvalue.
+    """Leading functions of a lump's perturbation, down to a share `tolerance` of the largest eigenvalue.
 
     Load and displacement are averaged over squares of `square_mm`; 0 for points.
     """
@@ -376,11 +370,11 @@ def skin_perturbation(
     r: FloatArray = STEP_MM * np.arange(int(np.ceil(min(TABLE_MM, last) / STEP_MM)) + 1, dtype=np.float64)
     tables, orders, signs = [np.zeros((len(r), 0))], [], []
     for order, value, vector in parts:
-        kept = np.abs(value) > tolerance * largest
-        spline = skin_spline(condensed.radius_mm, vector[:, kept] * np.sqrt(np.abs(value[kept])), order=order)
+        leading = np.abs(value) > tolerance * largest
+        spline = skin_spline(condensed.radius_mm, vector[:, leading] * np.sqrt(np.abs(value[leading])), order=order)
         tables.append(square_mean(spline, r, order=order, square_mm=square_mm, last_mm=last))
-        orders += [order] * int(kept.sum())
-        signs += list(np.sign(value[kept]))
+        orders += [order] * int(leading.sum())
+        signs += list(np.sign(value[leading]))
     return SkinPerturbation(np.concatenate(tables, axis=1), np.array(orders, dtype=np.int64), np.array(signs))
 
 
@@ -390,7 +384,7 @@ def square_mean(
     """(t, k) means of ``function(r) cos(m theta)`` over a square about a point at angle 0, at distances `r_mm`.
 
     The centre with weight 2/7 and a ring of radius side sqrt(7/30) with 5/7 have the square's second and fourth radial
-    moments, so only the fourth power that depends on how the square is turned is lost.
+    moments; of the fourth power only the part that depends on the square's rotation is lost.
     """
     angle = (np.arange(_DIRECTIONS) + 0.5) * (2 * np.pi / _DIRECTIONS)
     x = r_mm[:, None] + square_mm * np.sqrt(7.0 / 30.0) * np.cos(angle)
@@ -403,42 +397,40 @@ def square_mean(
 class HeadFace(Record, eq=False):
     """Squares of the face of a rigid head that can touch the skin: the taxels and the rounded rim around them.
 
-    A flat end without a rim would press like a punch, with a singular pressure along its edge that no taxel array
-    shows.
+    Without a rim a flat end would press like a punch, with a singular pressure along its edge.
     """
 
     surface_mm: FloatArray
-    """(rows, columns, 3) array: centres in `scanhead`: origin at the apex of the face, z into the tissue."""
-    sensing: NDArray[np.bool_]  #: (rows, columns) bool array: true for taxels, False for the rim.
+    """(rows, columns, 3) array: Centres in `scanhead`: origin at the apex of the face, z into the tissue."""
+    sensing: NDArray[np.bool_]  #: (rows, columns) bool array: True for taxels, False for the rim.
     pitch_mm: float
 
 
 def head_face(head: Head) -> HeadFace:
-    """The taxels of a head and its rim: a quarter round at the edge, tangent to the face; none where shoulders lie
-    inside the array.
+    """Taxels of a head, and squares whose centres lie on its rim: a quarter round, none with shoulders inside.
 
-    Across the head the face is the section `contact.Head` with its shoulders outside. Along the head the rim is tangent
-    to a line. Squares whose centres lie on the rim are added.
+    Across the head the face is a `contact.HeadSection` with its shoulders outside; along it the rim is tangent to a
+    line.
     """
     rows, columns, pitch_mm, radius_mm = head.rows, head.columns, head.pitch_mm, head.radius_mm
     rim_mm = 0.0 if head.shoulder_mm > 0 else head.rim_mm
     if not 0 <= rim_mm < radius_mm:
         raise BadDataError(f"rim_mm is {rim_mm:g}", way_out=f"it must lie in 0 to below radius_mm, {radius_mm:g} mm")
     half_x, half_y = rows * pitch_mm / 2, columns * pitch_mm / 2
-    section = Section(2 * half_x, radius_mm, rim_mm, SHOULDERS_OUTSIDE)
-    more_x = _squares(half_x, section.half_face_mm, pitch_mm)
-    more_y = _squares(half_y, half_y + rim_mm, pitch_mm)
-    x, y = ((np.arange(float(n)) - (n - 1) / 2) * pitch_mm for n in (rows + 2 * more_x, columns + 2 * more_y))
+    section = HeadSection(2 * half_x, radius_mm, rim_mm, SHOULDERS_OUTSIDE)
+    rim_x = _rim_squares(half_x, section.half_face_mm, pitch_mm)
+    rim_y = _rim_squares(half_y, half_y + rim_mm, pitch_mm)
+    x, y = ((np.arange(float(n)) - (n - 1) / 2) * pitch_mm for n in (rows + 2 * rim_x, columns + 2 * rim_y))
     across = -section.profile_mm(x)
     along = np.sqrt(np.maximum(rim_mm**2 - np.clip(np.abs(y) - half_y, 0.0, None) ** 2, 0.0)) - rim_mm
     surface = np.stack(np.broadcast_arrays(x[:, None], y[None, :], across[:, None] + along[None, :]), axis=-1).copy()
     sensing = np.zeros(surface.shape[:2], dtype=bool)
-    sensing[more_x : more_x + rows, more_y : more_y + columns] = True
+    sensing[rim_x : rim_x + rows, rim_y : rim_y + columns] = True
     surface[sensing] = head.surface_mm().reshape(-1, 3)
     return HeadFace(surface, sensing, pitch_mm)
 
 
-def _squares(half_mm: float, reach_mm: float, pitch_mm: float) -> int:
+def _rim_squares(half_mm: float, reach_mm: float, pitch_mm: float) -> int:
     """Number of squares beyond `half_mm` whose centres are nearer than `reach_mm`."""
     return max(0, int(np.ceil((reach_mm - half_mm) / pitch_mm - 0.5 - 1e-9)))
 
@@ -458,11 +450,10 @@ class SolidHead(Record, eq=False):
         mean_kpa: float,
         touching: NDArray[np.bool_] | None = None,
     ) -> tuple[FloatArray, Contact]:
-        """(rows, columns) mean pressure on each taxel, and the contact of the whole face, at a pose and a mean over the
-        taxels: what the examiner's tone holds, and the gate of a map looks at.
+        """(rows, columns) pressures of the taxels, and the contact of the whole face, at a pose and a mean pressure.
 
-        ``p_plane = rotation @ p_scanhead + (*at_mm[:2], contact.depth_mm)``: z = 0 is the undisturbed skin. The head
-        keeps its rotation; only the depth adapts. `touching` is where to start: that of a neighbouring frame's contact.
+        ``p_plane = rotation @ p_scanhead + (*at_mm[:2], contact.depth_mm)``: z = 0 is the undisturbed skin, and only
+        the depth adapts. `mean_kpa` is over the taxels; `touching`, a neighbouring frame's, is the solver's start.
         """
         place, sensing = self.face.surface_mm.reshape(-1, 3) @ rotation.T, self.face.sensing
         parts, signs = [np.zeros((len(place), 0))], []
@@ -470,9 +461,9 @@ class SolidHead(Record, eq=False):
             values, sign = lump.vectors(place[:, 0] + at_mm[0], place[:, 1] + at_mm[1])
             values = values * self.face.pitch_mm  # a pressure of 1 kPa on a square is a force of pitch^2
             weight = np.einsum("nk,nk->k", values, values)
-            kept = weight > _LEAST_WEIGHT * float(np.diag(self.plain.plain).mean()) ** -1
-            parts.append(values[:, kept])
-            signs.append(sign[kept])
+            counts = weight > _LEAST_WEIGHT * float(np.diag(self.plain.plain).mean()) ** -1
+            parts.append(values[:, counts])
+            signs.append(sign[counts])
         vectors = np.concatenate(parts, axis=1)
         stiffness = self.plain.changed(vectors, np.concatenate(signs)) if vectors.shape[1] else self.plain
         contact = solve_contact(stiffness, -place[:, 2], mean_kpa=mean_kpa, counted=sensing.ravel(), touching=touching)
@@ -481,11 +472,7 @@ class SolidHead(Record, eq=False):
 
 
 def solid_head(head: Head, layers: Layers) -> SolidHead:
-    """Prepare a head on a body without lumps.
-
-    The compliance is that of the squares on the flat skin: the head's curvature and tilt enter as heights, as the
-    linear theory has it (Johnson 1985, ch. 4).
-    """
+    """Head on a body without lumps; its curvature and tilt enter as heights over flat skin (Johnson 1985, ch. 4)."""
     face = head_face(head)
     rows, columns = face.sensing.shape
     compliance = taxel_compliance(layers, rows=rows, columns=columns, pitch_mm=face.pitch_mm)
@@ -494,22 +481,23 @@ def solid_head(head: Head, layers: Layers) -> SolidHead:
 
 # --- Three-dimensional scans of lumps of tissue in a layered body, solved frame by frame.
 #
-# The mean over the taxels follows the scene's background, as an examiner holds it by the tone; where the head sinks
-# less, over a lump, its pose says so. Tilts are the scene's. Each frame is at rest: nothing slides, creeps or lags.
-# Ribs are rows of balls.
+# The mean over the taxels is the scene's background, as an examiner keeps it by the tone, and the head sinks less over
+# a lump. Each frame is at rest: nothing slides, creeps or lags. Ribs are rows of balls.
 
 
 def frames_at_poses(
     scene: Scene, rotation: FloatArray, origin_mm: FloatArray, *, mean_kpa: FloatArray, progress: Progress = no_progress
 ) -> tuple[FloatArray, FloatArray]:
-    """Pressures in kPa, (n, rows, columns), on the head at poses from `scanhead` to the scene's `plane`, without noise,
-    and z in mm of its apex there, which the mean pressures decide."""
+    """(n, rows, columns) pressures in kPa at poses from `scanhead` to the scene's `plane`, and (n,) depths of the apex.
+
+    The depths, in mm, follow from the mean pressures; both are without noise.
+    """
     layers, lumps = scene.layers, []
     head, count = _head(scene.head, layers), len(mean_kpa)
     balls = (ball for rib in scene.ribs for ball in rib.balls())
     for lump in (*scene.solid_lumps, *balls):
-        around = condensed_lump(lump, layers)
-        change = skin_perturbation(around, lump.stiffness_ratio * layers.fat_kpa, square_mm=scene.head.pitch_mm)
+        condensed = condensed_lump(lump, layers)
+        change = skin_perturbation(condensed, lump.stiffness_ratio * layers.fat_kpa, square_mm=scene.head.pitch_mm)
         lumps.append(replace(change, x_mm=lump.x_mm, y_mm=lump.y_mm))
     pressure = np.empty((count, scene.head.rows, scene.head.columns))
     depth, touching = np.empty(count), None
@@ -522,10 +510,10 @@ def frames_at_poses(
 
 
 def condensed_lump(lump: SolidLump, layers: Layers) -> CondensedLump:
-    """Condense the body around a lump; the lump's stiffness and place do not matter here."""
+    """Body condensed around a lump, for any stiffness and place of the lump."""
     return _condensed(mesh.LumpGeometry(lump.d_mm / 2, lump.vertical_mm / 2, lump.depth_mm, layers))
 
 
-_BODIES_KEPT = 8  #: Exams of one body, and lumps of one size and depth in it, share these; a scene has few.
-_condensed = lru_cache(maxsize=_BODIES_KEPT)(condense_lump)
-_head = lru_cache(maxsize=_BODIES_KEPT)(solid_head)
+_CACHE_SIZE = 8  #: Exams of one body, and lumps of one size and depth in it, share these; a scene has few.
+_condensed = lru_cache(maxsize=_CACHE_SIZE)(condense_lump)
+_head = lru_cache(maxsize=_CACHE_SIZE)(solid_head)

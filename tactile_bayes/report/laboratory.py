@@ -12,7 +12,7 @@ import numpy as np
 
 from tactile_bayes.declarations import as_dict, names_of
 from tactile_bayes.files.tables import csv_text
-from tactile_bayes.forward.contact import Head
+from tactile_bayes.forward.contact import HeadSection
 from tactile_bayes.forward.plane import RANGE, outside_range
 from tactile_bayes.options import FieldCosines
 from tactile_bayes.presets import RESEARCH_USE
@@ -141,12 +141,12 @@ def sbc_figure(maps: Sequence[sbc.MapRanks], path: Path, *, force: bool = False)
 # --- Tables 1 and 2 of the paper as text and as plain data: ours, the nearest head's and the printed figures.
 
 Rows = Sequence[model_comparison.Agreement]
-ByHead = Mapping[Head, Rows]
+ByHead = Mapping[HeadSection, Rows]
 _PRINTED = {"centred_frame": model_comparison.PRINTED_FRAMES, "map": model_comparison.PRINTED_MAPS}
 
 
 def tables_text(
-    cases: Rows, phantoms: Rows, *, head: Head, nearest: Head | None = None, beside: Rows | None = None
+    cases: Rows, phantoms: Rows, *, head: HeadSection, nearest: HeadSection | None = None, beside: Rows | None = None
 ) -> str:
     """Both tables, the widths and amplitudes of the ten lumps, and the phantoms, under `head`.
 

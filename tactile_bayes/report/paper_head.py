@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.forward.contact import Head
+from tactile_bayes.forward.contact import HeadSection
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE
 from tactile_bayes.report.figure_file import figure_file, finish
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 # --- How evenly heads press, as text and as plain data.
 
 
-def head_words(head: Head) -> str:
+def head_words(head: HeadSection) -> str:
     """A head in a few words."""
     return f"{_arc(head)}, {head.shoulders} of {head.shoulder_mm:g} mm"
 
 
-def _arc(head: Head) -> str:
+def _arc(head: HeadSection) -> str:
     return "flat" if np.isinf(head.radius_mm) else f"R {head.radius_mm:g} mm"
 
 

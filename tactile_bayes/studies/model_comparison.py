@@ -10,7 +10,7 @@ from tactile_bayes import presets
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward import plane
-from tactile_bayes.forward.contact import Head
+from tactile_bayes.forward.contact import HeadSection
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import felt_at_poses
 from tactile_bayes.geometry import FloatArray, inverse
@@ -57,7 +57,7 @@ PHANTOMS = {
 }
 """The silicone models of section 2.3: diameter in mm and h/d, with a rigid lump."""
 TRIED_HEADS = tuple(
-    Head(radius_mm=radius, shoulder_mm=shoulder, shoulders=kind)
+    HeadSection(radius_mm=radius, shoulder_mm=shoulder, shoulders=kind)
     for radius in (13.0, 16.0, 20.0, 25.0, 35.0, 70.0)
     for kind, shoulder in (
         (presets.SHOULDERS_INSIDE, 3.0),
@@ -68,8 +68,8 @@ TRIED_HEADS = tuple(
 )
 """Heads that the tables are computed for with ``tables --heads``."""
 NEAREST_HEADS = {
-    0.0: Head(radius_mm=13.0, shoulder_mm=3.0, shoulders=presets.SHOULDERS_INSIDE),
-    1.0: Head(radius_mm=70.0, shoulder_mm=3.0, shoulders=presets.SHOULDERS_OUTSIDE),
+    0.0: HeadSection(radius_mm=13.0, shoulder_mm=3.0, shoulders=presets.SHOULDERS_INSIDE),
+    1.0: HeadSection(radius_mm=70.0, shoulder_mm=3.0, shoulders=presets.SHOULDERS_OUTSIDE),
 }
 """By seat: of `TRIED_HEADS` the one whose tables lie nearest to the printed ones (`table_distance`; record 0096)."""
 
@@ -154,7 +154,7 @@ def compare(scene: TableScene, *, settings: StudySettings, surface: plane.Surfac
     )
 
 
-def compare_heads(scene: TableScene, *, settings: StudySettings, heads: Sequence[Head]) -> list[Agreement]:
+def compare_heads(scene: TableScene, *, settings: StudySettings, heads: Sequence[HeadSection]) -> list[Agreement]:
     """Compare both models of one scene under each of several heads; the body is condensed once."""
     widest = max(heads, key=lambda head: head.half_face_mm)
     body = settings.body(scene.d_mm, scene.depth_ratio, seat=scene.seat)

@@ -13,7 +13,7 @@ from scipy.optimize import minimize_scalar
 from tactile_bayes.declarations import Record, as_dict, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward import plane
-from tactile_bayes.forward.contact import Head
+from tactile_bayes.forward.contact import HeadSection
 from tactile_bayes.forward.tissue import SEATS, Body, Layers
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.options import CaseOptions, TissueOptions
@@ -76,7 +76,7 @@ class CaseSettings(CaseOptions, kw_only=True):
 class StudySettings(CaseSettings, kw_only=True):
     """Settings of a study: all that its table depends on besides its cases."""
 
-    head: Head = field(default_factory=Head)  #: Cross-section of the head.
+    head: HeadSection = field(default_factory=HeadSection)  #: Cross-section of the head.
     positions_mm: tuple[float, float, float] = plane.POSITIONS_MM
     """First and last position of the head and the step between them."""
     fit_radius_mm: float = FIT_RADIUS_MM  #: Eq 5 is fitted where abs(x) is at most this.
@@ -422,7 +422,7 @@ class HomogeneousTissue(TissueOptions):
 class Uniformity(Record, eq=False):
     """How evenly one head presses."""
 
-    head: Head  #: Its section.
+    head: HeadSection  #: Its section.
     s_mm: FloatArray  #: (n,) array: Taxel positions across the head.
     share: FloatArray  #: (3, 3, n) array: Pressure over the frame's mean, for each modulus and each mean pressure.
 
@@ -452,7 +452,7 @@ class Uniformity(Record, eq=False):
         return 2 * self.head.half_face_mm
 
 
-def uniformity(head: Head, tissue: HomogeneousTissue, *, cell_mm: float = _CELL_MM) -> Uniformity:
+def uniformity(head: HeadSection, tissue: HomogeneousTissue, *, cell_mm: float = _CELL_MM) -> Uniformity:
     """How evenly a head presses on homogeneous tissue."""
     # halving the thickness into two equal layers is the homogeneous body
     layers = Layers(0.5 * tissue.thickness_mm, tissue.thickness_mm, 1.0, 1.0, tissue.poisson)
@@ -472,11 +472,11 @@ def search_heads(
     """Uniformity of every head on a grid of shoulder positions (`presets.HEADS`) and radii of arc and shoulders;
     impossible sections are left out."""
     sections = [
-        Head(radius_mm=radius, shoulder_mm=shoulder, shoulders=kind)
+        HeadSection(radius_mm=radius, shoulder_mm=shoulder, shoulders=kind)
         for kind in kinds
         for radius in radii_mm
         for shoulder in shoulders_mm
-        if shoulder < (Head().half_width_mm if kind == SHOULDERS_INSIDE else radius)
+        if shoulder < (HeadSection().half_width_mm if kind == SHOULDERS_INSIDE else radius)
     ]
     return [uniformity(section, tissue) for section in sections]
 

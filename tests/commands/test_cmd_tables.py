@@ -11,7 +11,7 @@ import pytest
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_BAD_DATA
-from tactile_bayes.forward.contact import Head
+from tactile_bayes.forward.contact import HeadSection
 from tactile_bayes.report.laboratory import heads_text, tables_document, tables_text
 from tactile_bayes.studies.model_comparison import (
     NEAREST_HEADS,
@@ -40,7 +40,7 @@ def agreement(scene) -> Agreement:
 
 def test_the_tables_stand_beside_the_printed_ones_and_say_what_they_mean() -> None:
     lumps, phantoms = [agreement(s) for s in table_scenes(0.0)], [agreement(s) for s in phantom_scenes(0.0)]
-    text = tables_text(lumps, phantoms, head=Head())
+    text = tables_text(lumps, phantoms, head=HeadSection())
     assert text.startswith("mean MSD: frames 5.0 % (printed 4.1), maps 1.0 % (printed 2.4)")
     assert "MSD = sum of squared differences over the sum of squares of the elastic model" in text
     assert "5.0 (4.1)" in text
@@ -50,14 +50,14 @@ def test_the_tables_stand_beside_the_printed_ones_and_say_what_they_mean() -> No
     assert "phantom 18.75 mm" in text
     assert "RMS over the largest                20.0 (20-20)    15.0 (15-15)" in text
     assert max(map(len, text.partition("head: ")[2].partition("the empirical model")[0].splitlines())) <= 80
-    beside = tables_text(lumps, phantoms, head=Head(), nearest=TRIED_HEADS[0], beside=lumps)
+    beside = tables_text(lumps, phantoms, head=HeadSection(), nearest=TRIED_HEADS[0], beside=lumps)
     assert "5.0/5.0 (4.1)" in beside
     assert "the head nearest to the print: R 13 mm, shoulders-inside of 3 mm" in beside
 
 
 def test_the_document_names_the_width_of_each_fit() -> None:
     rows = [agreement(scene) for scene in table_scenes(0.0)]
-    (first, *_) = tables_document({Head(): rows}, {Head(): rows}, seat=0.0)["cases"]
+    (first, *_) = tables_document({HeadSection(): rows}, {HeadSection(): rows}, seat=0.0)["cases"]
     assert first["elastic"] == {"amplitude": 0.3, "sigma_mm": 3.0, "rms": 0.01, "resolved": True}
     assert (first["empirical"]["sigma_mm"], first["map_strict"]) == (3.5, 0.4)
 

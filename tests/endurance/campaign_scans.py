@@ -69,7 +69,7 @@ class Body:
         self.scene = scene
         self._time = frame_times(scene)
         level = scenes.level_kpa(scene.background, self._time)
-        poses = scenes.head_positions(scene, self._time)
+        poses = scenes.head_poses(scene, self._time)
         self._pressure, self._depth = frames_at_poses(scene, *poses, mean_kpa=level)
 
     @property
@@ -81,7 +81,7 @@ class Body:
         """One exam: the same strokes with gains, noise and tracker error of their own."""
         made = record(
             self.scene,
-            felt=lambda at: self._pressure[np.searchsorted(self._time, at)],
+            pressure=lambda at: self._pressure[np.searchsorted(self._time, at)],
             depth=lambda at: np.interp(at, self._time, self._depth),
             truth={"model": "solid", "lumps": []},
             rng=np.random.default_rng([SEED, seed]),

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward import contact
-from tactile_bayes.forward.contact import Contact, ContactStiffness, Head, solve_contact
+from tactile_bayes.forward.contact import Contact, ContactStiffness, HeadSection, solve_contact
 from tactile_bayes.forward.plane import (
     SurfaceCompliance,
     build_line,
@@ -45,7 +45,7 @@ def pressed(compliance: np.ndarray, profile: np.ndarray, total_kpa: float) -> Co
 def test_a_cylinder_presses_as_hertz_says() -> None:
     """Line contact, Johnson (1985) section 4.2(c): half width and peak pressure of a half-ellipse."""
     cell, radius, half_width = 0.1, 200.0, 4.0
-    head = Head(width_mm=12.0, radius_mm=radius, shoulder_mm=0.0)
+    head = HeadSection(width_mm=12.0, radius_mm=radius, shoulder_mm=0.0)
     force = np.pi * PLANE_KPA * half_width**2 / (4 * radius)
     pressure = pressed(toeplitz(120, cell), head.cell_profile_mm(cell), force / cell).pressure_kpa
     assert pressure.max() == pytest.approx(2 * force / (np.pi * half_width), rel=3e-3)
@@ -58,7 +58,7 @@ def test_a_cylinder_presses_as_hertz_says() -> None:
 def test_the_peak_converges_to_hertz() -> None:
     errors = []
     for cell in (0.4, 0.2, 0.1):
-        head = Head(width_mm=12.0, radius_mm=400.0, shoulder_mm=0.0)
+        head = HeadSection(width_mm=12.0, radius_mm=400.0, shoulder_mm=0.0)
         force = np.pi * PLANE_KPA * 4.1**2 / 1600.0
         found = pressed(toeplitz(round(12 / cell), cell), head.cell_profile_mm(cell), force / cell)
         errors.append(abs(found.pressure_kpa.max() / (2 * force / (np.pi * 4.1)) - 1))
@@ -68,7 +68,7 @@ def test_the_peak_converges_to_hertz() -> None:
 def test_a_flat_punch_presses_hardest_at_its_edges() -> None:
     """p = F / (pi sqrt(w^2 - s^2)), Johnson (1985) section 2.8; compared as means over the cells."""
     cell, half = 0.25, 12.0
-    flat = Head(width_mm=24.0, radius_mm=np.inf, shoulder_mm=0.0)
+    flat = HeadSection(width_mm=24.0, radius_mm=np.inf, shoulder_mm=0.0)
     assert (flat.cell_profile_mm(cell) == 0).all()
     found = pressed(toeplitz(96, cell), flat.cell_profile_mm(cell), 96.0)
     edges = np.linspace(-half, half, 97)
@@ -90,7 +90,7 @@ def complementarity_holds(found: Contact, compliance: np.ndarray, profile: np.nd
 @given(seed=st.integers(0, 2**31), rough=st.floats(0.0, 1.0), total=st.floats(0.1, 1e4))
 def test_whatever_the_profile_each_cell_touches_or_is_free(seed: int, rough: float, total: float) -> None:
     rng = np.random.default_rng(seed)
-    profile = Head().cell_profile_mm(0.5) + rough * rng.normal(size=48)
+    profile = HeadSection().cell_profile_mm(0.5) + rough * rng.normal(size=48)
     profile -= profile.min()
     compliance = toeplitz(48, 0.5, Layers(12.0))
     found = pressed(compliance, profile, total)
@@ -98,7 +98,7 @@ def test_whatever_the_profile_each_cell_touches_or_is_free(seed: int, rough: flo
 
 
 def test_one_cell_at_a_time_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    profile = Head().cell_profile_mm(0.5) + 0.3 * np.sin(np.arange(48.0))
+    profile = HeadSection().cell_profile_mm(0.5) + 0.3 * np.sin(np.arange(48.0))
     compliance = toeplitz(48, 0.5, Layers(12.0))
     together = pressed(compliance, profile, 30.0)
     monkeypatch.setattr(contact, "_PATIENCE", 0)
@@ -110,14 +110,14 @@ def test_one_cell_at_a_time_gives_the_same(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_contact_on_a_lump_is_complementary_too(surface: SurfaceCompliance) -> None:
     matrix = surface.with_lump(100.0)
-    profile = Head().cell_profile_mm(0.25)
+    profile = HeadSection().cell_profile_mm(0.25)
     for window in (matrix[i : i + 96, i : i + 96] for i in range(0, 480, 16)):
         for total in (5.0, 96 * 9.5):
             complementarity_holds(pressed(window, profile, total), window, profile, total)
 
 
 def test_the_shape_of_the_head() -> None:
-    head = Head()
+    head = HeadSection()
     s = np.linspace(-12, 12, 24001)
     z = head.profile_mm(s)
     slope = np.diff(z) / np.diff(s)
@@ -140,13 +140,13 @@ def test_the_shape_of_the_head() -> None:
 )
 def test_impossible_heads_are_named(options: dict[str, float], words: list[str]) -> None:
     with pytest.raises(BadDataError) as caught:
-        Head(**options)
+        HeadSection(**options)
     assert all(word in str(caught.value) for word in words)
 
 
 def test_a_head_off_the_surface_is_refused(surface: SurfaceCompliance) -> None:
     with pytest.raises(BadDataError, match="must divide the head's width"):
-        Head().cell_profile_mm(0.7)
+        HeadSection().cell_profile_mm(0.7)
     with pytest.raises(BadDataError, match=r"the head at 60.5 mm leaves the surface, which ends at 72 mm"):
         press(surface, None, np.array([60.5]))
     with pytest.raises(BadDataError, match=r"pitch_mm is 0\.4"):
@@ -175,7 +175,7 @@ def test_frames_between_two_cells_are_interpolated(surface: SurfaceCompliance) -
 
 
 def test_twice_the_force_on_a_flat_head_is_twice_the_pressure(surface: SurfaceCompliance) -> None:
-    flat = Head(radius_mm=np.inf, shoulder_mm=0.0)
+    flat = HeadSection(radius_mm=np.inf, shoulder_mm=0.0)
     once, twice = (press(surface, 100.0, np.array([2.0]), head=flat, mean_kpa=p).pressure_kpa for p in (5.0, 10.0))
     np.testing.assert_allclose(twice, 2 * once, rtol=1e-9)
 

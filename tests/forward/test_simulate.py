@@ -26,7 +26,7 @@ from tactile_bayes.forward.scene import (
     Strokes,
     Taxels,
     Tracker,
-    head_positions,
+    head_poses,
     level_kpa,
 )
 from tactile_bayes.forward.simulate import simulate
@@ -131,7 +131,7 @@ def test_faulty_taxels_read_nothing_or_full_scale() -> None:
 
 def test_strokes_cover_their_lines() -> None:
     time = np.linspace(0, 7, 1401)
-    _, origin = head_positions(Scene(strokes=Strokes(wander_mm=0.0)), time)
+    _, origin = head_poses(Scene(strokes=Strokes(wander_mm=0.0)), time)
     assert origin[:, 0].min() == pytest.approx(-34, abs=0.1)
     assert origin[:, 0].max() == pytest.approx(34, abs=0.1)
     lines = np.unique(np.round(origin[::140, 1][1::2], 1))

@@ -7,7 +7,7 @@ import pytest
 from numpy.polynomial import legendre
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes, Tracker, head_positions
+from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes, Tracker, head_poses
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import broken_assumptions, skewed
@@ -37,7 +37,7 @@ def figures(scan: Scan) -> dict[str, float]:
 def pressed(*, change: float = 0.0, skew: float = 0.0) -> Scan:
     """A scan whose readings follow a profile: second order across by the place along x, first by the stroke."""
     scan = scan_of(scene(noise=TRUE_POSES))
-    _, origin = head_positions(scene(), scan.frames.time_s)
+    _, origin = head_poses(scene(), scan.frames.time_s)
     x, y = ((2 * np.arange(n) + 1) / n - 1 for n in (16, 26))
     way = np.sign(np.gradient(origin[:, 0]))
     readings = np.empty(scan.frames.counts.shape)
@@ -81,7 +81,7 @@ def dragged(lag_mm: float, **changes) -> Scan:
     """A Gaussian lump that lies `lag_mm` ahead in every stroke."""
     one = scene(noise=TRUE_POSES, **changes)
     ways = [scan_of(replace(one, lumps=(Lump(x_mm=way * lag_mm),))) for way in (1, -1)]
-    _, origin = head_positions(one, ways[0].frames.time_s)
+    _, origin = head_poses(one, ways[0].frames.time_s)
     forth = (np.gradient(origin[:, 0]) > 0)[:, None, None]
     counts = np.where(forth, ways[0].frames.counts, ways[1].frames.counts)
     return replace(ways[0], frames=PressureFrames(ways[0].frames.time_s, counts))
@@ -102,7 +102,7 @@ def test_a_latency_shows_as_a_lag_the_other_way() -> None:
     one = scene(noise=TRUE_POSES, lumps=(Lump(),))
     found = figures(scan_of(replace(one, tracker=Tracker(latency_ms=late_ms))))
     time = np.linspace(0.0, one.duration_s, 2000)
-    _, origin = head_positions(one, time)
+    _, origin = head_poses(one, time)
     near = np.abs(origin[:, 0]) < 12.0
     speed = float(np.abs(np.gradient(origin[:, 0], time))[near].mean())
     assert found["stroke_lag_mm"] == pytest.approx(-speed * late_ms / 1000.0, rel=0.25)

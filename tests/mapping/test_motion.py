@@ -9,7 +9,7 @@ import pytest
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes, Tracker
-from tactile_bayes.forward.simulate import head_positions, simulate
+from tactile_bayes.forward.simulate import head_poses, simulate
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.convention import stroke_starts
 from tactile_bayes.mapping.map import TactileMap
@@ -39,7 +39,7 @@ def follows(delta_mm: float, *, lumps: tuple[Lump, ...] = (LUMP,)) -> Scan:
         ).scan
         for way in ((1, -1) if delta_mm else (1,))
     ]
-    _, origin = head_positions(scene, ways[0].frames.time_s)
+    _, origin = head_poses(scene, ways[0].frames.time_s)
     forth = (np.gradient(origin[:, 0]) > 0)[:, None, None]
     counts = np.where(forth, ways[0].frames.counts, ways[-1].frames.counts)
     return replace(ways[0], frames=PressureFrames(ways[0].frames.time_s, counts))

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_bayes.mapping.accumulate import Source, sources_of
+from tactile_bayes.mapping.accumulate import FrameSource, frame_sources
 from tactile_bayes.mapping.cells import PRESSURE_STEP_KPA, CellSums, Readout, add_frames, chunk_frames
 from tactile_bayes.mapping.select import select_frames
 from tactile_bayes.scans import ElementCalibration, Scan
@@ -29,13 +29,13 @@ def rough_scan(seed: int, *, frames: int = 40) -> Scan:
     return Scan(scans.with_counts(scan, counts).frames, scan.poses, head, calibration)
 
 
-def source_of(seed: int, cell_mm: float) -> Source:
+def source_of(seed: int, cell_mm: float) -> FrameSource:
     selected = select_frames(rough_scan(seed), pressure_window_kpa=(2.0, 30.0))
-    (source,) = sources_of([selected], plane_from_base=np.eye(4), cell_mm=cell_mm)
+    (source,) = frame_sources([selected], plane_from_base=np.eye(4), cell_mm=cell_mm)
     return source
 
 
-def summed(source: Source, level: np.ndarray, cell_mm: float, *, size: int) -> CellSums:
+def summed(source: FrameSource, level: np.ndarray, cell_mm: float, *, size: int) -> CellSums:
     sums = CellSums(cell_mm)
     for part, counts in source.parts(size):
         pressure, valid = source.selection.readout.pressure_kpa(counts)
@@ -43,7 +43,7 @@ def summed(source: Source, level: np.ndarray, cell_mm: float, *, size: int) -> C
     return sums.trimmed()
 
 
-def by_loop(source: Source, level: np.ndarray, limit: float) -> tuple[dict[tuple[int, int], list[int]], int]:
+def by_loop(source: FrameSource, level: np.ndarray, limit: float) -> tuple[dict[tuple[int, int], list[int]], int]:
     """Count, sum and sum of squares in steps of 2^-12 by cell, and how many were clipped, reading by reading."""
     cells: dict[tuple[int, int], list[int]] = {}
     clipped = 0

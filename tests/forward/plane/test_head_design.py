@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from tactile_bayes.cli import cli
 from tactile_bayes.errors import EXIT_USAGE, BadDataError, UsageError
-from tactile_bayes.forward.contact import Head
+from tactile_bayes.forward.contact import HeadSection
 from tactile_bayes.presets import SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
 from tactile_bayes.studies.paper import HomogeneousTissue, most_even, narrowest, search_heads, uniformity
 
@@ -31,7 +31,8 @@ def taxel_means(primitive) -> np.ndarray:
 def test_a_flat_head_is_the_punch_of_a_half_plane() -> None:
     """p / mean = 2 / (pi sqrt(1 - s^2/w^2)), Johnson eq. 2.64, at every pressure."""
     found = uniformity(
-        Head(radius_mm=np.inf, shoulder_mm=0.0), HomogeneousTissue(thickness_mm=THICK_MM, modulus_kpa=(15.0, 25.0))
+        HeadSection(radius_mm=np.inf, shoulder_mm=0.0),
+        HomogeneousTissue(thickness_mm=THICK_MM, modulus_kpa=(15.0, 25.0)),
     )
     expected = taxel_means(lambda s: np.arcsin(s / 12.0))
     np.testing.assert_allclose(found.share[..., 2:-2], np.broadcast_to(expected, (3, 3, 16))[..., 2:-2], rtol=0.01)
@@ -53,14 +54,14 @@ def test_a_round_head_that_touches_in_part_is_hertz() -> None:
     assert 8.0 < a < 10.0
     inside = np.clip(EDGES, -a, a)
     expected = taxel_means(lambda _: 0.5 * (inside * np.sqrt(a**2 - inside**2) + a**2 * np.arcsin(inside / a)))
-    found = uniformity(Head(radius_mm=radius, shoulder_mm=0.0), tissue, cell_mm=0.125)
+    found = uniformity(HeadSection(radius_mm=radius, shoulder_mm=0.0), tissue, cell_mm=0.125)
     np.testing.assert_allclose(found.share[0, 0], expected, atol=0.01)
-    other = uniformity(Head(radius_mm=0.9 * radius, shoulder_mm=0.0), tissue, cell_mm=0.125)
+    other = uniformity(HeadSection(radius_mm=0.9 * radius, shoulder_mm=0.0), tissue, cell_mm=0.125)
     assert np.abs(other.share[0, 0] - expected).max() > 0.05  # the negative control: another radius is seen
 
 
 def test_only_the_ratio_of_pressure_to_modulus_matters() -> None:
-    head = Head(radius_mm=60.0, shoulders=SHOULDERS_OUTSIDE)
+    head = HeadSection(radius_mm=60.0, shoulders=SHOULDERS_OUTSIDE)
     plain = uniformity(head, HomogeneousTissue())
     scaled = uniformity(head, HomogeneousTissue(modulus_kpa=(45.0, 75.0), pressure_kpa=(15.0, 42.0)))
     np.testing.assert_allclose(plain.share, scaled.share, rtol=1e-9)
@@ -69,7 +70,7 @@ def test_only_the_ratio_of_pressure_to_modulus_matters() -> None:
 
 
 def test_three_cells_a_taxel_are_enough() -> None:
-    head = Head(radius_mm=70.0, shoulder_mm=15.0, shoulders=SHOULDERS_OUTSIDE)
+    head = HeadSection(radius_mm=70.0, shoulder_mm=15.0, shoulders=SHOULDERS_OUTSIDE)
     tissue = HomogeneousTissue()
     coarse, fine = (uniformity(head, tissue, cell_mm=cell).worst for cell in (0.5, 0.25))
     assert coarse == pytest.approx(fine, abs=0.001)

@@ -14,9 +14,9 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.scan_mcap import read_scan_report
 from tactile_bayes.forward import scene as scene_types
-from tactile_bayes.forward.contact import Head
+from tactile_bayes.forward.contact import HeadSection
 from tactile_bayes.forward.plane import condense, kappa, press, press_layers
-from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, Strokes, frame_times, head_positions, level_kpa
+from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, Strokes, frame_times, head_poses, level_kpa
 from tactile_bayes.forward.simulate import PlaneSection, simulate
 from tactile_bayes.forward.tissue import Body, Layers, Rib, SceneBody, SolidLump
 
@@ -33,7 +33,7 @@ SCENE = Scene(
 
 def frames_of(scene: Scene, time_s: np.ndarray, fidelity: str = "plane-strain") -> np.ndarray:
     level = level_kpa(scene.background, time_s)
-    return PlaneSection.of(scene, fidelity).frames(*head_positions(scene, time_s), level, reach_mm=60.0)
+    return PlaneSection.of(scene, fidelity).frames(*head_poses(scene, time_s), level, reach_mm=60.0)
 
 
 @cache
@@ -44,7 +44,7 @@ def frames(fidelity: str) -> np.ndarray:
 def test_every_column_feels_the_frame_of_the_two_dimensional_body() -> None:
     """One frame at a time by the study's own contact, at the head's place and that frame's force."""
     time = frame_times(SCENE)
-    place, level = head_positions(SCENE, time)[1][:, 0] - 3.0, level_kpa(SCENE.background, time)
+    place, level = head_poses(SCENE, time)[1][:, 0] - 3.0, level_kpa(SCENE.background, time)
     surface = condense(Body(15.0, 1.0, 0.0))
     for i in (12, 20, 33):
         direct = press(surface, 100.0, place[i : i + 1], mean_kpa=float(level[i])).as_taxels(1.5).pressure_kpa[0]
@@ -55,7 +55,7 @@ def test_every_column_feels_the_frame_of_the_two_dimensional_body() -> None:
 def test_the_empirical_frames_are_eqs_1_to_4() -> None:
     """Their parts by the printed formulas, from the fitted numbers; scaled with the level."""
     time = frame_times(SCENE)
-    place, level = head_positions(SCENE, time)[1][:, 0] - 3.0, level_kpa(SCENE.background, time)
+    place, level = head_poses(SCENE, time)[1][:, 0] - 3.0, level_kpa(SCENE.background, time)
     model, s = PlaneSection.of(SCENE, "empirical").empirical_model(condense(Body(15.0, 1.0, 0.0)))
     p1 = model.peak_kpa * np.sqrt(1 - model.curvature_per_mm2 * s**2)
     largest = max(model.peak_kpa, model.peak_kpa * np.sqrt(1 - model.curvature_per_mm2 * 12.0**2))
@@ -69,7 +69,7 @@ def test_a_turned_head_has_its_columns_at_different_places() -> None:
     turned = replace(SCENE, strokes=replace(SCENE.strokes, yaw_deg=20.0))
     time = frame_times(turned)[25:26]
     found = frames_of(turned, time)[0]
-    rotation, origin = head_positions(turned, time)
+    rotation, origin = head_poses(turned, time)
     level = float(level_kpa(turned.background, time)[0])
     surface = condense(Body(15.0, 1.0, 0.0))
     for column in (0, 25):
@@ -83,7 +83,7 @@ def test_without_a_lump_every_frame_is_that_of_the_layers() -> None:
     bare = replace(SCENE, solid_lumps=(), body=SceneBody(fat_mm=10.0))
     found = frames_of(bare, np.array([0.1, 0.15]))
     level = level_kpa(bare.background, np.array([0.15]))[0]
-    plain = press_layers(Layers(10.0), head=Head(), mean_kpa=float(level)).as_taxels(1.5).pressure_kpa[0]
+    plain = press_layers(Layers(10.0), head=HeadSection(), mean_kpa=float(level)).as_taxels(1.5).pressure_kpa[0]
     np.testing.assert_allclose(found[1], np.repeat(plain[:, None], 26, axis=1), rtol=1e-9)
 
 
@@ -127,7 +127,7 @@ IMPOSSIBLE = {
         "strokes.half_length_mm 150.*mesh reaches",
     ),
     "head wider than the mesh": (
-        {"head": scene_types.Head(rows=200, radius_mm=500.0)},
+        {"head": scene_types.HeadSection(rows=200, radius_mm=500.0)},
         "a head 300 mm wide.*the mesh reaches 142 mm: shorten the strokes or narrow the head",
     ),
     "bump": (

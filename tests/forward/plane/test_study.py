@@ -10,7 +10,7 @@ from tactile_bayes.actions.study import study_csv
 from tactile_bayes.cli import cli
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.contact import Head
+from tactile_bayes.forward.contact import HeadSection
 from tactile_bayes.forward.plane import TactileLine
 from tactile_bayes.inference.modes import fit_least_squares
 from tactile_bayes.posterior.bump import cell_mean_gaussian
@@ -168,12 +168,12 @@ def test_the_coefficients_of_the_papers_study(seat: float) -> None:
 def test_shoulders_around_the_sensing_width_show_deep_lumps_higher() -> None:
     """Record 0075: they decide how many of the paper's cases cannot be seen."""
     deep = Geometry(0.0, 15.0, 1.5, (100.0,))
-    settings = [StudySettings(head=Head(shoulders=where)) for where in HEADS]
+    settings = [StudySettings(head=HeadSection(shoulders=where)) for where in HEADS]
     (inside,), (outside,) = (replace(one, fineness=1).rows(deep) for one in settings)
     assert (inside.head, outside.head) == HEADS
     assert outside.amplitude / inside.amplitude == pytest.approx(1.33, abs=0.05)
     with pytest.raises(BadDataError, match="shoulders"):
-        Head(shoulders="round")
+        HeadSection(shoulders="round")
 
 
 @pytest.mark.parametrize("words", [("study", "-o", "s.csv"), ("tables",), ("simulate", "s.toml", "-o", "s.mcap")])

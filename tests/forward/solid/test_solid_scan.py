@@ -27,7 +27,7 @@ from tactile_bayes.forward.scene import (
     Strokes,
     Tracker,
     frame_times,
-    head_positions,
+    head_poses,
     level_kpa,
 )
 from tactile_bayes.forward.simulate import (
@@ -77,7 +77,7 @@ def scene_from_text(text: str) -> Scene:
 
 
 def solid_frames(scene: Scene, time_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return frames_at_poses(scene, *head_positions(scene, time_s), mean_kpa=level_kpa(scene.background, time_s))
+    return frames_at_poses(scene, *head_poses(scene, time_s), mean_kpa=level_kpa(scene.background, time_s))
 
 
 @cache
@@ -90,7 +90,7 @@ def test_frames_bear_the_level_and_rise_over_the_lump() -> None:
     pressure, depth = short_frames()
     np.testing.assert_allclose(pressure.mean(axis=(1, 2)), level_kpa(SHORT.background, time), rtol=1e-9, atol=1e-12)
     assert pressure.min() >= 0
-    over = np.argmin(np.abs(head_positions(SHORT, time)[1][:, 0]))
+    over = np.argmin(np.abs(head_poses(SHORT, time)[1][:, 0]))
     assert pressure[over, 7:9, 12:14].mean() > 1.2 * pressure[over].mean()
     # pressed harder, sunk deeper; over the lump less deep than beside it
     assert depth[0] < depth[5] < depth[10]
