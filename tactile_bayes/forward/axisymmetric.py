@@ -1,4 +1,4 @@
-"""Layers that are pressed round an axis: elements and their stiffness."""
+"""Compliance of a layered body's skin: its exact Green's function, and its change by a lump on a vertical axis."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tactile_bayes.forward.mesh import (
     LumpGeometry,
     Mesh,
     MeshSize,
-    Part,
+    PartStiffness,
     lagrange_points,
     lump_mesh,
     quadrature,
@@ -30,11 +30,10 @@ from tactile_bayes.geometry import FloatArray, IndexArray
 # The layers are bonded to each other and to the rigid base. z runs into the body; a displacement is positive downwards,
 # a pressure into the skin.
 
-# Beyond this wave number times the top layer's thickness the layers below have no effect: exp(-2 x 18) = 2e-16.
-_DEEPEST: Final = 18.0
-# Gauss points per panel, and panels per decade of wave numbers; the remainder is smooth on a logarithmic scale.
-_POINTS: Final = 24
-# Below this thickness in wave lengths the layer matrices lose digits, and the integrand is as good as constant.
+# Largest wave number times the top layer's thickness: beyond it layers below have no effect, exp(-2 x 18) = 2e-16.
+_LARGEST: Final = 18.0
+_POINTS: Final = 24  #: Gauss points per panel.
+# Least wave number times thickness: below it the layer matrices lose digits, and the integrand is as good as constant.
 _LEAST: Final = 1e-3
 
 
@@ -45,25 +44,23 @@ def skin_flexibility(wave_number: FloatArray, layers: Layers) -> FloatArray:
     those of the radial displacement and the sinking. For a half-space entry (1, 1), sinking under pressure, is
     :math:`2(1-\nu^2)/(E k)`, and entry (1, 0), sinking under shear, :math:`-(1-2\nu)(1+\nu)/(E k)`.
 
-    For one k the fields are :math:`u_r = U(z) J_1(kr)`, :math:`u_z = W(z) J_0(kr)`, which obey the equations of plane
-    strain with a wave of number k. Each layer is replaced by its exact stiffness between the displacements of its two
-    faces (the static limit of Kausel & Roesset 1981), and the stiffness felt at a face is carried upwards. All
+    The fields :math:`u_r = U(z) J_1(kr)`, :math:`u_z = W(z) J_0(kr)` obey the equations of plane strain. Each layer is
+    its exact stiffness between its two faces (the static limit of Kausel & Roesset 1981), condensed upwards. All
     exponentials decay, so no k overflows, and nothing is singular at nu = 0.5.
     """
     k, fat_mm = np.asarray(wave_number, dtype=np.float64), layers.fat_mm
     gland_kpa, gland_mm = layers.fat_kpa * layers.gland_ratio, layers.thickness_mm - fat_mm
     gland = _layer_stiffness(k, gland_kpa, gland_mm, layers.poisson)[:, :2, :2]  # its lower face does not move
     fat = _layer_stiffness(k, layers.fat_kpa, fat_mm, layers.poisson)
-    across, lower = fat[:, :2, 2:], fat[:, 2:, 2:] + gland
-    felt = fat[:, :2, :2] - across @ np.linalg.solve(lower, fat[:, 2:, :2])
-    return np.asarray(np.linalg.inv(felt), dtype=np.float64)
+    coupling, lower = fat[:, :2, 2:], fat[:, 2:, 2:] + gland
+    skin_stiffness = fat[:, :2, :2] - coupling @ np.linalg.solve(lower, fat[:, 2:, :2])
+    return np.asarray(np.linalg.inv(skin_stiffness), dtype=np.float64)
 
 
 def _waves(depth: FloatArray, nu: float) -> tuple[FloatArray, FloatArray]:
-    """Displacements (U, W) and tractions (tau, sigma) / (2 mu k) of the two waves that decay with `depth` = k z.
+    """(n, 2, 2) displacements (U, W) and tractions (tau, sigma) / (2 mu k), by wave, of the two that decay with k z.
 
-    Returns two (n, 2, 2) arrays: component by wave. The first wave is a harmonic gradient, the second its
-    Papkovich-Neuber partner (Johnson 1985, ch. 2 and 3: the half-space under a normal load is a sum of both).
+    The first is a harmonic gradient, the second its Papkovich-Neuber partner (Johnson 1985, ch. 2 and 3).
     """
     decay = np.exp(-depth)
     one, kappa = np.ones_like(depth), 3.0 - 4.0 * nu
@@ -87,16 +84,15 @@ def _layer_stiffness(k: FloatArray, modulus_kpa: float, thickness_mm: float, nu:
 
 def layering_compliance(r_mm: FloatArray, layers: Layers) -> FloatArray:
     r"""Sinking at distances r from a unit normal force, less that of a half-space of the top layer, in mm / (kPa mm^2).
-    Smooth through r = 0.
 
     .. math:: \frac{1}{2\pi}\int_0^\infty \left[F(k) - \frac{2(1-\nu^2)}{E_1 k}\right] J_0(kr)\, k\, dk
 
-    by Gauss-Legendre panels. The bracket decays as :math:`\exp(-2kH)` with the top layer's thickness H, so what is
-    singular at r = 0 is left to the closed forms for the half-space.
+    by Gauss-Legendre panels. The bracket decays as :math:`\exp(-2kH)` with the top layer's thickness H: the difference
+    is smooth through r = 0.
     """
     r = np.asarray(r_mm, dtype=np.float64)
     k, weight = _wave_numbers(layers, reach_mm=float(r.max(initial=0.0)))
-    # lower wave numbers than the layer matrices can stand take the limit: F is constant
+    # below the least wave number of the layer matrices F is as good as constant
     safe = np.maximum(k, _LEAST / layers.thickness_mm)
     top = 2.0 * (1.0 - layers.poisson**2) / layers.fat_kpa
     bracket = skin_flexibility(safe, layers)[:, 1, 1] * k - top
@@ -105,10 +101,11 @@ def layering_compliance(r_mm: FloatArray, layers: Layers) -> FloatArray:
 
 def _wave_numbers(layers: Layers, *, reach_mm: float) -> tuple[FloatArray, FloatArray]:
     """Gauss-Legendre points and weights over wave numbers, fine enough for J0 at `reach_mm`."""
-    top, slowest = _DEEPEST / layers.fat_mm, 0.05 / layers.thickness_mm
-    edges = np.concatenate([[0.0], np.geomspace(slowest, top, 1 + int(np.ceil(4 * np.log10(top / slowest))))])
-    most = 10.0 / max(reach_mm, 1.0)  # rad of J0 in a panel: ten, for 24 points
-    parts = [np.linspace(a, b, 1 + int(np.ceil((b - a) / most)))[:-1] for a, b in pairwise(edges)]
+    largest, least = _LARGEST / layers.fat_mm, 0.05 / layers.thickness_mm
+    panels = int(np.ceil(4 * np.log10(largest / least)))  # four per decade
+    edges = np.concatenate([[0.0], np.geomspace(least, largest, 1 + panels)])
+    widest = 10.0 / max(reach_mm, 1.0)  # ten rad of J0, for 24 points
+    parts = [np.linspace(a, b, 1 + int(np.ceil((b - a) / widest)))[:-1] for a, b in pairwise(edges)]
     edges = np.concatenate([*parts, edges[-1:]])
     node, weight = np.polynomial.legendre.leggauss(_POINTS)
     half = np.diff(edges)[:, None] / 2
@@ -143,8 +140,7 @@ def _corner(x: FloatArray, y: FloatArray) -> FloatArray:
 def taxel_compliance(layers: Layers, *, rows: int, columns: int, pitch_mm: float) -> FloatArray:
     """Mean sinking of every taxel under unit pressure on every other, in mm / kPa, symmetric and positive definite.
 
-    Taxels are in row-major order. Both the load and the displacement are averaged over the square of a taxel
-    (Galerkin), the self term included.
+    Taxels are in row-major order; load and displacement are averaged over the square of a taxel (Galerkin).
     """
     node, weight = np.polynomial.legendre.leggauss(6)
     shift = node * pitch_mm / 2
@@ -157,11 +153,11 @@ def taxel_compliance(layers: Layers, *, rows: int, columns: int, pitch_mm: float
     by_offset = np.einsum("rcij,ij->rc", half_space, share)
     r = np.linspace(0.0, np.hypot(dx[-1] + 2 * pitch_mm, dy[-1] + 2 * pitch_mm), 400)
     smooth = CubicSpline(r, layering_compliance(r, layers), bc_type=("clamped", "not-a-knot"))
-    # The difference of two points of a square has a triangular density along each axis; three Gauss points are exact
-    # for its first five moments: of 1 - |s| on (-1, 1) they are 0 and +-sqrt(2/5), from its moments 1, 1/6 and 1/15.
-    apart, weight = pitch_mm * np.sqrt(0.4) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 14.0, 5.0]) / 24.0
-    between = smooth(np.hypot(dx[:, None, None, None] + apart[:, None], dy[None, :, None, None] + apart[None, :]))
-    by_offset += pitch_mm**2 * np.einsum("rcij,i,j->rc", between, weight, weight)
+    # The difference of two points of a square has a triangular density along each axis; the three Gauss points of
+    # 1 - |s| on (-1, 1) are 0 and +-sqrt(2/5), from its moments 1, 1/6 and 1/15, and exact for its first five.
+    offset, weight = pitch_mm * np.sqrt(0.4) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 14.0, 5.0]) / 24.0
+    layering = smooth(np.hypot(dx[:, None, None, None] + offset[:, None], dy[None, :, None, None] + offset[None, :]))
+    by_offset += pitch_mm**2 * np.einsum("rcij,i,j->rc", layering, weight, weight)
     row, column = np.divmod(np.arange(rows * columns), columns)
     return np.asarray(
         by_offset[np.abs(row[:, None] - row[None, :]), np.abs(column[:, None] - column[None, :])], dtype=np.float64
@@ -175,14 +171,13 @@ def taxel_compliance(layers: Layers, *, rows: int, columns: int, pitch_mm: float
 # two-dimensional problem. The body around the lump is condensed once onto the lump's boundary and the skin; a lump
 # of any stiffness is then a small dense matrix on that boundary.
 
-_LEAST_SHARE: Final = 1e-4  #: Orders m are left out from where their share of the perturbation has fallen to this.
+_LEAST_SHARE: Final = 1e-4  #: Least share of the perturbation for an order m that counts.
 
 
 class CondensedLump(Record, eq=False):
-    """All Fourier orders of one geometry; the perturbation for a stiffness takes milliseconds."""
+    """Fourier orders of one geometry, condensed; the perturbation for a stiffness takes milliseconds."""
 
-    radius_mm: FloatArray
-    """(s,) array: Skin nodes, by increasing distance from the lump's axis, the axis itself left out."""
+    radius_mm: FloatArray  #: (s,) array: Distances of the skin nodes from the lump's axis, rising, without the axis.
     modes: tuple[CondensedHole, ...]  #: Orders 0, 1, ...: forces in kPa mm^2, displacements in mm.
 
     def perturbation(self, lump_kpa: float) -> list[FloatArray]:
@@ -196,39 +191,39 @@ class CondensedLump(Record, eq=False):
 
 
 def condense_lump(geometry: LumpGeometry, *, size: MeshSize | None = None, orders: int | None = None) -> CondensedLump:
-    """Condense the body around a lump onto the lump's boundary and the skin.
+    """Body around a lump, condensed onto the lump's boundary and the skin; by default in `orders_needed` orders.
 
-    The default mesh is held by a test to 1 % in amplitude and 0.5 % in width; the lump's depth decides the number of
-    Fourier orders where none is given (`orders_needed`).
+    A test checks the default mesh to 1 % in amplitude and 0.5 % in width.
     """
     mesh, layers = lump_mesh(geometry, size), geometry.layers
     stiffness = element_stiffness(mesh, nu=layers.poisson)
     modulus = np.where(mesh.gland, layers.fat_kpa * layers.gland_ratio, layers.fat_kpa)
     lump = mesh.lump
     one_tissue = (modulus[lump] == modulus[lump][0]).all()
-    # off the rim, which does not move, and off the axis: the ring that a node there stands for has no length, and its
-    # displacement is off by several per cent where its neighbours' are off by a few in a thousand
+    # without the rim, which does not move, and the axis, where a node's ring has no length and its displacement errs by
+    # several per cent, its neighbours' by a few in a thousand
     skin = mesh.skin[1:-1]
     modes = []
     for order in range(orders_needed(geometry) if orders is None else orders):
         k = stiffness[0] + order * stiffness[1] + order**2 * stiffness[2]
         number, sign = order_unknowns(mesh, order)
-        rim, own = np.unique(number[mesh.rim]), k * modulus[:, None, None]
-        flexibility, sunk = Part.of(mesh.elements[~lump], own[~lump], number, sign).around(rim, number[skin, 2])
-        unit = Part.of(mesh.elements[lump], k[lump], number, sign).within(rim)
-        filling = (
-            modulus[lump][0] * unit if one_tissue else Part.of(mesh.elements[lump], own[lump], number, sign).within(rim)
-        )
-        modes.append(CondensedHole(flexibility, sunk, unit, filling))
+        rim, scaled = np.unique(number[mesh.rim]), k * modulus[:, None, None]
+        outside = PartStiffness.of(mesh.elements[~lump], scaled[~lump], number, sign)
+        flexibility, sinking = outside.hole_flexibility(rim, number[skin, 2])
+        unit = PartStiffness.of(mesh.elements[lump], k[lump], number, sign).condensed_on(rim)
+        original = modulus[lump][0] * unit
+        if not one_tissue:
+            original = PartStiffness.of(mesh.elements[lump], scaled[lump], number, sign).condensed_on(rim)
+        modes.append(CondensedHole(flexibility, sinking, unit, original))
     return CondensedLump(mesh.nodes[skin, 0], tuple(modes))
 
 
 def orders_needed(geometry: LumpGeometry) -> int:
-    r"""Fourier orders that carry all but 1e-4 of the perturbation.
+    r"""Number of Fourier orders with all but 1e-4 of the perturbation.
 
-    A force at distance rho from the centre is felt by a sphere of radius a as multipoles falling as :math:`(a/\rho)^l`,
-    and its order m starts at l = m with :math:`(\sin\varphi)^m`; a force on the skin has :math:`\sin\varphi = r/\rho`,
-    so :math:`(a r/\rho^2)^{2m} \le (a/2h)^{2m}` for force and displacement together.
+    A force at distance rho acts on a sphere of radius a by multipoles that fall as :math:`(a/\rho)^l`, its order m from
+    l = m on as :math:`(\sin\varphi)^m = (r/\rho)^m`: for force and displacement together as
+    :math:`(a r/\rho^2)^{2m} \le (a/2h)^{2m}`.
     """
     share = max(geometry.radius_mm, geometry.half_height_mm) / (2.0 * geometry.depth_mm)
     return 2 + int(np.ceil(np.log(_LEAST_SHARE) / (2.0 * np.log(min(share, 0.6)))))
@@ -242,10 +237,9 @@ def skin_spline(radius_mm: FloatArray, values: FloatArray, *, order: int) -> Cub
 
 
 def element_stiffness(mesh: Mesh, *, nu: float) -> FloatArray:
-    """Stiffness of every element for a modulus of 1 kPa, as a polynomial in the order m: (3, e, 27, 27) of
-    :math:`K = K_0 + m K_1 + m^2 K_2`, without the factor of the integral over the angle.
+    """(3, e, 27, 27) stiffness of every element for 1 kPa, :math:`K = K_0 + m K_1 + m^2 K_2` in the order m.
 
-    Unknowns are (u_r, u_theta, u_z) of each of the nine nodes.
+    Without the factor of the integral over the angle; unknowns are (u_r, u_theta, u_z) of each of the nine nodes.
     """
     gradient, point, area = quadrature(mesh.nodes[mesh.elements])
     r = point[..., 0]

@@ -1,4 +1,4 @@
-"""Pressing a head on a body: the contact problem, for a line of taxels and in the solid."""
+"""Contact of a rigid head with a body's skin, for a line of taxels and in the solid."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from tactile_bayes.presets import HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS, HEAD
 class HeadSection(Record):
     """The head's cross-section: an arc with rounded shoulders.
 
-    The paper has "nearly a section of a circular cylinder" of 24 mm (section 2.1); radius and shoulders are assumed.
-    Where the shoulders lie decides how many faint lumps show: decision record 0075.
+    The paper has "nearly a section of a circular cylinder" of 24 mm (section 2.1); radius and shoulders are assumed
+    (record 0075).
     """
 
-    width_mm: float = HEAD_ROWS * HEAD_PITCH_MM  #: Of the sensing part.
-    radius_mm: float = HEAD_RADIUS_MM  #: Of the arc; infinity for a flat head.
+    width_mm: float = HEAD_ROWS * HEAD_PITCH_MM  #: Width of the sensing part.
+    radius_mm: float = HEAD_RADIUS_MM  #: Radius of the arc; infinity for a flat head.
     shoulder_mm: float = SHOULDER_MM  #: Radius of the round between arc and side, tangent to both; 0 for a sharp edge.
     shoulders: str = SHOULDERS_INSIDE
     """``"shoulders-inside"``: the rounds are cut into the sensing width, which is the whole face.
@@ -77,7 +77,7 @@ class HeadSection(Record):
         return np.asarray(self.profile_mm(centres[:, None] + 0.5 * cell_mm * points) @ (0.5 * weights))
 
     def sensing_cells(self, cell_mm: float) -> BoolArray:
-        """(n,) whether each cell of the face, from left to right, senses pressure or only presses."""
+        """(n,) mask of the cells of the face, from left to right, that sense pressure; the others only press."""
         count = round(self.width_mm / cell_mm)
         fits = count >= 2 and abs(count * cell_mm - self.width_mm) <= 1e-9 * self.width_mm
         require(fits, "cell_mm", cell_mm, f"divide the head's width of {self.width_mm:g} mm")
@@ -100,19 +100,17 @@ def _circle(radius: float, x: FloatArray) -> FloatArray:
 # a small convex quadratic programme (Johnson 1985, section 5.8). Where shoulders lie around the sensing cells, F is
 # the force on the sensing cells alone (decision record 0025).
 
-# Pressures and gaps beyond this share of the mean pressure and of the depth count as of the wrong sign.
-_TOLERANCE: Final = 1e-11
+_TOLERANCE: Final = 1e-11  #: Share of the mean pressure, or of the depth, beyond which a sign is wrong.
 _MOST_STEPS: Final = 2000
-# Steps in which the number of wrong signs may fail to fall before one taxel at a time is changed.
-_PATIENCE: Final = 4
+_PATIENCE: Final = 4  #: Steps without fewer wrong signs after which one taxel at a time is changed.
 
 
 class Contact(Record, eq=False):
-    """The solved contact of a head."""
+    """Solution of a contact."""
 
-    pressure_kpa: FloatArray  #: (n,) array: Of each taxel; 0 where it does not touch.
-    gap_mm: FloatArray  #: (n,) array: Between each taxel and the skin; 0 where it touches.
-    depth_mm: float  #: Of the head's highest point of `height_mm` 0 below the undisturbed skin.
+    pressure_kpa: FloatArray  #: (n,) array: Pressure of each taxel; 0 where it does not touch.
+    gap_mm: FloatArray  #: (n,) array: Gap between each taxel and the skin; 0 where it touches.
+    depth_mm: float  #: Depth of the head's point of `height_mm` 0 below the undisturbed skin.
     touching: BoolArray  #: (n,) array of bool.
 
 
@@ -137,11 +135,10 @@ class ContactStiffness(Record, eq=False):
         return cls((inverse + inverse.T) / 2, empty, np.zeros((0, 0)))
 
     def changed(self, vectors: FloatArray, signs: FloatArray) -> ContactStiffness:
-        """Stiffness after ``vectors @ diag(signs) @ vectors.T`` is added to the compliance: (n, k) in mm^(1/2)
-        kPa^(-1/2), and signs of 1 or -1. All changes are made in one.
+        """Stiffness after ``vectors @ diag(signs) @ vectors.T`` is added to the compliance, with signs of 1 or -1.
 
-        :math:`(C + V s V^T)^{-1} = H - H V (s + V^T H V)^{-1} V^T H` (Woodbury). The sum is positive definite when the
-        bracket has as many negative eigenvalues as s (Sylvester's law of inertia).
+        :math:`(C + V s V^T)^{-1} = H - H V (s + V^T H V)^{-1} V^T H` (Woodbury); V is (n, k) in mm^(1/2) kPa^(-1/2).
+        The sum is positive definite if the bracket has as many negative eigenvalues as s (Sylvester's law of inertia).
         """
         factor = self.plain @ vectors
         bracket = np.diag(signs) + vectors.T @ factor
@@ -169,16 +166,14 @@ def solve_contact(
     counted: BoolArray | None = None,
     touching: BoolArray | None = None,
 ) -> Contact:
-    r"""Press a head on the body until the force over the area of the counted squares, touching or not, is `mean_kpa`.
+    r"""Contact of a head whose mean pressure over the `counted` squares, touching or not, is `mean_kpa`.
 
-    Each taxel touches when the head has come down by its `height_mm`, of which the minimum may be any number. `counted`
-    are the taxels of a head that also has a rim, None for all; `touching` is where to start: a neighbouring frame's
-    saves steps.
+    A square touches when the head has come down by its `height_mm`, whose minimum may be any number. `counted` are the
+    taxels of a head with a rim, None for all; `touching`, a neighbouring frame's, is the start.
 
-    With H the stiffness and I the taxels off the skin, :math:`p = H(\delta - g + w)`, :math:`p_I = 0` and :math:`w = 0`
-    elsewhere: a system as large as the part of the head that does not touch. Signs are put right by block principal
-    pivoting, with one taxel at a time where blocks fail (Judice & Pires 1994), which ends because the matrix is
-    positive definite.
+    With H the stiffness and I the squares off the skin, :math:`p = H(\delta - g + w)`, :math:`p_I = 0`, and
+    :math:`w = 0` elsewhere. Wrong signs are changed by block principal pivoting, or one at a time where blocks fail
+    (Judice & Pires 1994).
     """
     count = len(height_mm)
     if not mean_kpa > 0:
@@ -188,12 +183,12 @@ def solve_contact(
         return Contact(np.zeros(count), height_mm - lowest, lowest, np.zeros(count, dtype=bool))
     share = np.full(count, 1.0 / count) if counted is None else counted / np.count_nonzero(counted)
     level, shaped = stiffness.times(np.stack([np.ones(count), height_mm], axis=-1)).T
-    start = touching is not None and (touching & (share > 0)).any()
-    now = touching.copy() if start and touching is not None else np.ones(count, dtype=bool)
+    usable = touching is not None and (touching & (share > 0)).any()
+    guess = touching.copy() if usable and touching is not None else np.ones(count, dtype=bool)
     fewest, patience = count + 1, _PATIENCE
 
     def solved(touching: BoolArray) -> tuple[Contact, BoolArray]:
-        """The contact of exactly the `touching` squares, and where pressure or gap has the wrong sign."""
+        """Contact of exactly the `touching` squares, and a mask of the wrong signs of pressure or gap."""
         off = np.flatnonzero(~touching)
         # one column for a unit of depth, one for the head's shape
         pressure, gap = np.stack([level, -shaped], axis=-1), np.zeros((count, 2))
@@ -209,22 +204,21 @@ def solve_contact(
         return Contact(kpa, mm, float(depth), touching), wrong
 
     for _ in range(_MOST_STEPS):
-        contact, wrong = solved(now)
-        bad = int(np.count_nonzero(wrong))
-        if bad == 0:
+        contact, wrong = solved(guess)
+        wrong_count = int(np.count_nonzero(wrong))
+        if wrong_count == 0:
             return contact
-        if bad < fewest:
-            fewest, patience = bad, _PATIENCE
+        if wrong_count < fewest:
+            fewest, patience = wrong_count, _PATIENCE
         else:
             patience -= 1
         if patience > 0:
-            now = now ^ wrong
+            guess = guess ^ wrong
         else:
-            now = now.copy()
-            last = int(np.flatnonzero(wrong)[-1])
-            now[last] = not now[last]
-        if not (now & (share > 0)).any():
-            now[int(np.argmin(np.where(share > 0, height_mm, np.inf)))] = True
+            guess = guess.copy()
+            guess[np.flatnonzero(wrong)[-1]] ^= True
+        if not (guess & (share > 0)).any():
+            guess[int(np.argmin(np.where(share > 0, height_mm, np.inf)))] = True
     raise NotConvergedError(
         "the contact between head and skin did not converge", diagnostics={"wrong_signs": float(fewest)}
     )

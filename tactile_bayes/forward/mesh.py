@@ -17,9 +17,8 @@ from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 
 # --- Nine-node quadrilaterals of half a body, graded and with every material boundary on element edges.
 #
-# About the lump runs a ring of rays from its boundary to a box, and within it from a point to its boundary; beyond
-# the box, rows and columns. Where rays meet in a point (inside the lump, or where a resting lump touches the gland)
-# quadrilaterals collapse to triangles.
+# Rays run from a point in the lump to its boundary and on to a box; beyond the box are rows and columns. Where rays
+# meet in a point (in the lump, or where a resting lump touches the gland) quadrilaterals collapse to triangles.
 
 
 class Mesh(Record, eq=False):
@@ -29,12 +28,12 @@ class Mesh(Record, eq=False):
     elements: IndexArray
     """(e, 9) int array: Node numbers in tensor order: ``elements[:, 3 * i + j]`` is the node at step i of the first
     local direction and step j of the second."""
-    gland: BoolArray  #: (e,) bool array: Whether the element lies below the fat-gland boundary.
-    lump: BoolArray  #: (e,) bool array: Whether it lies in the lump.
+    gland: BoolArray  #: (e,) bool array: True for elements below the fat-gland boundary.
+    lump: BoolArray  #: (e,) bool array: True for elements in the lump.
 
     @property
     def rim(self) -> IndexArray:
-        """Nodes on the lump's boundary from its highest point to its lowest: alike in all meshes of a body."""
+        """Nodes on the lump's boundary from its highest point to its lowest, as many in all meshes of a body."""
         rim = np.intersect1d(self.elements[self.lump], self.elements[~self.lump])
         return rim[np.argsort(self.nodes[rim, 1])]
 
@@ -46,7 +45,7 @@ class Mesh(Record, eq=False):
 
     @property
     def edges(self) -> tuple[BoolArray, BoolArray, BoolArray]:
-        """(n,) each: whether a node lies on the lump's axis, at the mesh's end, on the chest wall."""
+        """(n,) masks of the nodes on the lump's axis, at the mesh's end, and on the chest wall."""
         x, z = self.nodes.T
         return x < 1e-9 * self.nodes.max(), x == x.max(), z == z.max()
 
@@ -61,10 +60,10 @@ def _mesh(
     shares: tuple[FloatArray, FloatArray],
     scale_mm: float,
 ) -> Mesh:
-    """Mesh the lump from a point of its axis to the arcs of its boundary, around it from there to the rims of the box,
-    and beyond that the lattices of points; coinciding points become one node, elements without area are dropped.
+    """Mesh from a point of the lump's axis to the arcs of its boundary, on to the rims of the box, and the lattices.
 
-    `shares` are those of the way along the rays, around the lump and inside it.
+    Coinciding points become one node, elements without area are dropped. `shares` divide the rays around the lump and
+    inside it.
     """
     outside, inside = shares
     blocks: list[tuple[FloatArray, bool]] = []
@@ -87,10 +86,10 @@ def _mesh(
     corners = nodes[element[:, [0, 2, 8, 6]]]
     x, z = corners[..., 0], corners[..., 1]
     area = 0.5 * np.abs(np.sum(x * np.roll(z, -1, axis=1) - z * np.roll(x, -1, axis=1), axis=1))
-    kept = area > 1e-12 * scale_mm**2
-    used, numbers = np.unique(element[kept], return_inverse=True)
-    gland = corners[kept, :, 1].mean(axis=1) > boundary_mm
-    return Mesh(nodes[used], numbers.reshape(-1, 9), gland, np.concatenate(lump)[kept])
+    proper = area > 1e-12 * scale_mm**2
+    used_nodes, numbers = np.unique(element[proper], return_inverse=True)
+    gland = corners[proper, :, 1].mean(axis=1) > boundary_mm
+    return Mesh(nodes[used_nodes], numbers.reshape(-1, 9), gland, np.concatenate(lump)[proper])
 
 
 def _grid(x_mm: FloatArray, z_mm: FloatArray) -> FloatArray:
@@ -114,7 +113,7 @@ def _blend(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:
 
 
 def _graded_line(start: float, stop: float, *, first: float, grade: float, least: int = 1) -> FloatArray:
-    """Nodes of elements, `least` or more, whose length grows from about `first` by at most `grade` until `stop`."""
+    """Nodes of `least` or more elements, from `start` to `stop`, whose lengths grow from about `first` by `grade`."""
     length = stop - start
     count = max(least, int(np.ceil(np.log1p((grade - 1.0) * length / first) / np.log(grade))))
     line = start + length * _graded_share(count, grade)
@@ -126,10 +125,10 @@ def _graded_line(start: float, stop: float, *, first: float, grade: float, least
 #
 # Under a lump that stands clear of the gland the box ends on the boundary of the two.
 
-_BOX = 0.75  #: Half width of the box about the lump, and how far it reaches above and below the centre, in diameters.
-_LEAST_ABOVE = 0.35  #: A box whose top would leave less than this many diameters of rows above it goes to the skin.
-_BEYOND = 3.0  #: Beyond the outermost head position (72 mm) the body goes on for this many thicknesses.
-REACH_MM = 72.0
+_BOX = 0.75  #: Half width of the box about the lump, and its reach above and below the centre, in diameters.
+_LEAST_ABOVE = 0.35  #: Least height of rows above the box, in diameters; for less the box reaches to the skin.
+REACH_MM = 72.0  #: Outermost position of the head.
+_BEYOND = 3.0  #: Length of the body beyond that, in thicknesses.
 # Elements per unit of fineness: along the arc below the skin (where the bump's shape is made), from there down to the
 # fat-gland boundary, on either part below it, and along the rays outside and inside the lump.
 _TOP, _UP, _DOWN, _OUT, _IN = 8, 4, 2, 2, 2
@@ -138,10 +137,10 @@ _GROWTH = 2.2
 
 
 def body_mesh(body: Body, *, fineness: int, layered: bool) -> Mesh:
-    """The body on x >= 0 with its lump; twice the fineness is half the element size everywhere.
+    """Mesh of the body on x >= 0 with its lump; twice the fineness is half the element size everywhere.
 
-    Layered, the fat-gland boundary runs along element edges through the lump; else the rays in it meet in its centre.
-    Around the lump both are the same mesh.
+    If `layered`, the fat-gland boundary runs along element edges through the lump; else the rays in it meet in its
+    centre. Around the lump both are the same mesh.
     """
     h, d, layers, clear = body.centre_mm, body.d_mm, body.layers, body.seat > 1.0
     half, top = _BOX * d, h - _BOX * d if h > (_BOX + _LEAST_ABOVE) * d else 0.0
@@ -188,18 +187,14 @@ def body_mesh(body: Body, *, fineness: int, layered: bool) -> Mesh:
 
 
 def _projected(half_width_mm: float, distance_mm: float, count: int) -> FloatArray:
-    """Points of the box's lid or floor by central projection of equal angles.
-
-    Rays so leave the circle at right angles where the line is near, and stand close together where it is nearest.
-    """
+    """Points of the box's lid or floor by central projection of equal angles: closest together over the centre."""
     corner = np.arctan2(half_width_mm, distance_mm)
     return np.asarray(distance_mm * np.tan(np.linspace(0.0, corner, 2 * count + 1)))
 
 
 # --- The mesh of a layered body with a spheroid on its vertical axis, in the (r, z) half-plane.
 
-# A layer boundary nearer than this to touching the spheroid (as a share of its vertical half axis) is moved away.
-LEAST_CAP: Final = 0.04
+LEAST_CAP: Final = 0.04  #: Least distance of a layer boundary from touching the spheroid, in vertical half axes.
 
 
 class LumpGeometry(Record):
@@ -211,7 +206,7 @@ class LumpGeometry(Record):
     layers: Layers  #: The body without it.
 
     def __post_init__(self) -> None:
-        """Refuse what the mesh cannot resolve; bodies and scenes have refused all else."""
+        """Raise `BadDataError` for what the mesh cannot resolve; bodies and scenes refuse all else."""
         bottom = self.depth_mm + self.half_height_mm
         if bottom > self.layers.thickness_mm - 0.02 * self.half_height_mm:
             raise BadDataError(
@@ -230,7 +225,7 @@ class LumpGeometry(Record):
 
 
 class MeshSize(Record):
-    """How fine a mesh is."""
+    """Fineness of a mesh."""
 
     arc: int = 18  #: Elements along the half circle of the lump.
     rings: int = 6
@@ -240,7 +235,7 @@ class MeshSize(Record):
 
 
 def lump_mesh(geometry: LumpGeometry, size: MeshSize | None = None) -> Mesh:
-    """Mesh a lump in its body, finely near it and coarsely far away."""
+    """Mesh of a lump in its body, fine near it and coarse far away."""
     size = size or MeshSize()
     g, boundary = geometry, geometry.boundary_mm()
     cut = abs(boundary - g.depth_mm) < g.half_height_mm
@@ -304,7 +299,7 @@ def _fan(g: LumpGeometry, boundary: float, *, cut: bool, elements: int) -> tuple
 
 
 def _beyond_box(rims: list[FloatArray], g: LumpGeometry, boundary: float, size: MeshSize) -> Iterator[FloatArray]:
-    """The lattices outside, below and above the box, whose sides from the top to the bottom are given."""
+    """Lattices outside, below and above the box with these `rims`, from the top to the bottom."""
     lid, *sides, floor = rims
     (corner_r, top), bottom = lid[-1].tolist(), float(floor[0, 1])
     side = np.concatenate([sides[0][:1, 1], *(part[1:, 1] for part in sides)])
@@ -320,7 +315,7 @@ def _beyond_box(rims: list[FloatArray], g: LumpGeometry, boundary: float, size: 
 
 
 def _down_from(start: float, stop: float, boundary: float, *, first: float, grade: float) -> FloatArray:
-    """Nodes down a line, one of them at the layer boundary; empty when the line has no length."""
+    """Nodes down a line, one of them at the layer boundary; empty for a line without length."""
     if not stop > start:
         return np.zeros(0)
     if not start < boundary < stop:
@@ -379,80 +374,86 @@ def stiffness_factor(
     return np.concatenate([scaled, np.sqrt(bulk) * (root @ volume)], axis=-2)
 
 
-class Part(Record, eq=False):
+class PartStiffness(Record, eq=False):
     """Stiffness of a part of a mesh."""
 
     matrix: csc_array  #: Symmetric, sparse.
-    unknowns: IndexArray  #: Which unknown each row is, rising.
+    unknowns: IndexArray  #: Number of the unknown of each row, rising.
 
     @classmethod
     def of(
         cls, elements: IndexArray, stiffness: FloatArray, number: IndexArray, sign: FloatArray | None = None
-    ) -> Part:
-        """Assemble (e, k, k) stiffnesses of elements; each of a node's displacements is the unknown of the (n, c)
-        `number`, -1 for none, with its `sign`."""
+    ) -> PartStiffness:
+        """Assemble (e, k, k) stiffnesses of elements.
+
+        `number` has the (n, c) unknowns of the nodes' displacements, -1 for none, and `sign` their signs.
+        """
         unknown = number[elements].reshape(len(elements), -1)
         if sign is not None:
             signs = sign[elements].reshape(len(elements), -1)
             stiffness = stiffness * (signs[:, :, None] * signs[:, None, :])
-        used = np.unique(unknown[unknown >= 0])
-        place = np.where(unknown >= 0, np.searchsorted(used, unknown), -1)
+        unknowns = np.unique(unknown[unknown >= 0])
+        place = np.where(unknown >= 0, np.searchsorted(unknowns, unknown), -1)
         row, column = np.broadcast_arrays(place[:, :, None], place[:, None, :])
-        kept = (row >= 0) & (column >= 0)
-        return cls(coo_array((stiffness[kept], (row[kept], column[kept])), shape=2 * (len(used),)).tocsc(), used)
+        free = (row >= 0) & (column >= 0)
+        shape = 2 * (len(unknowns),)
+        return cls(coo_array((stiffness[free], (row[free], column[free])), shape=shape).tocsc(), unknowns)
 
-    def without(self, held: IndexArray) -> Part:
-        """The same with some unknowns held at 0."""
-        free = ~np.isin(self.unknowns, held)
-        return Part(self.matrix[free][:, free], self.unknowns[free])
+    def without(self, fixed: IndexArray) -> PartStiffness:
+        """The stiffness with some unknowns fixed at 0."""
+        free = ~np.isin(self.unknowns, fixed)
+        return PartStiffness(self.matrix[free][:, free], self.unknowns[free])
 
-    def around(self, rim: IndexArray, skin: IndexArray) -> tuple[FloatArray, FloatArray]:
-        """Displacements (b, b) of the lump's boundary, by its unknowns `rim`, and (s, b) of the skin, for unit forces
-        on that boundary with nothing inside; those that are not in the part are 0 and take no force."""
-        on = np.searchsorted(self.unknowns, rim[np.isin(rim, self.unknowns)])
-        force = np.zeros((len(self.unknowns), len(on)))
-        force[on, np.arange(len(on))] = 1.0
-        found = _solved(self.matrix, force)
-        found[on] = 0.5 * (found[on] + found[on].T)
-        sunk = np.zeros((len(skin), len(on)))
+    def hole_flexibility(self, rim: IndexArray, skin: IndexArray) -> tuple[FloatArray, FloatArray]:
+        """(b, b) displacements of the lump's boundary and (s, b) of the skin, for unit forces on an empty boundary.
+
+        `rim` and `skin` are unknowns; those that are not in the part are 0 and take no force.
+        """
+        boundary = np.searchsorted(self.unknowns, rim[np.isin(rim, self.unknowns)])
+        force = np.zeros((len(self.unknowns), len(boundary)))
+        force[boundary, np.arange(len(boundary))] = 1.0
+        displacement = _solve(self.matrix, force)
+        displacement[boundary] = 0.5 * (displacement[boundary] + displacement[boundary].T)
+        sinking = np.zeros((len(skin), len(boundary)))
         moves = np.isin(skin, self.unknowns)
-        sunk[moves] = found[np.searchsorted(self.unknowns, skin[moves])]
-        return found[on], sunk
+        sinking[moves] = displacement[np.searchsorted(self.unknowns, skin[moves])]
+        return displacement[boundary], sinking
 
-    def within(self, rim: IndexArray) -> FloatArray:
+    def condensed_on(self, rim: IndexArray) -> FloatArray:
         """(b, b) stiffness of the lump condensed onto its boundary (Guyan 1965: exact in statics)."""
-        on = np.searchsorted(self.unknowns, rim[np.isin(rim, self.unknowns)])
+        boundary = np.searchsorted(self.unknowns, rim[np.isin(rim, self.unknowns)])
         inner = np.flatnonzero(~np.isin(self.unknowns, rim))
-        coupling = self.matrix[inner][:, on].toarray()
-        kept = self.matrix[on][:, on].toarray() - coupling.T @ _solved(self.matrix[inner][:, inner], coupling)
-        return np.asarray(0.5 * (kept + kept.T))
+        coupling = self.matrix[inner][:, boundary].toarray()
+        condensed = self.matrix[boundary][:, boundary].toarray()
+        condensed -= coupling.T @ _solve(self.matrix[inner][:, inner], coupling)
+        return np.asarray(0.5 * (condensed + condensed.T))
 
 
-def _solved(matrix: csc_array, sides: FloatArray) -> FloatArray:
-    """Solution of a symmetric positive definite system for many right-hand sides: one factorisation."""
+def _solve(matrix: csc_array, right: FloatArray) -> FloatArray:
+    """Solution of a symmetric positive definite system for many right-hand sides, by one factorisation."""
     factor = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    return np.asarray(factor.solve(sides))
+    return np.asarray(factor.solve(right))
 
 
 class CondensedHole(Record, eq=False):
     r"""A body with a hole where the lump is, condensed onto the hole's boundary and the skin.
 
-    With the flexibility F of the surroundings and the stiffness S of what fills the hole, the boundary moves by
-    :math:`(I + F S)^{-1} F f`. The difference of two such answers is written as one product, so that it is exact to
-    rounding however small it is, and vanishes for equal stiffness:
+    With the flexibility F of the surroundings and the stiffness S of the filling, the boundary moves by
+    :math:`(I + F S)^{-1} F f`. The difference of two fillings is one product, exact to rounding however small:
 
     .. math:: -F_s (I + S_1 F)^{-1} (S_1 - S_0) (I + F S_0)^{-1} F_s^T
     """
 
-    flexibility: FloatArray  #: F, (b, b) array: displacements on the boundary for unit forces there, nothing inside.
+    flexibility: FloatArray  #: F, (b, b) array: Displacements on the empty boundary for unit forces there.
     skin: FloatArray  #: F_s, (s, b) array: Sinking of the skin for the same forces.
     unit_stiffness: FloatArray  #: (b, b) array: The lump, condensed on its boundary, for a modulus of 1 kPa.
     original_stiffness: FloatArray  #: S_0, (b, b) array: The tissue that the lump replaces.
 
     def change(self, lump_kpa: float) -> FloatArray:
         """(s, s) change of the skin's compliance when tissue is replaced by a lump of modulus `lump_kpa`; symmetric."""
-        inside, identity = lump_kpa * self.unit_stiffness, np.eye(len(self.flexibility))
+        stiffness, identity = lump_kpa * self.unit_stiffness, np.eye(len(self.flexibility))
         before = np.linalg.solve(identity + self.flexibility @ self.original_stiffness, self.skin.T)
-        forces = np.linalg.solve(identity + inside @ self.flexibility, (inside - self.original_stiffness) @ before)
+        difference = (stiffness - self.original_stiffness) @ before
+        forces = np.linalg.solve(identity + stiffness @ self.flexibility, difference)
         change = self.skin @ forces
         return np.asarray(-0.5 * (change + change.T))

@@ -13,7 +13,7 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.axisymmetric import skin_flexibility
 from tactile_bayes.forward.contact import ContactStiffness, HeadSection, solve_contact
-from tactile_bayes.forward.mesh import CondensedHole, Mesh, Part, body_mesh, quadrature, stiffness_factor
+from tactile_bayes.forward.mesh import CondensedHole, Mesh, PartStiffness, body_mesh, quadrature, stiffness_factor
 from tactile_bayes.forward.tissue import Body, Layers
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 from tactile_bayes.presets import MEAN_KPA
@@ -23,7 +23,7 @@ from tactile_bayes.presets import MEAN_KPA
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
-def plane_part(mesh: Mesh, young_kpa: FloatArray, chosen: BoolArray, *, poisson: float) -> Part:
+def plane_part(mesh: Mesh, young_kpa: FloatArray, chosen: BoolArray, *, poisson: float) -> PartStiffness:
     """Stiffness of a mesh's chosen elements, by their Young's moduli; unknowns are ``x0, z0, x1, z1, ...``."""
     elements = mesh.elements[chosen]
     gradient, place, weight = quadrature(mesh.nodes[elements])
@@ -32,23 +32,20 @@ def plane_part(mesh: Mesh, young_kpa: FloatArray, chosen: BoolArray, *, poisson:
     strain[..., 2, :, 0], strain[..., 2, :, 1] = gradient[..., 1], gradient[..., 0]
     factor = stiffness_factor(strain.reshape(*weight.shape, 3, 18), place, weight, normal=2, poisson=poisson)
     stiffness = factor.transpose(0, 2, 1) @ factor * young_kpa[chosen, None, None]
-    return Part.of(elements, stiffness, np.arange(2 * len(mesh.nodes)).reshape(-1, 2))
+    return PartStiffness.of(elements, stiffness, np.arange(2 * len(mesh.nodes)).reshape(-1, 2))
 
 
-def _held(mesh: Mesh, *, even: bool) -> IndexArray:
-    """Unknowns that do not move: at the chest wall, along x at the body's end, and by symmetry on the axis u_x for
-    loads symmetric in x, u_z for antisymmetric ones."""
+def _fixed(mesh: Mesh, *, even: bool) -> IndexArray:
+    """Unknowns that do not move: at the chest wall, u_x at the body's end, and on the axis u_x (`even`) or u_z."""
     axis, end, base = mesh.edges
     return np.flatnonzero(np.stack([end | base | (axis & even), base | (axis & (not even))], axis=1))
 
 
 def skin_average(x_mm: FloatArray, *, edges_mm: FloatArray, even: bool) -> FloatArray:
-    """Matrix (c, k) that takes displacements of the skin's k nodes, from 0 on, to their averages over c cells.
+    """(c, k) matrix from displacements of the skin's k nodes, from 0 on, to their averages over c cells.
 
-    `even`: the displacement continues to x < 0 with the same sign, or else with the other.
-
-    A cubic spline through the nodes, not the elements' own quadratics: their slopes jump from element to element, and a
-    contact pressure answers a jump of slope with a spike. Frames are up to seven times closer to converged ones.
+    By a cubic spline through the nodes, even or odd in x: the elements' own quadratics have jumps of slope, which a
+    contact pressure answers with a spike (record 0020).
     """
     k = len(x_mm)
     both = np.concatenate([-x_mm[:0:-1], x_mm])
@@ -110,10 +107,9 @@ def _log_primitive(x: FloatArray, b: float) -> FloatArray:
 
 # --- Static condensation of a body with a lump onto its surface and the lump's boundary.
 #
-# The skin of the layered body without a lump answers exactly (`surface_compliance`). What the lump changes is that a
-# hole in the body is filled with the lump and not with the layers' own tissue (`mesh.CondensedHole`). One
-# factorisation a geometry then gives every stiffness ratio. The body is symmetric, so all this is done twice on half of
-# it: for loads symmetric and antisymmetric in x.
+# The skin's compliance is the exact one of the layers (`surface_compliance`), and its change by a hole that is filled
+# with the lump instead of the layers' own tissue (`mesh.CondensedHole`): one factorisation per geometry gives every
+# stiffness ratio (record 0021). The body is symmetric: half of it is solved for loads even and odd in x.
 
 FINENESS = 2
 CELL_MM = 0.25
@@ -141,8 +137,8 @@ class SurfaceCompliance(Record, eq=False):
         """(n, n) compliance with a lump of E2/E1 = `stiffness_ratio`, symmetric and positive definite."""
         require(0 < stiffness_ratio < np.inf, "stiffness_ratio", stiffness_ratio, "be finite and above 0")
         even, odd = (hole.change(stiffness_ratio * self.body.fat_kpa) for hole in (self.even, self.odd))
-        alike, across = even + odd, even - odd
-        change = np.block([[alike[::-1, ::-1], across[::-1]], [across[:, ::-1], alike]])
+        same_side, other_side = even + odd, even - odd
+        change = np.block([[same_side[::-1, ::-1], other_side[::-1]], [other_side[:, ::-1], same_side]])
         # each half carries half of a load, and force is pressure times width
         return np.asarray(self.without_lump() + 0.5 * self.cell_mm * change)
 
@@ -150,34 +146,32 @@ class SurfaceCompliance(Record, eq=False):
 def condense(
     body: Body, *, reach_mm: float = 72.0, cell_mm: float = CELL_MM, fineness: int = FINENESS
 ) -> SurfaceCompliance:
-    """Condense a body onto cells of its skin from ``-reach_mm`` to ``reach_mm``, rounded up to a whole number
-    of cells."""
+    """Condense a body onto cells of its skin from ``-reach_mm`` to ``reach_mm``, rounded up to whole cells."""
     count = int(np.ceil(reach_mm / cell_mm - 1e-9))
     half: FloatArray = cell_mm * np.arange(count + 1.0)
     row = surface_compliance(2 * half[-1] * np.arange(2 * count) / (2 * count), cell_mm=cell_mm, layers=body.layers)
-    cut = body.seat < 1.0 and body.gland_ratio != 1.0  # the lump, by the fat-gland boundary
+    cut = body.seat < 1.0 and body.gland_ratio != 1.0  # the fat-gland boundary cuts the lump
     mesh = body_mesh(body, fineness=fineness, layered=cut)
     plain = body_mesh(body, fineness=fineness, layered=False) if cut else mesh
     modulus = np.where(mesh.gland, body.gland_ratio, 1.0) * body.fat_kpa
-    around, within = (plane_part(mesh, modulus, one, poisson=body.poisson) for one in (~mesh.lump, mesh.lump))
+    outside, inside = (plane_part(mesh, modulus, chosen, poisson=body.poisson) for chosen in (~mesh.lump, mesh.lump))
     unit = plane_part(plain, np.ones(len(plain.elements)), plain.lump, poisson=body.poisson)
     skin, holes = mesh.skin, []
-    rim, plain_rim = ((2 * one.rim[:, None] + np.arange(2)).ravel() for one in (mesh, plain))
+    rim, plain_rim = ((2 * nodes[:, None] + np.arange(2)).ravel() for nodes in (mesh.rim, plain.rim))
     for even in (True, False):
-        held = _held(mesh, even=even)
-        flexibility, sunk = around.without(held).around(rim, 2 * skin + 1)
+        fixed = _fixed(mesh, even=even)
+        flexibility, sinking = outside.without(fixed).hole_flexibility(rim, 2 * skin + 1)
         average = skin_average(mesh.nodes[skin, 0], edges_mm=half, even=even)
-        lump = unit.without(_held(plain, even=even)).within(plain_rim)
-        holes.append(CondensedHole(flexibility, average @ sunk, lump, within.without(held).within(rim)))
+        lump = unit.without(_fixed(plain, even=even)).condensed_on(plain_rim)
+        original = inside.without(fixed).condensed_on(rim)
+        holes.append(CondensedHole(flexibility, average @ sinking, lump, original))
     return SurfaceCompliance(body, np.concatenate([-half[:0:-1], half]), row, *holes)
 
 
 # --- Frames of a head that slides over the lump in two dimensions, and the map they average to.
 #
-# A map is the mean of all pressures measured at a place. Here a frame is the pressure on the cells under the head,
-# the head stands at equal steps, and a cell of the map is as wide as a step: it takes every reading whose cell lies
-# in it (whole cells always do). Far from the lump a map cell so collects the head's profile at equal distances over
-# the whole width, each once, and its mean is the mean of a frame: 1 after normalising, without a correction.
+# The head stands at equal steps, and a cell of the map is as wide as a step. Far from the lump a cell collects the
+# head's profile at equal distances over its width, each once: its mean is that of a frame, 1 after normalising.
 
 POSITIONS_MM = (-60.0, 60.0, 0.5)
 _NOMINAL_HEAD = HeadSection()
@@ -209,7 +203,7 @@ class LineFrames(Record, eq=False):
 
 
 class TactileLine(Record, eq=False):
-    """A one-dimensional tactile map: the counterpart of `TactileMap` for a line."""
+    """One-dimensional tactile map: the counterpart of `TactileMap` for a line."""
 
     x_mm: FloatArray  #: (k,) array: Centres of the map's cells.
     mean: FloatArray  #: (k,) array: Mean of the readings in a cell; NaN without any.
@@ -218,7 +212,7 @@ class TactileLine(Record, eq=False):
 
 
 def head_positions(positions_mm: tuple[float, float, float] = POSITIONS_MM) -> FloatArray:
-    """Equal steps of the head from first to last, both included."""
+    """(m,) positions of the head at equal steps from first to last, both included."""
     first, last, step = positions_mm
     return np.asarray(first + step * np.arange(round((last - first) / step) + 1), dtype=np.float64)
 
@@ -231,8 +225,7 @@ def press(
     head: HeadSection = _NOMINAL_HEAD,
     mean_kpa: float | FloatArray = MEAN_KPA,
 ) -> LineFrames:
-    """Frames of a head pressed with given force at positions `x_c_mm`; the mean pressure over the sensing width is one
-    or (m,).
+    """Frames of a head at (m,) positions `x_c_mm`, pressed with one or (m,) mean pressures over the sensing width.
 
     A `stiffness_ratio` (E2/E1) of None is the body without a lump. Shoulders outside the sensing cells press and are
     not in the frames.
@@ -249,9 +242,9 @@ def press(
     level = np.broadcast_to(np.asarray(mean_kpa, dtype=np.float64), (len(first),))
     pressure, touching = np.empty((len(first), int(senses.sum()))), None
     for i, (begin, kpa) in enumerate(zip(first.tolist(), level.tolist(), strict=True)):
-        under = ContactStiffness.of(_window(matrix, begin, len(profile)))
-        found = solve_contact(under, profile, mean_kpa=kpa, counted=senses, touching=touching)
-        pressure[i], touching = found.pressure_kpa[senses], found.touching
+        stiffness = ContactStiffness.of(_window(matrix, begin, len(profile)))
+        contact = solve_contact(stiffness, profile, mean_kpa=kpa, counted=senses, touching=touching)
+        pressure[i], touching = contact.pressure_kpa[senses], contact.touching
     return LineFrames(np.asarray(x_c_mm, dtype=np.float64), _cell_centres(pressure.shape[1], cell), pressure)
 
 
@@ -262,13 +255,14 @@ def press_layers(
     mean_kpa: float | FloatArray = MEAN_KPA,
     cell_mm: float = CELL_MM,
 ) -> LineFrames:
-    """Frames of a body without a lump, P1, one per mean pressure; they do not depend on the head's position."""
+    """Frames of a body without a lump, P1, one per mean pressure, wherever the head is."""
     profile, senses = head.cell_profile_mm(cell_mm), head.sensing_cells(cell_mm)
     row = surface_compliance(np.asarray(cell_mm * np.arange(len(profile))), cell_mm=cell_mm, layers=layers)
-    under = ContactStiffness.of(np.asarray(toeplitz(row)))
+    stiffness = ContactStiffness.of(np.asarray(toeplitz(row)))
     level = np.atleast_1d(np.asarray(mean_kpa, dtype=np.float64))
-    found = [solve_contact(under, profile, mean_kpa=kpa, counted=senses).pressure_kpa[senses] for kpa in level.tolist()]
-    return LineFrames(np.zeros(len(level)), _cell_centres(int(senses.sum()), cell_mm), np.stack(found))
+    contacts = [solve_contact(stiffness, profile, mean_kpa=kpa, counted=senses) for kpa in level.tolist()]
+    pressure = np.stack([contact.pressure_kpa[senses] for contact in contacts])
+    return LineFrames(np.zeros(len(level)), _cell_centres(pressure.shape[1], cell_mm), pressure)
 
 
 def _cell_centres(count: int, cell_mm: float) -> FloatArray:
@@ -277,7 +271,7 @@ def _cell_centres(count: int, cell_mm: float) -> FloatArray:
 
 
 def _window(matrix: FloatArray, first: float, n: int) -> FloatArray:
-    """(n, n) diagonal block that begins at `first`; between two cells, the weighted mean of both blocks."""
+    """(n, n) diagonal block that begins at `first`; between two cells the weighted mean of both blocks."""
     low = int(np.clip(np.floor(first + 1e-9), 0, len(matrix) - n))
     share, block = first - low, matrix[low : low + n, low : low + n]
     if abs(share) <= 1e-9:
@@ -293,7 +287,7 @@ def slide(
     mean_kpa: float = MEAN_KPA,
     positions_mm: tuple[float, float, float] = POSITIONS_MM,
 ) -> LineFrames:
-    """Simulate frames of a head that slides across the lump; mirrored positions are solved once."""
+    """Frames of a head that slides across the lump; mirrored positions are solved once."""
     x_c = head_positions(positions_mm)
     if not np.allclose(x_c, -x_c[::-1], rtol=0, atol=1e-9):
         return press(surface, stiffness_ratio, x_c, head=head, mean_kpa=mean_kpa)
@@ -322,24 +316,20 @@ def build_line(frames: LineFrames) -> TactileLine:
 # Symbols as in the paper, except that its three meanings of *a* have names of their own: `SHARE` (alpha, 0.5), the
 # curvature :math:`1/a(t)^2` of the homogeneous profile, and the map's amplitude, which is not part of this model.
 
-SHARE = 0.5  #: alpha: share of the homogeneous profile that is taken off the frame over the lump (P2 = P0 - alpha P1).
+SHARE = 0.5  #: alpha: share of the homogeneous profile that is subtracted over the lump (P2 = P0 - alpha P1).
 
 DEEPEST_RATIO, LEAST_D_MM = 1.0, 10.0
-"""h/d up to which, and diameter in mm from which, the map of Eqs 1 to 4 has a lump about as high and wide as plane
-strain: amplitude -33 to +56 %, width -31 to +59 %, by record 0098."""
+"""Largest h/d and least diameter in mm for which the map of Eqs 1 to 4 has a lump about as high and wide as plane
+strain: amplitude -33 to +56 %, width -31 to +59 % (record 0098)."""
 LOST_RATIO = 1.5  #: h/d from which the map of Eqs 1 to 4 has lost most lumps (record 0098).
 RANGE = f"it holds for cylinders of {LEAST_D_MM:g} mm and more down to h/d {DEEPEST_RATIO:g}"
 
 
 def outside_range(d_mm: float, depth_ratio: float) -> str | None:
-    """Warn in one line of a lump that the empirical model does not stand for; None inside its range.
-
-    Below, the frame over the lump has no bump of its own: least squares of Eq 2 makes it as flat as the homogeneous
-    profile, and Eq 3's map has no lump, or too low a one. Smaller lumps get a bump two to three times too wide.
-    """
+    """Line of warning for a lump outside the empirical model's range (record 0098); None inside it."""
     if depth_ratio > DEEPEST_RATIO:
-        what = "loses most lumps" if depth_ratio >= LOST_RATIO else "makes lumps too low and wide, or loses them"
-        return f"warning: h/d {depth_ratio:g}: the empirical model {what} at this depth; {RANGE} (use plane-strain)"
+        fault = "loses most lumps" if depth_ratio >= LOST_RATIO else "makes lumps too low and wide, or loses them"
+        return f"warning: h/d {depth_ratio:g}: the empirical model {fault} at this depth; {RANGE} (use plane-strain)"
     if d_mm < LEAST_D_MM:
         return f"warning: d {d_mm:g} mm: the empirical model makes it too wide; {RANGE} (use plane-strain)"
     return None
@@ -366,7 +356,7 @@ def kappa(x_c_mm: FloatArray, *, d_mm: float) -> FloatArray:
 
 
 class EmpiricalModel(Record):
-    """The fitted parameters of one case."""
+    """Fitted parameters of one case."""
 
     peak_kpa: float
     curvature_per_mm2: float
@@ -411,11 +401,7 @@ class EmpiricalModel(Record):
 def fit_empirical(
     s_mm: FloatArray, far_kpa: FloatArray, centred_kpa: FloatArray, *, d_mm: float, half_width_mm: float
 ) -> EmpiricalModel:
-    """Fit Eqs 1 and 2 to two frames, one far from the lump (Fig 5a) and one with the head's centre over it (P0, Fig
-    5b), as section 2.2 does.
-
-    The diameter is for Eq 4.
-    """
+    """Fit Eqs 1 and 2 to a frame far from the lump (Fig 5a) and one centred over it (P0, Fig 5b); `d_mm` is Eq 4's."""
     if len(s_mm) < 4 or not (far_kpa > 0).any():
         raise BadDataError(f"a frame of {len(s_mm)} cells", way_out="give at least 4, some of them above 0 kPa")
 
@@ -438,7 +424,7 @@ def fit_empirical(
 
 
 class ShapeFit(Record):
-    """The multiple of a shape that fits best: its height, the shape's parameter and the sum of squares left."""
+    """Best multiple of a shape: its height, the shape's parameter and the residual sum of squares."""
 
     height: float
     parameter: float
@@ -448,23 +434,22 @@ class ShapeFit(Record):
 def fit_shape(shape: Callable[[float], FloatArray], data: FloatArray, *, grid: FloatArray) -> ShapeFit:
     """Least squares of ``height * shape(parameter)``: the lowest minimum between the ends of an increasing grid.
 
-    The height is linear and leaves one unknown (variable projection; Golub & Pereyra 1973), which is looked for on the
-    grid first and then refined about the best place. Steps of Gauss and Newton do not settle here where the shape
-    leaves more of the data than it explains, as a faint bump in its trough does.
+    The height is eliminated (variable projection; Golub & Pereyra 1973). Gauss-Newton steps do not settle where the
+    shape leaves more of the data than it explains, as a faint bump in its trough does.
     """
 
-    def left(parameter: float) -> float:
+    def residual(parameter: float) -> float:
         return fit_height(shape(parameter), data)[1]
 
-    k = int(np.argmin([left(value) for value in grid]))
+    k = int(np.argmin([residual(value) for value in grid]))
     bounds = (grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)])
-    refined = float(minimize_scalar(left, bounds=bounds, method="bounded", options={"xatol": 1e-11}).x)
-    best = min((refined, float(grid[k])), key=left)
+    refined = float(minimize_scalar(residual, bounds=bounds, method="bounded", options={"xatol": 1e-11}).x)
+    best = min((refined, float(grid[k])), key=residual)
     height, sse = fit_height(shape(best), data)
     return ShapeFit(height, best, sse)
 
 
 def fit_height(shape: FloatArray, data: FloatArray) -> tuple[float, float]:
-    """The best multiple of `shape` and the sum of squares it leaves of `data`."""
+    """Best multiple of `shape`, and the residual sum of squares of `data`."""
     height = float(shape @ data / (shape @ shape))
     return height, float(np.sum((data - height * shape) ** 2))

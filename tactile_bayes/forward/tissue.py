@@ -13,14 +13,10 @@ from tactile_bayes.presets import FAT_KPA, GLAND_RATIO, POISSON, THICKNESS_MM
 
 LEAST_DEPTH_RATIO = 0.52
 MOST_SEAT = 2.0
-# Lumps and layers outside are no breast's: a mesh of them would have elements without end, or none that differ.
-LEAST_MM, MOST_MM = 0.1, 1e4
-# A lump that reaches less than this far into the gland, in radii, rests on it: the mesh could not tell its nodes apart.
-_RESTS = 1e-4
-# A film of fat under the lump that is thinner than this, in radii, is none: no element could be as thin.
-_THINNEST_FILM = 0.01
-SEATS = {"centred": 0.0, "resting": 1.0}
-"""Named seats. Where the lump's centre lies on the fat-gland boundary, and where the lump only touches it."""
+LEAST_MM, MOST_MM = 0.1, 1e4  #: Limits of lumps and layers that a mesh can resolve.
+_RESTS = 1e-4  #: Depth in the gland, in radii, below which a lump rests on it: the mesh's nodes would coincide.
+_THINNEST_FILM = 0.01  #: Thickness of fat under the lump, in radii, below which there is none: no element is as thin.
+SEATS = {"centred": 0.0, "resting": 1.0}  #: The lump's centre lies on the fat-gland boundary, or it only touches it.
 
 
 class Layers(Record):
@@ -42,7 +38,7 @@ class Layers(Record):
 
 
 class Body(Record):
-    """Three layers and the place of a circular lump; the lump's stiffness is given elsewhere.
+    """Three layers with a circular lump, without its stiffness.
 
     Wellman & Howe (1999) section 2.2: fat of 5 kPa, gland ten times as stiff, a rigid chest wall, plane strain.
     """
@@ -51,9 +47,9 @@ class Body(Record):
     depth_ratio: float
     """h/d: depth of the lump's centre below the skin over its diameter, at least 0.52 (at 0.5 it touches the skin)."""
     seat: float = 0.0
-    """How far the lump stands out of the gland, 0 to 2. The fat-gland boundary lies at depth ``h + seat d/2``: through
-    the lump's centre at 0 (centred), under its lowest point at 1 (resting, the lump wholly in the fat), below it from
-    there on. From 1e-4 below 1 to 0.01 above it, it is 1."""
+    """Height of the lump out of the gland, 0 to 2: the fat-gland boundary lies at depth ``h + seat d/2``, through the
+    lump's centre at 0 (centred), under its lowest point at 1 (resting, the lump wholly in the fat). From 1e-4 below 1
+    to 0.01 above it, it is 1."""
     thickness_mm: float | None = None
     """Depth of the chest wall; None takes 70 mm, or 2 mm below ``h + 0.6 d`` and below the fat where that is deeper."""
     fat_kpa: float = FAT_KPA
@@ -94,7 +90,7 @@ class Body(Record):
 
 
 def parse_seat(text: str) -> float:
-    """Convert ``centred``, ``resting`` or a number from 0 to 2 to a seat."""
+    """Seat from ``centred``, ``resting`` or a number from 0 to 2."""
     try:
         seat = SEATS[text] if text in SEATS else float(text)
     except ValueError:
@@ -193,7 +189,7 @@ class Rib(Record):
     stiffness_ratio: Annotated[float, Meta(gt=0, le=1_000_000)] = 100.0  #: Modulus of the balls over that of fat.
 
     def balls(self) -> tuple[SolidLump, ...]:
-        """The row as lumps."""
+        """The row's balls as lumps."""
         each_side = int(self.half_length_mm / self.spacing_mm + 1e-9)
         ratio = self.depth_mm / self.d_mm
         return tuple(
@@ -259,10 +255,10 @@ def check_solid(body: SceneBody, lumps: Sequence[SolidLump], ribs: Sequence[Rib]
     fat_thickness(body, lumps)
 
 
-def _check_room(key: str, depth: float, ends: tuple[float, float], what: str, where: str) -> None:
-    """Refuse a depth at which something stands out of the body."""
+def _check_room(key: str, depth: float, ends: tuple[float, float], name: str, rule: str) -> None:
+    """Refuse a depth outside its ends, at which the named thing stands out of the body."""
     least, most = ends
     if not least <= depth <= most:
         out = "stands out of the skin" if depth < least else "reaches into the chest wall"
-        way_out = f"it must lie in {least:.4g} to {most:.4g}{where}"
-        raise BadDataError(f"{key} is {depth:g}: {what} {out}", way_out=way_out)
+        way_out = f"it must lie in {least:.4g} to {most:.4g}{rule}"
+        raise BadDataError(f"{key} is {depth:g}: {name} {out}", way_out=way_out)

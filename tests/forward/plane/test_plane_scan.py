@@ -127,7 +127,7 @@ IMPOSSIBLE = {
         "strokes.half_length_mm 150.*mesh reaches",
     ),
     "head wider than the mesh": (
-        {"head": scene_types.HeadSection(rows=200, radius_mm=500.0)},
+        {"head": scene_types.Head(rows=200, radius_mm=500.0)},
         "a head 300 mm wide.*the mesh reaches 142 mm: shorten the strokes or narrow the head",
     ),
     "bump": (

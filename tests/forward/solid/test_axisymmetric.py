@@ -20,7 +20,7 @@ from tactile_bayes.forward.axisymmetric import (
     orders_needed,
     skin_spline,
 )
-from tactile_bayes.forward.mesh import LumpGeometry, Mesh, MeshSize, Part, lump_mesh
+from tactile_bayes.forward.mesh import LumpGeometry, Mesh, MeshSize, PartStiffness, lump_mesh
 from tactile_bayes.forward.tissue import Layers
 
 CENTRED = LumpGeometry(7.5, 7.5, 15.0, Layers(15.0))
@@ -176,7 +176,7 @@ def test_without_a_lump_the_elements_sink_as_the_exact_layers() -> None:
     sinkings = []
     for gland in (50.0, 5.0):
         modulus = np.where(mesh.gland, gland, 5.0)
-        part = Part.of(mesh.elements, k * modulus[:, None, None], number, sign)
+        part = PartStiffness.of(mesh.elements, k * modulus[:, None, None], number, sign)
         skin = np.searchsorted(part.unknowns, number[mesh.skin[:-1], 2])
         force = np.zeros(len(part.unknowns))
         force[skin[0]] = 1 / (2 * np.pi)
