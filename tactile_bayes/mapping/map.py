@@ -227,7 +227,8 @@ def broken_assumptions(quality: Mapping[str, float]) -> Iterator[Finding]:
             f"the scan has {strokes:.0f} stroke{'' if strokes == 1 else 's'} only, and sizes were learned from 4 to 7 "
             "(simulated ones from 3 came out 6 % large)"
         )
-        yield finding("few_strokes", text)
+        remedy = f"scan with {LEAST_STROKES} strokes or more, side by side"
+        yield finding("few_strokes", text, remedy, remedy)
 
 
 def handling_findings(quality: Mapping[str, float]) -> Iterator[Finding]:
@@ -235,7 +236,7 @@ def handling_findings(quality: Mapping[str, float]) -> Iterator[Finding]:
     if quality.get("saturated_readings"):
         number = f"{quality['saturated_readings']:.0f} readings"
         text = f"{number} were pressed beyond the array's range and left out: the map is too low there"
-        yield finding("saturated_readings", text)
+        yield finding("saturated_readings", text, "press less hard", "press less hard")
     if quality.get("clipped_values"):
         yield finding("clipped_values", f"{quality['clipped_values']:.0f} values beyond the map's range were clipped")
     if quality.get("gain_unsettled"):
@@ -254,7 +255,8 @@ def handling_findings(quality: Mapping[str, float]) -> Iterator[Finding]:
         text = (
             f"the head was turned by {quality['yaw_sd_deg']:.0f} degrees (SD): the lump's length and breadth are mixed"
         )
-        yield finding("turned_head", text)
+        remedy = "keep the head square to its strokes"
+        yield finding("turned_head", text, remedy, remedy)
 
 
 def skewed(quality: Mapping[str, float]) -> str:

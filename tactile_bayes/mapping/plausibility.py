@@ -16,11 +16,18 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding, finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, principal_axes
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
-from tactile_bayes.mapping.select import SelectedFrames, chunks, frame_figures, refuse_without_frames, timing_figures
+from tactile_bayes.mapping.select import (
+    LEAST_FRAMES,
+    SelectedFrames,
+    chunks,
+    frame_figures,
+    refuse_without_frames,
+    timing_figures,
+)
 from tactile_bayes.scans import HeadShape, Landmarks
 
 RATE_HZ: Final = (5.0, 2000.0)  #: Rate of frames.
-LEAST_FRAMES, LEAST_USED_SHARE = 30, 0.05
+LEAST_USED_SHARE: Final = 0.05  #: Least share of the frames that are used; and `LEAST_FRAMES` in all.
 LEAST_AREA: Final = 1.5  #: Area of a map in areas of the array: a head that stood still covers its own and its noise.
 MOST_SPAN_MM: Final = 600.0  #: Range of the places along one axis: a chest is narrower.
 IMPOSSIBLE_MM: Final = 3000.0

@@ -81,6 +81,10 @@ def find_faults(scan: Scan) -> tuple[TaxelFault, ...]:
     )
 
 
+def _kinds(faults: Iterable[TaxelFault]) -> str:
+    return ", ".join(sorted({fault.fault for fault in faults}))
+
+
 def _element_levels(scan: Scan) -> tuple[FloatArray, ...]:
     """Each taxel's mean and flicker in kPa, and shares of frames: still, lost and saturated."""
     counts, calibration = scan.frames.counts, scan.element_calibration
@@ -317,6 +321,7 @@ def with_times(findings: Sequence[Finding], frames: Span, poses: Span) -> tuple[
 # --- Selection of the frames that go into a map, and the reasons for leaving others out (paper step ii, the gate).
 
 VALID_SHARE = 0.9  #: Share of valid taxels below which a frame is left out.
+LEAST_FRAMES = 30  #: Fewest used frames of an exam.
 
 
 class SelectedFrames(Record, eq=False, dict=True):
@@ -381,9 +386,8 @@ def select_frames(
     """
     faults, taxels = find_faults(scan), scan.head.shape[0] * scan.head.shape[1]
     if len(faults) >= taxels > 0:
-        kinds = ", ".join(sorted({fault.fault for fault in faults}))
         way_out = _counts_question([scan]) or "check the array's cable and its calibration"
-        raise BadDataError(f"none of the {taxels} taxels works ({kinds})", way_out=way_out)
+        raise BadDataError(f"none of the {taxels} taxels works ({_kinds(faults)})", way_out=way_out)
     fresh = cells.distinct_poses(scan.poses)
     poses = cells.poses_at(fresh, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=max_pose_gap_ms)
     readout = cells.Readout.of(scan.element_calibration, good_taxels(scan.head.shape, faults))
@@ -415,9 +419,11 @@ def refuse_without_frames(selections: list[SelectedFrames], *, pressure_window_k
         raise _without_poses(selections)
     gated = sum(int((selection.low | selection.high).sum()) for selection in selections)
     if not gated:
-        share = max(float(selection.valid_share.max()) for selection in selections)
+        best = max(selections, key=lambda part: float(part.valid_share.max()))
+        share, taxels = f"{100 * best.valid_share.max():.1f} %", best.good_taxels.size
+        faulty = f"; {len(best.faults)} of {taxels} taxels are {_kinds(best.faults)} throughout" if best.faults else ""
         raise BadDataError(
-            f"no frame has {100 * VALID_SHARE:g} % of its taxels valid (the best has {100 * share:.1f} %)",
+            f"no frame has {100 * VALID_SHARE:g} % of its taxels valid (the best has {share}{faulty})",
             way_out=_counts_question([part.scan for part in selections])
             or "repair the array, or press less hard if taxels are saturated",
         )
@@ -442,10 +448,12 @@ def _outside_window(selections: list[SelectedFrames], window: tuple[float, float
     imported = session.get("source") == "imported"  # a recorder knows its unit
     question = unit_question(float(middle), session.get("frames_unit", "kPa"), window) if imported else ""
     more = "" if question else _counts_question([part.scan for part in selections])
+    frames = sum(len(part.scan.frames) for part in selections)
+    short = f"the scan has {frames} frames only: record for longer; " if frames < LEAST_FRAMES else ""
     return BadDataError(
         f"no frame's mean lies within {window[0]:g} to {window[1]:g} kPa ({len(levels)} frames, means "
         f"{levels.min():.2f} to {levels.max():.2f} kPa, median {middle:.2f}{f': {question}' if question else ''})",
-        way_out=("import it again with the right --unit; " if question else "")
+        way_out=("import it again with the right --unit; " if question else short)
         + f"a window of {np.floor(low * 10) / 10:g} to {np.ceil(high * 10) / 10:g} kPa would keep nine in ten"
         + (f", but {more}" if more else ""),
     )
