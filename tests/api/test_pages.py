@@ -39,7 +39,7 @@ def test_the_python_guide_runs_as_printed(
     said = capsys.readouterr().out
     assert names["low"] < 15.0 < names["high"]
     assert (tmp_path / "size.png").read_bytes()[:4] == b"\x89PNG"
-    assert repr(names["found"]) in (DOCS / "python.md").read_text()
+    assert repr(names["estimate"]) in (DOCS / "python.md").read_text()
     assert "as stated" in said
     assert names["own"].session["imported_as"].startswith("frames in kPa")
     assert names["empty"].max_size_mm is None
@@ -54,9 +54,9 @@ def test_the_first_block_is_ten_lines() -> None:
 @pytest.mark.long
 def test_the_notebook_runs_and_holds_no_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = run(cells_of_notebook(), tmp_path, monkeypatch)
-    assert isinstance(names["found"], tb.SizeEstimate)
+    assert isinstance(names["estimate"], tb.SizeEstimate)
     own = tb.estimate(tb.build_map(names["own"])).max_size_mm
     assert own is not None
-    assert own.median == pytest.approx(names["found"].max_size_mm.median, rel=0.01)
+    assert own.median == pytest.approx(names["estimate"].max_size_mm.median, rel=0.01)
     cells = json.loads((DOCS / "python.ipynb").read_text())["cells"]
     assert not any(one.get("outputs") for one in cells)
