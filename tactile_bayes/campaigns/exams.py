@@ -363,22 +363,24 @@ def estimate_matched(path: Path, settings: Settings, match: Match) -> SizeEstima
     if not on_map(tactile_map, *place):
         words = f"mass {mass} would lie at ({place[0]:.1f}, {place[1]:.1f}) mm, off the map"
         raise BadDataError(words, way_out="check the landmarks, or give the row its centre_x_mm and centre_y_mm")
-    looked = estimate_file(path, replace(settings, centre_mm=place))
-    found = looked.estimate
-    here = next((one for one in found.masses if one.reported), None)
-    if found.status != "estimate" or here is None or np.hypot(here.x_mm - place[0], here.y_mm - place[1]) <= most_mm:
-        return looked
+    at_place = estimate_file(path, replace(settings, centre_mm=place))
+    estimate = at_place.estimate
+    reported = next((one for one in estimate.masses if one.reported), None)
+    if estimate.status != "estimate" or reported is None:
+        return at_place
+    if np.hypot(reported.x_mm - place[0], reported.y_mm - place[1]) <= most_mm:
+        return at_place
     reason = f"no lump found within {most_mm:g} mm of mass {mass}'s place, ({place[0]:.1f}, {place[1]:.1f}) mm"
     why = no_verdict(tactile_map) or Abstention("undetected", reason)
     none = Estimate(
         "no_estimate",
         why.reason,
-        candidates=found.candidates,
+        candidates=estimate.candidates,
         code=why.code,
-        masses=tuple(replace(one, reported=False) for one in found.masses),
-        findings=looked.tactile_map.findings,
+        masses=tuple(replace(one, reported=False) for one in estimate.masses),
+        findings=at_place.tactile_map.findings,
     )
-    return replace(looked, estimate=none)
+    return replace(at_place, estimate=none)
 
 
 def map_of_exam(path: Path, exam: Exam) -> TactileMap:

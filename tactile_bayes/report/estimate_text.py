@@ -225,12 +225,12 @@ def _advice_lines(report: EstimateReport) -> list[str]:
 
 def _quantities(report: EstimateReport | PooledReport) -> dict[str, Quantity]:
     """Quantities of `ROWS` that the report has, by name."""
-    found: dict[str, Any] = {}
+    quantities: dict[str, Any] = {}
     for path, _, _ in ROWS:
         holder, _, name = path.rpartition(".")
         held = getattr(report, holder, None) if holder else report
-        found[path] = getattr(held, name, None)
-    return {name: quantity for name, quantity in found.items() if quantity is not None}
+        quantities[path] = getattr(held, name, None)
+    return {name: quantity for name, quantity in quantities.items() if quantity is not None}
 
 
 def size_decimals(sizes: Iterable[Quantity]) -> int:

@@ -191,10 +191,10 @@ def size_sentences(exam: ShownExam) -> Iterator[str]:
     yield f"With a probability of {share} it lies between {size.low:.1f} and {size.high:.1f} mm{_supposed(exam)}."
     alike, spread = report.max_size_mm, report.figures.get("between_map_sd")
     if report.another_exam is not None and alike is not None:
-        told = "did not differ" if spread is None else f"differed by {100 * spread:.0f} % only"
+        spread_words = "did not differ" if spread is None else f"differed by {100 * spread:.0f} % only"
         learned = "as these maps suggest" if exam.pooled is not None else "as those of simulated bodies do"
         yield (
-            f"If exams of one lump {told}, {learned}, it would lie between {alike.low:.1f} and {alike.high:.1f} mm "
+            f"If exams of one lump {spread_words}, {learned}, it would lie between {alike.low:.1f} and {alike.high:.1f} mm "
             f"({share}): repeat exams of patients here can show whether they do."
         )
     least = report.leading.min_size_mm
@@ -217,14 +217,14 @@ def _supposed(exam: ShownExam) -> str:
     at_site = report.figures.get("repeatability") if exam.pooled is None else exam.pooled.site_words
     if at_site and exam.pooled is None:
         return f"; {at_site}"
-    told = f"; exams of a lump are taken to differ by {100 * spread:.0f} %"
+    words = f"; exams of a lump are taken to differ by {100 * spread:.0f} %"
     if at_site:
-        return f"{told}, by these maps and this site's other exams"
+        return f"{words}, by these maps and this site's other exams"
     stated = report.origin.settings.get("between_map_sd")
     if stated is not None:
-        return f"{told}, as was stated"
+        return f"{words}, as was stated"
     if exam.pooled is not None:
-        return f"{told}, learned from these maps"
+        return f"{words}, learned from these maps"
     return f", if exams of a lump differ by {100 * spread:.0f} %, as those of simulated bodies do"
 
 

@@ -147,16 +147,16 @@ def _tissue_document(tissue: HomogeneousTissue, limit: float) -> dict[str, objec
     }
 
 
-def _head_document(found: Uniformity) -> dict[str, Any]:
+def _head_document(design: Uniformity) -> dict[str, Any]:
     """JSON has no infinity: a flat head's radius is null."""
-    head = found.head
+    head = design.head
     return {
         "radius_mm": None if np.isinf(head.radius_mm) else head.radius_mm,
         "shoulder_mm": head.shoulder_mm,
         "shoulders": head.shoulders,
-        "face_mm": found.face_mm,
-        "worst": found.worst,
-        "worst_rms": found.worst_rms,
+        "face_mm": design.face_mm,
+        "worst": design.worst,
+        "worst_rms": design.worst_rms,
     }
 
 
