@@ -191,10 +191,10 @@ def size_sentences(exam: ShownExam) -> Iterator[str]:
     yield f"With a probability of {share} it lies between {size.low:.1f} and {size.high:.1f} mm{_supposed(exam)}."
     alike, spread = report.max_size_mm, report.figures.get("between_map_sd")
     if report.another_exam is not None and alike is not None:
-        spread_words = "did not differ" if spread is None else f"differed by {100 * spread:.0f} % only"
+        differ = "did not differ" if spread is None else f"differed by {100 * spread:.0f} % only"
         learned = "as these maps suggest" if exam.pooled is not None else "as those of simulated bodies do"
         yield (
-            f"If exams of one lump {spread_words}, {learned}, it would lie between {alike.low:.1f} and {alike.high:.1f} mm "
+            f"If exams of one lump {differ}, {learned}, it would lie between {alike.low:.1f} and {alike.high:.1f} mm "
             f"({share}): repeat exams of patients here can show whether they do."
         )
     least = report.leading.min_size_mm
