@@ -46,7 +46,7 @@ def validate_action(
         if as_json:
             for doubt in analysis.report.doubts:
                 click.echo(f"doubtful: {doubt}", err=True)
-        click.echo(dump_json(analysis.document) if as_json else analysis.told(methods=methods), nl=False)
+        click.echo(dump_json(analysis.document) if as_json else analysis.text_with(methods=methods), nl=False)
 
 
 def plan_action(

@@ -30,16 +30,16 @@ _FLAGS: Final = ("force", "same-mass", "register-strokes", "flat-field", "patien
 
 
 def options_as_keywords(text: str) -> str:
-    """A text with keywords in place of the command line's options; commands between backticks stay."""
+    """Replace the command line's options in a text by keywords; commands between backticks stay."""
     parts = text.split("`")
     for i in range(0, len(parts), 2):
-        parts[i] = _OPTION.sub(_keyword, _SETTINGS_FILE.sub("", parts[i]))
+        parts[i] = _OPTION.sub(_keyword_for, _SETTINGS_FILE.sub("", parts[i]))
     return "`".join(parts)
 
 
-def _keyword(found: re.Match[str]) -> str:
-    name, value = found[1].replace("-", "_"), found[2]
-    if found[1] in _FLAGS:
+def _keyword_for(match: re.Match[str]) -> str:
+    name, value = match[1].replace("-", "_"), match[2]
+    if match[1] in _FLAGS:
         return f"{name}=True" + (f" {value}" if value else "")
     if value is None:
         return name
@@ -50,7 +50,7 @@ def _keyword(found: re.Match[str]) -> str:
 
 
 def door(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
-    """A public function whose errors name keywords, but options where the command line calls it."""
+    """Decorate a public function: its errors name keywords, or options where the command line calls it."""
 
     @wraps(function)
     def called(*args: _Given.args, **keywords: _Given.kwargs) -> _Returned:
@@ -71,49 +71,49 @@ def door(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
 def takes(
     *records: type[Record], without: Collection[str] = ()
 ) -> Callable[[Callable[_Given, _Returned]], Callable[_Given, _Returned]]:
-    """A `door` whose further keywords are the fields of these records, and no others.
+    """Decorate a public function as `door` does; its further keywords are the fields of these records.
 
-    Help and completion show each with its default. A keyword that was left out is not handed on: the record that the
-    function makes of them has the default.
+    Help and completion show each with its default. A keyword that was left out is not passed on: the record that the
+    function makes of the others has the default.
     """
     fields = {name: default_of(record, name) for record in records for name in names_of(record) if name not in without}
 
-    def made(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
-        own = [one for one in inspect.signature(function).parameters.values() if one.kind is not one.VAR_KEYWORD]
-        known, entered = [*(one.name for one in own), *fields], door(function)
+    def decorate(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
+        parameters = [one for one in inspect.signature(function).parameters.values() if one.kind is not one.VAR_KEYWORD]
+        names, call = [*(one.name for one in parameters), *fields], door(function)
 
         @wraps(function)
         def called(*args: _Given.args, **keywords: _Given.kwargs) -> _Returned:
             for name in keywords:
-                if name not in known:
-                    raise TypeError(f"{function.__name__} has no keyword {name!r}; {suggestion(name, known)}")
-            return entered(*args, **keywords)
+                if name not in names:
+                    raise TypeError(f"{function.__name__} has no keyword {name!r}; {suggestion(name, names)}")
+            return call(*args, **keywords)
 
-        more = (inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=fields[name]) for name in fields)
-        called.__signature__ = inspect.Signature([*own, *more])  # type: ignore[attr-defined]
+        options = (inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=fields[name]) for name in fields)
+        called.__signature__ = inspect.Signature([*parameters, *options])  # type: ignore[attr-defined]
         return called
 
-    return made
+    return decorate
 
 
-def list_of(name: str, given: Any, what: str) -> Sequence[Any]:
-    """A list or other sequence as it is."""
-    if isinstance(given, str | bytes) or not isinstance(given, Iterable):
-        raise UsageError(f"{name} is {given!r}; give a list of {what}")
-    return list(given)
+def list_of(name: str, value: Any, kind: str) -> Sequence[Any]:
+    """Convert an iterable other than a text to a list; `kind` names its items in the error."""
+    if isinstance(value, str | bytes) or not isinstance(value, Iterable):
+        raise UsageError(f"{name} is {value!r}; give a list of {kind}")
+    return list(value)
 
 
 def plain(value: Any) -> Any:
-    """A number of numpy's as one of Python's, which files and reports hold; anything else as it is."""
+    """Convert a numpy scalar to a Python number, as files hold; return anything else as it is."""
     return value.item() if isinstance(value, np.generic) else value
 
 
 class TextResult(Record, eq=False):
-    """What a function returns, in a notebook shown as its text."""
+    """Base of results that a notebook shows as their text."""
 
     @property
     def text(self) -> str:
-        """In words."""
+        """The result in words."""
         raise NotImplementedError
 
     def _repr_html_(self) -> str:
@@ -126,45 +126,45 @@ PathLike = str | os.PathLike[str]
 
 
 @overload
-def path_of(given: PathLike) -> Path: ...
+def path_of(path: PathLike) -> Path: ...
 
 
 @overload
-def path_of(given: None) -> None: ...
+def path_of(path: None) -> None: ...
 
 
-def path_of(given: PathLike | None) -> Path | None:
+def path_of(path: PathLike | None) -> Path | None:
     """Convert a text or path to a path, with ``~`` as the home folder; None stays None."""
-    if given is None:
+    if path is None:
         return None
-    if not isinstance(given, str | os.PathLike):
-        raise UsageError(f"a path is wanted, not {type(given).__name__}; give it as text or pathlib.Path")
-    return Path(given).expanduser()
+    if not isinstance(path, str | os.PathLike):
+        raise UsageError(f"a path is wanted, not {type(path).__name__}; give it as text or pathlib.Path")
+    return Path(path).expanduser()
 
 
-def required_path(given: PathLike, name: str) -> Path:
+def required_path(path: PathLike, name: str) -> Path:
     """Convert to the path of an input, which may not be None."""
-    if given is None:
+    if path is None:
         raise UsageError(f"{name} is None; give the path of a file")
-    return path_of(given)
+    return path_of(path)
 
 
-def output_path(given: PathLike, written: Format) -> Path:
+def output_path(given: PathLike, kind: Format) -> Path:
     """Convert to the path of an output, which may not have the suffix of another format than the one written."""
     path = required_path(given, "the path")
-    check_suffix(path, written)
+    check_suffix(path, kind)
     return path
 
 
 def dataframe(data: Any, columns: list[str] | None = None) -> pandas.DataFrame:
-    """A table as pandas has it, which is loaded here only."""
+    """Make a pandas DataFrame; pandas is loaded here only."""
     import pandas
 
     return pandas.DataFrame(data, columns=columns)
 
 
-def table_of(given: PathLike | pandas.DataFrame, name: str) -> Path | Sheet:
+def table_of(table: PathLike | pandas.DataFrame, name: str) -> Path | Sheet:
     """Return a path as it is, and a DataFrame as CSV text."""
-    if hasattr(given, "to_csv"):
-        return Sheet(Path(f"{name} (DataFrame)"), given.to_csv(index=False))
-    return required_path(given, name)
+    if hasattr(table, "to_csv"):
+        return Sheet(Path(f"{name} (DataFrame)"), table.to_csv(index=False))
+    return required_path(table, name)

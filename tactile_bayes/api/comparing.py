@@ -62,7 +62,7 @@ class Comparison(TextResult, eq=False):
 
     @property
     def probability(self) -> float:
-        """Of the intervals that are shown where none is asked for."""
+        """Probability of the intervals shown by default."""
         return self.settings.interval
 
     @property
@@ -82,7 +82,7 @@ class Comparison(TextResult, eq=False):
 
     @property
     def why(self) -> str:
-        """Why nothing is compared; empty where something is."""
+        """Reason for no comparison; empty where there is one."""
         return self.compared.reason
 
     @property
@@ -110,7 +110,7 @@ class Comparison(TextResult, eq=False):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What speaks against the comparison, cautions first."""
+        """Findings against the comparison, cautions first."""
         return self.compared.findings
 
     @property
@@ -126,17 +126,17 @@ class Comparison(TextResult, eq=False):
 
     @property
     def document(self) -> dict[str, Any]:
-        """What ``compare --json`` prints."""
+        """The document that ``compare --json`` prints."""
         return self.report.document
 
     @property
     def text(self) -> str:
-        """What ``compare`` prints."""
+        """The text that ``compare`` prints."""
         return compare_summary(self.report)
 
     @property
     def full_text(self) -> str:
-        """What ``compare -v`` prints."""
+        """The text that ``compare -v`` prints."""
         return compare_text(self.report)
 
     @door
@@ -151,16 +151,16 @@ class Comparison(TextResult, eq=False):
 
     def page_text(self, *, title: str, name: str) -> str:
         """The page's HTML."""
-        of_visits = [[scan for one in visit for scan in one.provenance.scans] for visit in self.visits]
+        scans_by_visit = [[scan for one in visit for scan in one.provenance.scans] for visit in self.visits]
 
-        def agreed(fact: str, among: Sequence[Mapping[str, str]]) -> str:
-            values = {scan[fact] for scan in among if scan.get(fact)}
+        def common_value(fact: str, scans: Sequence[Mapping[str, str]]) -> str:
+            values = {scan[fact] for scan in scans if scan.get(fact)}
             return values.pop() if len(values) == 1 else ""
 
-        codes = tuple(agreed("visit", visit) for visit in of_visits)
-        patient, side, mass = (agreed(fact, list(chain(*of_visits))) for fact in ("subject", "side", "mass"))
-        told = codes if all(codes) and len(set(codes)) == len(codes) else ()
-        course = Course(title, name, patient, side, mass, visits=told, dates=self.dates)
+        visit_codes = tuple(common_value("visit", visit) for visit in scans_by_visit)
+        patient, side, mass = (common_value(fact, list(chain(*scans_by_visit))) for fact in ("subject", "side", "mass"))
+        distinct = visit_codes if all(visit_codes) and len(set(visit_codes)) == len(visit_codes) else ()
+        course = Course(title, name, patient, side, mass, visits=distinct, dates=self.dates)
         return growth_page(self.compared, self.report, self._drawn(), course)
 
     @door
@@ -196,12 +196,12 @@ def compare_answers(
     comparing.check_visits(len(visits))
     if settings.size_calibration == "none":
         raise UsageError("a comparison needs a size calibration; leave out --size-calibration none")
-    every = list(chain.from_iterable(visits))
-    named = list(chain.from_iterable(names))
+    answers = list(chain.from_iterable(visits))
+    all_names = list(chain.from_iterable(names))
     inputs = {f"visit_{v}_map_{i}": path for v, maps in enumerate(files, 1) for i, path in enumerate(maps, 1)}
-    calibration, digests = common_calibration(every, settings, names=named, inputs=inputs)
-    for index, earlier in repeated_scans([_scans([one]) for one in every]).items():  # they are no two exams
-        raise UsageError(f"{named[index]} and {named[earlier]} are of one scan; give one map of each scan")
+    calibration, digests = common_calibration(answers, settings, names=all_names, inputs=inputs)
+    for index, earlier in repeated_scans([_scans([one]) for one in answers]).items():  # they are no two exams
+        raise UsageError(f"{all_names[index]} and {all_names[earlier]} are of one scan; give one map of each scan")
     compared = _compared(visits, calibration, settings, comparing)
     of_visits = (
         one.labelled(f"visit {number}" if len(maps) == 1 else f"visit {number}, map {i}")
@@ -230,17 +230,17 @@ def compare_estimates(
     visits: Visits, settings: Settings, comparing: CompareOptions, *, names: Names, files: Files = ()
 ) -> Comparison:
     """Compare visits, maps estimated again where they are of another mass; see `compare_answers`."""
-    every = iter(reestimate_at_common_mass([one for visit in visits for one in visit]))
-    same = tuple(tuple(next(every) for _ in visit) for visit in visits)
-    answers = [[one.answer for one in visit] for visit in same]
-    return replace(compare_answers(answers, settings, comparing, names=names, files=files), visits=same)
+    estimates = iter(reestimate_at_common_mass([one for visit in visits for one in visit]))
+    by_visit = tuple(tuple(next(estimates) for _ in visit) for visit in visits)
+    answers = [[one.answer for one in visit] for visit in by_visit]
+    return replace(compare_answers(answers, settings, comparing, names=names, files=files), visits=by_visit)
 
 
 def _compared(
     visits: Sequence[Sequence[Answer]], calibration: BodyCalibration, settings: Settings, comparing: CompareOptions
 ) -> VisitComparison:
-    """Sizes of the visits, where codes and places do not contradict that they are of one mass."""
-    found = [[answer for answer in maps if answer.shape is not None] for maps in visits]
+    """Compare the visits, unless codes, places or missing lumps forbid it."""
+    lump_answers = [[answer for answer in maps if answer.shape is not None] for maps in visits]
     missing = [words for number, maps in enumerate(visits, start=1) if (words := _missing(maps, f"visit {number}"))]
     contradicted = contradictions([_scans(one) for one in visits])
     if contradicted:
@@ -248,46 +248,48 @@ def _compared(
         return VisitComparison("not_one_mass", "; ".join(contradicted), advice)
     if missing:
         return VisitComparison("no_estimate", "; ".join(missing), "scan the mass again, or leave that visit out")
-    if unfit := without_calibration([one.report for maps in visits for one in maps]):
-        return VisitComparison("no_estimate", unfit, "compare maps that have a size each")
-    of_maps = [[place for answer in maps if (place := patient_place(answer.report)) is not None] for maps in found]
-    places = [PatientPlace.mean_of(one) for one in of_maps]
-    away = tuple(
+    if why := without_calibration([one.report for maps in visits for one in maps]):
+        return VisitComparison("no_estimate", why, "compare maps that have a size each")
+    places_by_visit = [
+        [place for answer in maps if (place := patient_place(answer.report)) is not None] for maps in lump_answers
+    ]
+    places = [PatientPlace.mean_of(one) for one in places_by_visit]
+    shifts = tuple(
         None if first is None or later is None else place_shift(first, later, registration_mm=comparing.registration_mm)
         for first, later in ((places[0], later) for later in places[1:])
     )
     doubts = [
         f"the masses of visits 1 and {number} lie {one.distance_mm:.0f} mm apart "
         f"(one mass: SD {one.sd_mm:.0f} mm each way)"
-        for number, one in enumerate(away, start=2)
+        for number, one in enumerate(shifts, start=2)
         if one is not None and one.doubtful
     ]
     doubts += [
         f"the masses on the maps of visit {number} lie too far apart for one"
-        for number, maps in enumerate(of_maps, start=1)
+        for number, maps in enumerate(places_by_visit, start=1)
         if one_place_probability(maps, registration_mm=comparing.registration_mm) < LEAST_PROBABILITY
     ]
     unknown = [str(number) for number, place in enumerate(places, start=1) if place is None]
     if not comparing.same_mass and doubts:
         advice = "compare exams of one mass; if it is one, --same-mass says so (a wider posture: --registration-mm)"
-        return VisitComparison("not_one_mass", "; ".join(doubts), advice, away)
+        return VisitComparison("not_one_mass", "; ".join(doubts), advice, shifts)
     if not comparing.same_mass and unknown:
         reason = f"no landmarks show where the mass of visit {' and '.join(unknown)} lies in the patient"
-        return VisitComparison("not_one_mass", reason, "touch both landmarks, or say --same-mass", away)
+        return VisitComparison("not_one_mass", reason, "touch both landmarks, or say --same-mass", shifts)
     doubts += [f"no landmarks show where the mass of visit {number} lies" for number in unknown]
-    taken = [finding("taken_as_one", f"{text}; taken as one mass because you say so") for text in doubts]
-    return _sized(found, calibration, settings, shifts=away, doubts=taken)
+    findings = [finding("taken_as_one", f"{text}; taken as one mass because you say so") for text in doubts]
+    return _sized(lump_answers, calibration, settings, shifts=shifts, doubts=findings)
 
 
 def _missing(maps: Sequence[Answer], visit: str) -> str:
-    """Why a visit has no size: too few of the maps that could show a lump show one; empty where enough do."""
-    found = sum(answer.shape is not None for answer in maps)
+    """Reason for a visit without a size: too few of the maps that could show a lump show one; else empty."""
+    lumps = sum(answer.shape is not None for answer in maps)
     silent = [one.report for one in maps if one.report.reason_code == CANNOT_SHOW]
-    if found and 2 * found >= len(maps) - len(silent):
+    if lumps and 2 * lumps >= len(maps) - len(silent):
         return ""
     if silent and len(silent) == len(maps):
         return f"{visit}: {silent[0].reason}"
-    return f"a lump was found on {found} of {len(maps)} maps of {visit}"
+    return f"a lump was found on {lumps} of {len(maps)} maps of {visit}"
 
 
 def _sized(
@@ -298,8 +300,8 @@ def _sized(
     shifts: tuple[PlaceShift | None, ...],
     doubts: Sequence[Finding],
 ) -> VisitComparison:
-    """Sizes of visits that are of one mass, or why there are none."""
-    # one order whatever the caller's, so that the order of a visit's maps leaves no trace
+    """Compare the sizes of visits of one mass, or say why they have none."""
+    # sorted, so that the result does not depend on the order of a visit's maps
     shapes: list[list[ShapeDraws]] = [
         sorted((answer.shape for answer in maps if answer.shape is not None), key=lambda one: one.order)
         for maps in visits
@@ -309,10 +311,10 @@ def _sized(
     if far:
         return VisitComparison("no_estimate", f"too {UNLIKE_LEARNED}: {'; '.join(far)}", "", shifts)
     priors = size_priors(settings)
-    words = sorted(answer.fingerprint for maps in visits for answer in maps)
+    fingerprints = sorted(answer.fingerprint for maps in visits for answer in maps)
 
     def joint(between: BetweenMaps | None) -> JointSizes:
-        rng = np.random.default_rng([settings.seed, *words])
+        rng = np.random.default_rng([settings.seed, *fingerprints])
         return joint_sizes(shapes, calibration=calibration, priors=priors, rng=rng, between=between)
 
     sizes = joint(None)
@@ -337,14 +339,14 @@ def _sized(
 def _by_visit(
     shapes: Sequence[Sequence[ShapeDraws]], fitted: Sequence[BodyCalibration], *, far: bool = False
 ) -> list[str]:
-    """In what the middles of the maps lie outside the calibration of their visit, or `far` outside, each once."""
-    found = [
+    """Texts on maps whose medians lie outside the calibration of their visit, or `far` outside, each once."""
+    texts = [
         f"visit {number}: {text}"
         for number, (maps, at) in enumerate(zip(shapes, fitted, strict=True), start=1)
         for one in maps
         for text in at.outside(*one.middle, far=far)
     ]
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(texts))
 
 
 def _scans(answers: Sequence[Answer]) -> list[Mapping[str, str]]:
@@ -392,11 +394,11 @@ def compare(
     BadDataError
         As of `estimate`, and when the maps were normalised in several ways.
     """
-    used = settings_of(settings)
-    refuse_checkpoint(used)
+    own_settings = settings_of(settings)
+    refuse_checkpoint(own_settings)
     later = None if days is None else map(plain, list_of("days", days, "numbers, one for each later visit"))
-    dated = None if dates is None else list_of("dates", dates, "dates, one for each visit")
-    times = days_from_first(None if later is None else list(later), dated)
+    visit_dates = None if dates is None else list_of("dates", dates, "dates, one for each visit")
+    times = days_from_first(None if later is None else list(later), visit_dates)
     shares = tuple(plain(one) for one in list_of("grown_by", grown_by, "shares, such as 0.2 for 20 %"))
     comparing = CompareOptions(times, shares, same_mass, plain(registration_mm))
     comparing.check_visits(2 + len(more))
@@ -404,9 +406,9 @@ def compare(
         estimate_each(one if isinstance(one, Sequence) and not isinstance(one, str) else [one], settings)
         for one in (first, second, *more)
     ]
-    prints = [one.tactile_map.fingerprint for visit in visits for one in visit]
-    if len(set(prints)) < len(prints):
+    fingerprints = [one.tactile_map.fingerprint for visit in visits for one in visit]
+    if len(set(fingerprints)) < len(fingerprints):
         raise UsageError("a map is given twice; give each map once, at its own visit")
     names = [[one.name or f"visit {v} map {i}" for i, one in enumerate(visit, 1)] for v, visit in enumerate(visits, 1)]
-    found = compare_estimates(visits, used, comparing, names=names)
-    return replace(found, dates=tuple(map(str, dated or ())))
+    comparison = compare_estimates(visits, own_settings, comparing, names=names)
+    return replace(comparison, dates=tuple(map(str, visit_dates or ())))

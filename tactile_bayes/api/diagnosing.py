@@ -1,4 +1,4 @@
-"""How far the draws of a posterior can be trusted, as a table and as pictures."""
+"""Convergence diagnostics of a posterior's draws, as a table and as figures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _FIGURES = {"trace": trace_figure, "rank": rank_figure, "corner": corner_figure}
 
 
 class Diagnosis(TextResult, eq=False):
-    """How far the draws of a posterior can be trusted."""
+    """Convergence diagnostics of a posterior's draws."""
 
     posterior: PosteriorDraws
     path: Path  #: Of its file.
@@ -39,7 +39,7 @@ class Diagnosis(TextResult, eq=False):
 
     @property
     def document(self) -> dict[str, Any]:
-        """What ``diagnose --json`` prints."""
+        """The document that ``diagnose --json`` prints."""
         return {
             "method": self.posterior.method,
             "chains": self.chains,
@@ -50,13 +50,13 @@ class Diagnosis(TextResult, eq=False):
 
     @property
     def text(self) -> str:
-        """What ``diagnose`` prints."""
-        found, chains = self.posterior, self.chains
-        number = next(iter(found.draws.values())).size
-        lines = [*finding_lines(found.findings)]
-        lines.append(f"method {found.method}: {number} draws in {chains} chain{'s' if chains > 1 else ''}")
+        """The text that ``diagnose`` prints."""
+        posterior, chains = self.posterior, self.chains
+        number = next(iter(posterior.draws.values())).size
+        lines = [*finding_lines(posterior.findings)]
+        lines.append(f"method {posterior.method}: {number} draws in {chains} chain{'s' if chains > 1 else ''}")
         if chains == 1:
-            shape = found.diagnostics.get("pareto_k")
+            shape = posterior.diagnostics.get("pareto_k")
             lines += [] if shape is None else [f"Pareto shape of the weights {shape:.2f} (trusted up to 0.7)"]
             lines += [f"{name:14}{one['median']:>10.4g}" for name, one in self.quantities.items()]
             return "\n".join([*lines, RESEARCH_USE]) + "\n"
@@ -100,10 +100,10 @@ def diagnose(posterior: PathLike) -> Diagnosis:
         When the file holds no draws of this program.
     """
     path = required_path(posterior, "posterior")
-    found = read_posterior(path)
-    shown = {name: found.draws[name] for name in _QUANTITIES if name in found.draws}
-    figures = {name: {"median": float(np.nanmedian(draws))} for name, draws in shown.items()}
-    if all(len(draws) > 1 for draws in shown.values()):
-        for name, draws in shown.items():
-            figures[name] |= convergence(draws)
-    return Diagnosis(found, path, figures)
+    contents = read_posterior(path)
+    draws_by_name = {name: contents.draws[name] for name in _QUANTITIES if name in contents.draws}
+    quantities = {name: {"median": float(np.nanmedian(draws))} for name, draws in draws_by_name.items()}
+    if all(len(draws) > 1 for draws in draws_by_name.values()):
+        for name, draws in draws_by_name.items():
+            quantities[name] |= convergence(draws)
+    return Diagnosis(contents, path, quantities)

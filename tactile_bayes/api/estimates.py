@@ -40,27 +40,27 @@ from tactile_bayes.report.pages import PageFiles
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
-    """Make settings from keywords; the defaults are the command line's."""
-    given = {name: plain(value) for name, value in options.items()}
-    calibration, repeatability = given.get("size_calibration"), given.get("repeatability")
+    """Make settings from keywords, with the command line's defaults."""
+    values = {name: plain(value) for name, value in options.items()}
+    calibration, repeatability = values.get("size_calibration"), values.get("repeatability")
     if not (calibration is None or isinstance(calibration, str) or hasattr(calibration, "recipe")):
-        given["size_calibration"] = str(path_of(calibration))
-    if "known" in given:
-        given["known"] = _properties(given["known"])
+        values["size_calibration"] = str(path_of(calibration))
+    if "known" in values:
+        values["known"] = _properties(values["known"])
     if not (repeatability is None or hasattr(repeatability, "between_maps")):
-        given["repeatability"] = read_repeatability(path_of(repeatability))
-    if "checkpoint" in given:
-        given["checkpoint"] = path_of(given["checkpoint"])
-    if isinstance(given.get("centre_mm"), Sequence | np.ndarray) and not isinstance(given["centre_mm"], str):
-        given["centre_mm"] = tuple(plain(one) for one in given["centre_mm"])
-    return Settings(**given)
+        values["repeatability"] = read_repeatability(path_of(repeatability))
+    if "checkpoint" in values:
+        values["checkpoint"] = path_of(values["checkpoint"])
+    if isinstance(values.get("centre_mm"), Sequence | np.ndarray) and not isinstance(values["centre_mm"], str):
+        values["centre_mm"] = tuple(plain(one) for one in values["centre_mm"])
+    return Settings(**values)
 
 
-def _properties(given: Any) -> tuple[tuple[str, float], ...]:
+def _properties(known: Any) -> tuple[tuple[str, float], ...]:
     """Known properties of a body from a mapping, or from pairs."""
-    pairs = list(given.items()) if isinstance(given, Mapping) else given
+    pairs = list(known.items()) if isinstance(known, Mapping) else known
     if isinstance(pairs, str) or not isinstance(pairs, Sequence) or any(np.shape(one) != (2,) for one in pairs):
-        raise UsageError(f'known is {given!r}; give a mapping such as {{"seat": 1.2}}')
+        raise UsageError(f'known is {known!r}; give a mapping such as {{"seat": 1.2}}')
     for name, value in pairs:
         check_number(f"known {name}", value)
     return tuple((str(name), plain(value)) for name, value in pairs)
@@ -103,10 +103,10 @@ def estimate(tactile_map: Any, *, progress: Callable[[int, int], None] | None = 
     >>> bool(low < 15.0 < high)
     True
     """
-    given = map_of(tactile_map)
-    inputs, used = {"map": given.path}, settings_of(settings)
-    found = estimate_one(given.tactile_map, used, inputs=inputs, scans=given.scans, progress=progress)
-    return replace(found, name="" if given.path is None else given.path.stem)
+    source = map_of(tactile_map)
+    inputs, own_settings = {"map": source.path}, settings_of(settings)
+    result = estimate_one(source.tactile_map, own_settings, inputs=inputs, scans=source.scans, progress=progress)
+    return replace(result, name="" if source.path is None else source.path.stem)
 
 
 @takes(Settings, without=["settings_file"])
@@ -127,89 +127,97 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
     BadDataError
         As of `estimate`, and when the maps were normalised in several ways.
     """
-    used = settings_of(settings)
-    refuse_checkpoint(used)
+    own_settings = settings_of(settings)
+    refuse_checkpoint(own_settings)
     if isinstance(maps, str | Path | Map | SizeEstimate | PooledSize):
         raise UsageError("pool takes several maps; give a list")
-    found = estimate_each(list_of("maps", maps, "maps, paths or estimates"), settings)
-    if not found:
+    estimates = estimate_each(list_of("maps", maps, "maps, paths or estimates"), settings)
+    if not estimates:
         raise UsageError("there is no map to pool; give at least one")
-    prints = [one.tactile_map.fingerprint for one in found]
-    if len(set(prints)) < len(prints):
+    fingerprints = [one.tactile_map.fingerprint for one in estimates]
+    if len(set(fingerprints)) < len(fingerprints):
         raise UsageError("a map is given twice; give each map once")
-    names = [one.name or f"map {i}" for i, one in enumerate(found, start=1)]
-    return pool_estimates(found, used, names=names)
+    names = [one.name or f"map {i}" for i, one in enumerate(estimates, start=1)]
+    return pool_estimates(estimates, own_settings, names=names)
 
 
-def estimate_each(given: Iterable[Any], settings: Mapping[str, Any]) -> tuple[SizeEstimate, ...]:
-    """Estimates of maps, or of their paths; those that are estimates already keep their own settings."""
-    return tuple(one if isinstance(one, SizeEstimate) else estimate(one, **settings) for one in given)
+def estimate_each(maps: Iterable[Any], settings: Mapping[str, Any]) -> tuple[SizeEstimate, ...]:
+    """Estimate maps or paths of maps; estimates are returned as they are."""
+    return tuple(one if isinstance(one, SizeEstimate) else estimate(one, **settings) for one in maps)
 
 
-def as_list(given: Any) -> list[Any]:
-    """One map, estimate, pooled size or path as a list of it; a list of them as it is."""
-    if isinstance(given, str | Path | Map | SizeEstimate | PooledSize):
-        return [given]
-    return list(list_of("files", given, "maps, estimates or paths"))
+def as_list(files: Any) -> list[Any]:
+    """Return a list of maps, estimates, pooled sizes or paths, also from a single one."""
+    if isinstance(files, str | Path | Map | SizeEstimate | PooledSize):
+        return [files]
+    return list(list_of("files", files, "maps, estimates or paths"))
 
 
-# --- The page of an exam from files: maps are estimate_each, an estimate is taken as it is, repeats are pooled.
+# --- The page of an exam from files: maps are estimated, an estimate is taken as it is, repeats are pooled.
 
 
 def exam_from_files(
-    paths: Sequence[Path], given: Callable[[], Settings], *, typed: Collection[str], notice: Notice | None = None
+    paths: Sequence[Path],
+    make_settings: Callable[[], Settings],
+    *,
+    typed: Collection[str],
+    notice: Notice | None = None,
 ) -> ShownExam:
-    """Read maps, or an estimate and its map, in any order, and put a page's exam together.
+    """Make the exam of a page from the files of maps, or of an estimate and its map, in any order.
 
     `paths`: maps of one mass; or an estimate, best with its map: what ``estimate`` printed with ``--json`` or wrote
-    with ``-o``; `given`: makes the settings, of which an estimate takes none; `typed`: those that somebody gave;
-    `notice`: called with a line that a user may want to read while waiting.
+    with ``-o``; `make_settings`: makes the settings, of which an estimate takes none; `typed`: names of those that
+    were typed; `notice`: called with a line that a user may want to read while waiting.
     """
     if twice := first_duplicate(paths):
         raise UsageError(f"{twice} is given twice; give each file once")
-    estimates = [
+    estimate_paths = [
         path
         for path in paths
         if path.suffix.lower() == ".json" or (first_bytes(path, len(HDF5_MAGIC)) == HDF5_MAGIC and is_posterior(path))
     ]
-    maps = [path for path in paths if path not in estimates]
-    if len(estimates) > 1 or (estimates and len(maps) > 1):
-        raise UsageError("an estimate goes with one map; several maps are estimate_each and pooled: give maps alone")
-    if estimates:
+    map_paths = [path for path in paths if path not in estimate_paths]
+    if len(estimate_paths) > 1 or (estimate_paths and len(map_paths) > 1):
+        raise UsageError("an estimate goes with one map; several maps are estimated and pooled: give maps alone")
+    if estimate_paths:
         for name in typed:  # they would change nothing
             option = "--settings" if name == "settings_file" else f"--{name.replace('_', '-')}"
             raise UsageError(f"an estimate has settings of its own; leave out {option}, or give the map alone")
-        return _from_estimate(estimates[0], maps[0] if maps else None)
-    settings = given()
-    if len(maps) > 1:
+        return _from_estimate(estimate_paths[0], map_paths[0] if map_paths else None)
+    settings = make_settings()
+    if len(map_paths) > 1:
         refuse_checkpoint(settings)
-    found = []
-    for path in maps:
-        tell = None if notice is None else lambda line, path=path: notice(f"{path}: {line}")
-        found.append(estimate_file(path, settings, notice=tell))
-    return exam_from_estimates(found, settings, files=maps)
+    estimates = []
+    for path in map_paths:
+        map_notice = None if notice is None else lambda line, path=path: notice(f"{path}: {line}")
+        estimates.append(estimate_file(path, settings, notice=map_notice))
+    return exam_from_estimates(estimates, settings, files=map_paths)
 
 
-def exam_from_estimates(found: Sequence[SizeEstimate], settings: Settings, *, files: Sequence[Path] = ()) -> ShownExam:
+def exam_from_estimates(
+    estimates: Sequence[SizeEstimate], settings: Settings, *, files: Sequence[Path] = ()
+) -> ShownExam:
     """Exam of maps that were estimated; several are pooled."""
-    if len(found) == 1:
-        return found[0].exam()
-    names = [f"map {number}" for number in range(1, len(found) + 1)]
-    return pool_estimates(found, settings, names=names, files=files).exam()
+    if len(estimates) == 1:
+        return estimates[0].exam()
+    names = [f"map {number}" for number in range(1, len(estimates) + 1)]
+    return pool_estimates(estimates, settings, names=names, files=files).exam()
 
 
-def _from_estimate(source: Path, path: Path | None) -> ShownExam:
-    """Exam of an estimate, and of its map where that is given: the estimate must name it by its digest."""
-    if source.suffix.lower() == ".json":
-        document = load_json(source, way_out="give what `estimate --json` printed for one map")
-        report = checked_report(document, EstimateReport, path=source)
+def _from_estimate(estimate_path: Path, map_path: Path | None) -> ShownExam:
+    """Make the exam of a page from an estimate's file, and its map's, whose digest the estimate must name."""
+    if estimate_path.suffix.lower() == ".json":
+        document = load_json(estimate_path, way_out="give what `estimate --json` printed for one map")
+        report = checked_report(document, EstimateReport, path=estimate_path)
     else:
-        report = read_estimate(source)
+        report = read_estimate(estimate_path)
     tactile_map, scans = None, scans_of(report.provenance)
-    if path is not None:
-        if sha256(path) not in [one.sha256 for one in report.origin.inputs if one.role == "map"]:
-            raise BadDataError(f"is not the estimate of {path}", way_out="give the map it names", path=str(source))
-        tactile_map, scans = read_map_and_scans(path)
+    if map_path is not None:
+        if sha256(map_path) not in [one.sha256 for one in report.origin.inputs if one.role == "map"]:
+            raise BadDataError(
+                f"is not the estimate of {map_path}", way_out="give the map it names", path=str(estimate_path)
+            )
+        tactile_map, scans = read_map_and_scans(map_path)
     return ShownExam((exam_map(tactile_map, report, side=side_of(scans)),), None, scans)
 
 
@@ -257,22 +265,22 @@ def exam_report(
     BadDataError
         When a file is damaged or of another kind, or the maps are of different exams.
     """
-    page, words = PageFiles(path_of(path), path_of(pdf), force), PageLabels(title, name, day)
+    page, labels = PageFiles(path_of(path), path_of(pdf), force), PageLabels(title, name, day)
     page.check()
-    given = as_list(files)
-    if not given:
+    sources = as_list(files)
+    if not sources:
         raise UsageError("nothing was given to report; give maps, or an estimate")
     exam: ShownExam
-    if all(isinstance(one, str | Path) for one in given):
-        exam = exam_from_files([path_of(one) for one in given], lambda: settings_of(settings), typed=settings)
-    elif len(given) == 1 and isinstance(given[0], PooledSize):
-        exam = given[0].exam()
+    if all(isinstance(one, str | Path) for one in sources):
+        exam = exam_from_files([path_of(one) for one in sources], lambda: settings_of(settings), typed=settings)
+    elif len(sources) == 1 and isinstance(sources[0], PooledSize):
+        exam = sources[0].exam()
     else:
-        used = settings_of(settings)
-        if len(given) > 1:
-            refuse_checkpoint(used)
-        exam = exam_from_estimates(estimate_each(given, settings), used)
-    exam = replace(exam, labels=words)
+        own_settings = settings_of(settings)
+        if len(sources) > 1:
+            refuse_checkpoint(own_settings)
+        exam = exam_from_estimates(estimate_each(sources, settings), own_settings)
+    exam = replace(exam, labels=labels)
     page.write(exam_page(exam))
     return headline(exam)
 
@@ -283,10 +291,10 @@ _IN_PYTHON = Path("what was given in Python")  #: What messages call a map or an
 
 
 class ExportedFiles(Record):
-    """What an export wrote."""
+    """Paths and notes of an export."""
 
     paths: tuple[Path, ...]  #: Of the files.
-    notes: tuple[str, ...] = ()  #: What a user should know of them, such as that they name no patient.
+    notes: tuple[str, ...] = ()  #: Remarks on them, such as that they name no patient.
 
 
 @takes(IdentityOptions)
@@ -341,47 +349,48 @@ def export(
         if not isinstance(value, str):
             raise UsageError(f"{name} is {value!r}; give a text")
     refuse_unsupported(to, identity)
-    several = as_list(files)
+    sources = as_list(files)
     outputs = Outputs(path_of(path), path_of(dictionary), to=to, force=force)
-    outputs.check(files=bool(several))
+    outputs.check(files=bool(sources))
     exported, notes = dict[str, bytes](), tuple[str, ...]()
-    if several:
-        read = [_read(one) for one in several]
-        if to == "dicom" and not any(isinstance(one, MapFile) for one in read):  # a report refers to its maps
-            read = [*(_map_file(*one) for estimate in several for one in _maps_of(estimate)), *read]
-        who = merged_identity(path_of(worklist), identity)
-        exported, notes = exported_files(read, to=to, identity=who, id_from_scan=patient_id_from_scan)
+    if sources:
+        records = [_export_records(one) for one in sources]
+        if to == "dicom" and not any(isinstance(one, MapFile) for one in records):  # a report refers to its maps
+            records = [*(_map_file(*one) for estimate in sources for one in _maps_of(estimate)), *records]
+        patient = merged_identity(path_of(worklist), identity)
+        exported, notes = exported_files(records, to=to, identity=patient, id_from_scan=patient_id_from_scan)
     return ExportedFiles(outputs.write(exported), notes)
 
 
-def _read(given: Any) -> MapFile | Sequence[EstimateFile]:
-    if isinstance(given, str | Path):
-        return read_exam(path_of(given))
-    if isinstance(given, Map):
-        return _map_file(given)
-    if isinstance(given, SizeEstimate | PooledSize):
-        document = given.answer.document if isinstance(given, SizeEstimate) else given.document
-        digests = tuple(_map_file(*one).digest for one in _maps_of(given))
+def _export_records(source: Any) -> MapFile | Sequence[EstimateFile]:
+    """Convert a map, an estimate or the path of one to what the formats write."""
+    if isinstance(source, str | Path):
+        return read_exam(path_of(source))
+    if isinstance(source, Map):
+        return _map_file(source)
+    if isinstance(source, SizeEstimate | PooledSize):
+        document = source.answer.document if isinstance(source, SizeEstimate) else source.document
+        digests = tuple(_map_file(*one).digest for one in _maps_of(source))
         return [replace(parse_estimate(document, _IN_PYTHON), maps=digests)]
-    raise UsageError(f"{type(given).__name__} is nothing to export; give a map, an estimate, or the path of one")
+    raise UsageError(f"{type(source).__name__} is nothing to export; give a map, an estimate, or the path of one")
 
 
-def _maps_of(given: Any) -> list[tuple[Map, str]]:
-    """The maps of an estimate, with the digests of the files that they were read from, empty for a map in none."""
-    found = (given,) if isinstance(given, SizeEstimate) else given.maps if isinstance(given, PooledSize) else ()
+def _maps_of(source: Any) -> list[tuple[Map, str]]:
+    """Maps of an estimate with the digests of their files; empty for a map that was in none."""
+    estimates = (source,) if isinstance(source, SizeEstimate) else source.maps if isinstance(source, PooledSize) else ()
     return [
         (Map(one.tactile_map, scans=tuple(map(dict, one.provenance.scans))), one.provenance.inputs.get("map", ""))
-        for one in found
+        for one in estimates
     ]
 
 
-def _map_file(given: Map, digest: str = "") -> MapFile:
-    """A map as an export takes it; one that is in no file has the digest of the file that `save` would write."""
-    facts = shared_facts(given.scans)
-    if digest or given.path is not None:
-        path = given.path or _IN_PYTHON
-        return MapFile(path, digest or sha256(path), given.tactile_map, facts)
+def _map_file(source: Map, digest: str = "") -> MapFile:
+    """Convert a map for export; one that is in no file gets the digest of the file that `save` would write."""
+    facts = shared_facts(source.scans)
+    if digest or source.path is not None:
+        path = source.path or _IN_PYTHON
+        return MapFile(path, digest or sha256(path), source.tactile_map, facts)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "map.nc"
-        given.save(path)
-        return MapFile(_IN_PYTHON, sha256(path), given.tactile_map, facts)
+        source.save(path)
+        return MapFile(_IN_PYTHON, sha256(path), source.tactile_map, facts)

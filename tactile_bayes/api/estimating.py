@@ -1,4 +1,4 @@
-"""One map: the calibration and options that fit it, and the estimate."""
+"""Estimate one map with the calibration and options that fit it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _LEAST_SQUARES: WhyNone = (
 
 
 def answer_file(path: Path, *, settings: Settings) -> Answer | Failure:
-    """Answer for a map file, in any process."""
+    """Estimate a map file in any process; return its answer, or the error as a `Failure`."""
     try:
         return estimate_file(path, settings).answer
     except TactileBayesError as error:
@@ -63,8 +63,10 @@ def estimate_file(
     """Read a map and estimate it; see `estimate_one`."""
     tactile_map, scans = read_map_and_scans(path)
     with in_file(path):
-        found = estimate_one(tactile_map, settings, inputs={"map": path}, scans=scans, progress=progress, notice=notice)
-    return replace(found, name=path.stem)
+        estimate = estimate_one(
+            tactile_map, settings, inputs={"map": path}, scans=scans, progress=progress, notice=notice
+        )
+    return replace(estimate, name=path.stem)
 
 
 def input_digests(
@@ -72,22 +74,22 @@ def input_digests(
 ) -> dict[str, str]:
     """Digests of an estimate's inputs by role, with that of the site's repeatability where there is one.
 
-    One of sizes by another calibration is refused: another form has another slope, so another spread.
+    A repeatability of sizes by another calibration is refused: another slope gives another spread.
     """
     digests = hash_inputs(**{role: path for role, path in files.items() if path is not None})
-    found = settings.repeatability
-    if found is None:
+    repeatability = settings.repeatability
+    if repeatability is None:
         return digests
-    if found.sha256:
-        digests["repeatability"] = found.sha256
-    if calibration is None or digests.get("size_calibration") == found.calibration_sha256:
+    if repeatability.sha256:
+        digests["repeatability"] = repeatability.sha256
+    if calibration is None or digests.get("size_calibration") == repeatability.calibration_sha256:
         return digests
     normalise = calibration.recipe.normalise
-    by = f"{found.calibration} (frames normalised by {found.normalise})"
-    this = f"{settings.calibration_name or default_for(normalise)} (frames normalised by {normalise})"
-    another = "another version of " if this == by else ""
+    sized_by = f"{repeatability.calibration} (frames normalised by {repeatability.normalise})"
+    sizing = f"{settings.calibration_name or default_for(normalise)} (frames normalised by {normalise})"
+    version = "another version of " if sizing == sized_by else ""
     raise BadDataError(
-        f"the repeatability is of sizes by {by}, and this size is by {another}{this}",
+        f"the repeatability is of sizes by {sized_by}, and this size is by {version}{sizing}",
         way_out="learn one from exams that were sized so: `calibrate repeatability`; or leave --repeatability out",
     )
 
@@ -104,8 +106,8 @@ def estimate_one(
     """Choose the calibration and the options that fit a map, and estimate.
 
     `inputs`: files that the map came from, by role, for the provenance; `scans`: the scans at the beginning, as
-    `Provenance.scans` has them; `progress`: called with draws done and wanted; `notice`: called before the work with a
-    line that a user may want to read while waiting.
+    `Provenance.scans` has them; `progress`: called with draws done and required; `notice`: called before the work with
+    a line that a user may want to read while waiting.
     """
     shipped = default_for(tactile_map.recipe.normalise)
     source, calibration, why_none = choose_calibration(settings, tactile_map)
@@ -120,14 +122,14 @@ def estimate_one(
         context = digests.get("size_calibration", "no calibration")
         options = replace(options, store=CheckpointFile(settings.checkpoint, context=context))
 
-    # the map's values are part of the seed: an answer depends neither on the place in a list nor on the file's history,
-    # and a mass has the numbers that its place alone would give
-    def estimated(a_map: TactileMap, given: SamplerSettings) -> Estimate:
+    # the map's values are part of the seed: a result depends neither on the place in a list nor on the file's history,
+    # and each mass gets the random numbers that it would get alone
+    def sample(a_map: TactileMap, sampler: SamplerSettings) -> Estimate:
         rng = np.random.default_rng([settings.seed, tactile_map.fingerprint])
-        told = progress if given is options else None
-        return estimate_map(a_map, calibration=calibration, options=given, rng=rng, progress=told)
+        callback = progress if sampler is options else None
+        return estimate_map(a_map, calibration=calibration, options=sampler, rng=rng, progress=callback)
 
-    estimate = with_masses(tactile_map, estimated(tactile_map, options), options, estimated)
+    estimate = with_masses(tactile_map, sample(tactile_map, options), options, sample)
     estimate = _with_place(estimate, tactile_map, scans, probability=settings.interval)
     if why_none is not None and estimate.status == "estimate":
         reason, advice = why_none
@@ -136,14 +138,14 @@ def estimate_one(
         fat_mm = None if calibration is None else calibration.fat_mm
         estimate = replace(estimate, smallest=smallest_lumps(tactile_map, fat_mm=fat_mm))
     posterior = estimate.map_posterior
-    used = None if posterior is None or calibration is None else calibration.at_depth_or_fallback(*posterior.medians)
-    if posterior is not None and used is not None and estimate.size is not None:
+    applied = None if posterior is None or calibration is None else calibration.at_depth_or_fallback(*posterior.medians)
+    if posterior is not None and applied is not None and estimate.size is not None:
         name = settings.calibration_name or shipped
         by = f"{'shipped ' if name in SHIPPED else ''}calibration {name}"
         sigma_mm = mean_width_mm(*posterior.medians[1:])
-        if isinstance(used, BodyCalibration) and used.site is not None:
-            by += f" ({site_words(used.site, math.log(sigma_mm))})"
-        words = calibration_line(by, used, sigma_mm=sigma_mm)
+        if isinstance(applied, BodyCalibration) and applied.site is not None:
+            by += f" ({site_words(applied.site, math.log(sigma_mm))})"
+        words = calibration_line(by, applied, sigma_mm=sigma_mm)
         diagnostics = {**estimate.diagnostics, "size_calibration": words}
         if settings.repeatability is not None:
             diagnostics["repeatability"] = settings.repeatability.words()
@@ -151,21 +153,25 @@ def estimate_one(
             diagnostics["convergence"] = diagnostics.pop("convergence")
         estimate = replace(estimate, diagnostics=diagnostics, sized_by=by)
     named = settings.calibration_name or (f"{shipped} (shipped)" if calibration is not None else "none")
-    used_fit = {"background": options.background, "fit_radius_mm": options.fit_radius_mm, "noise": options.noise}
-    recorded = settings.recorded(size_calibration=named, **used_fit)
+    fit = {"background": options.background, "fit_radius_mm": options.fit_radius_mm, "noise": options.noise}
+    recorded = settings.recorded(size_calibration=named, **fit)
     recorded = {name: value for name, value in recorded.items() if name not in _UNRECORDED}
     provenance = Provenance("estimate", recorded, digests, seed=settings.seed, scans=scans)
     return SizeEstimate(
-        tactile_map=tactile_map, estimate=estimate, provenance=provenance, settings=settings, calibration=used
+        tactile_map=tactile_map, estimate=estimate, provenance=provenance, settings=settings, calibration=applied
     )
 
 
 def _with_place(
     estimate: Estimate, tactile_map: TactileMap, scans: Sequence[Mapping[str, str]], *, probability: float
 ) -> Estimate:
-    """The estimate with what speaks against the place of its masses: side and landmarks, and how near they lie."""
-    here = [estimate_document.patient_mm(tactile_map, one.x_mm, one.y_mm) for one in estimate.masses if one.reported]
-    side = estimate_document.side_findings(estimate_document.side_of(scans), here[0] if here else None)
+    """Add the findings on the places of the masses: side, landmarks, and masses that may be one."""
+    patient_places = [
+        estimate_document.patient_mm(tactile_map, one.x_mm, one.y_mm) for one in estimate.masses if one.reported
+    ]
+    side = estimate_document.side_findings(
+        estimate_document.side_of(scans), patient_places[0] if patient_places else None
+    )
     sized = [
         (number, (one.x_mm, one.y_mm), one.estimate.size.summarise("max_size_mm", probability=probability))
         for number, one in enumerate(estimate.masses, start=1)
@@ -176,20 +182,20 @@ def _with_place(
 
 
 def named_calibration(settings: Settings, normalise: str) -> tuple[Path | None, Calibration | None]:
-    """The calibration that was named or given, else the shipped one for maps normalised so, with its path."""
-    given = settings.size_calibration
-    if given is not None and not isinstance(given, str):
-        return None, given
-    path = size_calibration_path(given or default_for(normalise))
+    """Path and calibration that the settings name or hold, else the shipped one for this normalisation."""
+    choice = settings.size_calibration
+    if choice is not None and not isinstance(choice, str):
+        return None, choice
+    path = size_calibration_path(choice or default_for(normalise))
     return path, None if path is None else read_size_calibration(path)
 
 
 def choose_calibration(
     settings: Settings, tactile_map: TactileMap
 ) -> tuple[Path | None, Calibration | None, WhyNone | None]:
-    """The calibration that was named, or the shipped one if none was and it fits map and options, with its path.
+    """Path and calibration that the settings name, else the shipped one if it fits map and options.
 
-    None where there is none; then with why the shipped one was not used, unless the user decided.
+    Without one, also the reason why the shipped one does not fit, unless the user asked for none.
     """
     path, calibration = named_calibration(settings, tactile_map.recipe.normalise)
     if calibration is None:
@@ -212,11 +218,11 @@ def choose_calibration(
 
 
 def _level_unknown(tactile_map: TactileMap, fit: SamplerSettings) -> WhyNone:
-    """Reason for widths only where a map's level is unknown, with the commands that lead to a size."""
-    made = f"--normalise {tactile_map.recipe.normalise} --background {fit.background} --noise {fit.noise}"
+    """Reason for widths only where the map's level is unknown, and the commands that lead to a size."""
+    recipe = f"--normalise {tactile_map.recipe.normalise} --background {fit.background} --noise {fit.noise}"
     learn = (
         "estimate maps of at least 8 lumps of known size made the same way, list their d_mm, amplitude, sigma_x_mm and "
-        f"sigma_y_mm in LUMPS.csv, run `tactile-bayes calibrate size LUMPS.csv {made} --fit-radius-mm "
+        f"sigma_y_mm in LUMPS.csv, run `tactile-bayes calibrate size LUMPS.csv {recipe} --fit-radius-mm "
         f"{fit.fit_radius_mm:g} -o size.json` and give --size-calibration size.json"
     )
     if tactile_map.recipe.source == "scan":
@@ -242,12 +248,12 @@ def _options(settings: Settings, calibration: Calibration | None, tactile_map: T
         background = "free"
     background = settings.background or background
     radius = settings.fit_radius_mm or (calibration.recipe.radius_mm if calibration else FIT_RADIUS_MM)
-    asked = {name: getattr(settings, name) for name in names_of(FitSettings)}
-    asked |= {"background": background, "fit_radius_mm": radius, "noise": noise}
-    return SamplerSettings(**asked, size_priors=size_priors(settings))
+    values = {name: getattr(settings, name) for name in names_of(FitSettings)}
+    values |= {"background": background, "fit_radius_mm": radius, "noise": noise}
+    return SamplerSettings(**values, size_priors=size_priors(settings))
 
 
 def estimate_inputs(settings: Settings, tactile_map: TactileMap) -> tuple[Calibration | None, SamplerSettings]:
-    """What `estimate_one` takes for a map: calibration and options."""
+    """Calibration and options by which `estimate_one` fits a map."""
     _, calibration, _ = choose_calibration(settings, tactile_map)
     return calibration, _options(settings, calibration, tactile_map)

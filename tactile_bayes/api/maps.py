@@ -71,7 +71,7 @@ class Map(Record, eq=False):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What speaks against sizes from this map, cautions first."""
+        """Findings against sizes from this map, cautions first."""
         return self.tactile_map.findings
 
     @property
@@ -86,11 +86,11 @@ class Map(Record, eq=False):
 
     def to_dataframe(self) -> pandas.DataFrame:
         """One row for each cell with data: x_mm, y_mm, mean, variance, count."""
-        found = self.tactile_map
-        rows, columns = np.nonzero(found.covered)
-        places = {"x_mm": found.x_mm[columns], "y_mm": found.y_mm[rows]}
-        values = {name: getattr(found, name)[rows, columns] for name in ("mean", "variance", "count")}
-        return dataframe({**places, **values})
+        tactile_map = self.tactile_map
+        rows, columns = np.nonzero(tactile_map.covered)
+        centres = {"x_mm": tactile_map.x_mm[columns], "y_mm": tactile_map.y_mm[rows]}
+        values = {name: getattr(tactile_map, name)[rows, columns] for name in ("mean", "variance", "count")}
+        return dataframe({**centres, **values})
 
     @door
     def plot(self, path: PathLike | None = None, *, force: bool = False) -> Figure:
@@ -111,11 +111,12 @@ class Map(Record, eq=False):
         write_map(output_path(path, "netCDF"), self.tactile_map, provenance=provenance, force=force)
 
     def __repr__(self) -> str:
-        found = self.tactile_map
-        ny, nx = found.mean.shape
-        covered = int(found.covered.sum())
-        cells = f"{nx} x {ny} cells of {found.recipe.cell_mm:g} mm, {covered} with data, {found.recipe.value_words}"
-        return f"<Map {' '.join([*finding_lines(found.findings, paper=True), cells])}>"
+        tactile_map = self.tactile_map
+        ny, nx = tactile_map.mean.shape
+        covered = int(tactile_map.covered.sum())
+        recipe = tactile_map.recipe
+        cells = f"{nx} x {ny} cells of {recipe.cell_mm:g} mm, {covered} with data, {recipe.value_words}"
+        return f"<Map {' '.join([*finding_lines(tactile_map.findings, paper=True), cells])}>"
 
     def _repr_html_(self) -> str:
         return f"<p>{escape(repr(self))}</p><p><small>{escape(RESEARCH_USE)}</small></p>"
@@ -160,7 +161,7 @@ def build_map(
     max_pose_gap_ms
         Frames between two distinct poses further apart are left out.
     progress
-        Called with frames done and wanted.
+        Called with the numbers of frames done and in all.
     **options
         As of `tactile_bayes.options.MapOptions`: cell_mm, pressure_window_kpa, normalise...
 
@@ -171,28 +172,28 @@ def build_map(
     UsageError
         When an option cannot be so, or a recording is given twice.
     """
-    given = [scans] if isinstance(scans, str | Path) or not isinstance(scans, Sequence) else list(scans)
-    loaded = [as_scan(one) for one in given]
-    digests = (sha256(path_of(one)) if isinstance(one, str | Path) else "" for one in given)
+    sources = [scans] if isinstance(scans, str | Path) or not isinstance(scans, Sequence) else list(scans)
+    loaded = [as_scan(one) for one in sources]
+    digests = (sha256(path_of(one)) if isinstance(one, str | Path) else "" for one in sources)
     facts = [scan_facts(scan, digest) for scan, digest in zip(loaded, digests, strict=True)]
     for later, earlier in repeated_scans([[one] for one in facts]).items():
         raise UsageError(
             f"scan {later + 1} is the recording of scan {earlier + 1}, whose frames would count twice; give it once"
         )
-    asked = {name: plain(value) for name, value in options.items()}
-    return Map(build(loaded, max_pose_gap_ms=max_pose_gap_ms, progress=progress, **asked), scans=tuple(facts))
+    keywords = {name: plain(value) for name, value in options.items()}
+    return Map(build(loaded, max_pose_gap_ms=max_pose_gap_ms, progress=progress, **keywords), scans=tuple(facts))
 
 
 @door
 def check(scan: Any, *, pressure_window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA) -> ArrangementCheck:
-    """Compare what is stated of a scan's array, lever arm and quaternions with other arrangements.
+    """Compare a scan's stated array, lever arm and quaternions with other arrangements.
 
     Parameters
     ----------
     scan
         A scan, a simulated scan, or a path.
     pressure_window_kpa
-        Frames whose mean pressure lies outside are left out.
+        Frames with a mean pressure outside are left out.
 
     Returns
     -------
@@ -202,11 +203,11 @@ def check(scan: Any, *, pressure_window_kpa: tuple[float, float] = PRESSURE_WIND
     return check_scan(as_scan(scan), pressure_window_kpa=pressure_window_kpa)
 
 
-def as_scan(given: Any) -> Scan:
-    """Return the scan given as a path, a `Scan` or a simulated one; refuse anything else."""
-    scan = read_scan(given) if isinstance(given, str | Path) else getattr(given, "scan", given)
+def as_scan(source: Any) -> Scan:
+    """Return the scan of a path, a `Scan` or a simulated scan; refuse anything else."""
+    scan = read_scan(source) if isinstance(source, str | Path) else getattr(source, "scan", source)
     if not isinstance(scan, Scan):
-        kind = type(given).__name__
+        kind = type(source).__name__
         raise UsageError(f"a scan is wanted, not {kind}; read one with read_scan, or make one of arrays with tb.scan")
     return scan
 
@@ -226,7 +227,7 @@ def simulate(
     scene
         Path of a TOML file, or what stands in it: ``{"scene": {"duration_s": 7}, "lump": [{"d_mm": 15}]}``.
     seed
-        Of the random numbers. Default: the scene's.
+        Random seed. Default: the scene's.
     fidelity, head
         As of `tactile-bayes simulate`.
 
@@ -237,14 +238,14 @@ def simulate(
     """
     from tactile_bayes.forward.simulate import simulate as run
 
-    read = (
+    parsed = (
         scene_of(to_plain(dict(scene), digits=EXACT))
         if isinstance(scene, Mapping)
         else read_scene(required_path(scene, "scene"))
     )
-    used = read.seed if seed is None else seed
-    check_number("seed", used, 0, whole=True)
-    return run(read, rng=np.random.default_rng(used), fidelity=fidelity, head=head)
+    scan_seed = parsed.seed if seed is None else seed
+    check_number("seed", scan_seed, 0, whole=True)
+    return run(parsed, rng=np.random.default_rng(scan_seed), fidelity=fidelity, head=head)
 
 
 def demo_scan() -> Scan:
@@ -295,9 +296,9 @@ def map_of(given: Any, **stated: Any) -> Map:
         raise UsageError(f"a map is wanted, not {type(given).__name__}; {way_out}")
     marks = stated.get("no_value", ())
     marks = [marks] if isinstance(marks, str) or not isinstance(marks, Iterable) else marks
-    asked = {name: plain(value) for name, value in stated.items()}
-    asked["no_value"] = tuple(one if isinstance(one, str) else repr(plain(one)) for one in marks)
-    options = GridOptions(**asked)
+    keywords = {name: plain(value) for name, value in stated.items()}
+    keywords["no_value"] = tuple(one if isinstance(one, str) else repr(plain(one)) for one in marks)
+    options = GridOptions(**keywords)
     if path is not None:
         return Map(import_grid(path, options)[0])
     values = given.filled(np.nan) if isinstance(given, np.ma.MaskedArray) else np.asarray(given)
@@ -360,45 +361,45 @@ def scan(
     """
     columns = {} if columns is None else columns
     named = ArrayMap(**columns) if isinstance(columns, Mapping) else read_array_map(path_of(columns))
-    given = replace(named, **{name: plain(value) for name, value in stated.items() if value is not None})
-    beside = [_poses(poses, given), _head(head), _calibration(calibration), _landmarks(landmarks)]
+    layout = replace(named, **{name: plain(value) for name, value in stated.items() if value is not None})
+    others = [_poses(poses, layout), _head(head), _calibration(calibration), _landmarks(landmarks)]
     if isinstance(frames, str | Path):
-        made, notes = imports.import_arrays(path_of(frames), given, beside)
+        imported, notes = imports.import_arrays(path_of(frames), layout, others)
     else:
         times = {} if time is None else {"frame_time_s": _array(time)}
-        made, notes = imports.combine_sources([Source({"frames": _array(frames), **times}), *beside], given)
+        imported, notes = imports.combine_sources([Source({"frames": _array(frames), **times}), *others], layout)
     for note in notes:
         if note.startswith("CAUTION"):
             warnings.warn(note, stacklevel=4)
-    return corrected(with_session(made, path_of(session)), correct)
+    return corrected(with_session(imported, path_of(session)), correct)
 
 
-def _array(given: Any) -> Any:
-    """An array in which masked values are NaN, and dates are s since 1970."""
-    if isinstance(given, np.ma.MaskedArray):
-        return np.ma.filled(given.astype(np.float64), np.nan)
-    array = np.asarray(given)
+def _array(values: Any) -> Any:
+    """Convert to an array: masked values become NaN, dates s since 1970."""
+    if isinstance(values, np.ma.MaskedArray):
+        return np.ma.filled(values.astype(np.float64), np.nan)
+    array = np.asarray(values)
     if array.dtype.kind in "Mm":
         return array.astype(f"{array.dtype.kind}8[ns]").astype(np.int64) / 1e9
     return array
 
 
-def _poses(given: Any, stated: ArrayMap) -> Source:
-    """Times, places and rotations, in the forms that `scan` takes."""
-    if given is None:
+def _poses(poses: Any, stated: ArrayMap) -> Source:
+    """Convert times, positions and rotations in any form that `scan` takes."""
+    if poses is None:
         return Source({})
-    if isinstance(given, str | Path):
-        return imports.pose_source(path_of(given), stated)
-    if isinstance(given, TrackerPoses):
-        return Source(_named(given.time_s, given.position_mm, given.quaternion_wxyz))
-    if isinstance(given, tuple | list) and len(given) == 3:
-        return Source(_named(*given))
-    if isinstance(given, tuple | list) and len(given) == 2:
-        return Source({"pose_time_s": _array(given[0]), "pose_matrix": _array(given[1])})
-    numbers = _array(given)
+    if isinstance(poses, str | Path):
+        return imports.pose_source(path_of(poses), stated)
+    if isinstance(poses, TrackerPoses):
+        return Source(_named(poses.time_s, poses.position_mm, poses.quaternion_wxyz))
+    if isinstance(poses, tuple | list) and len(poses) == 3:
+        return Source(_named(*poses))
+    if isinstance(poses, tuple | list) and len(poses) == 2:
+        return Source({"pose_time_s": _array(poses[0]), "pose_matrix": _array(poses[1])})
+    numbers = _array(poses)
     if numbers.ndim != 2 or numbers.shape[1] != 8:
         raise UsageError(
-            f"poses is {type(given).__name__} of shape {numbers.shape}; give (time, matrices), (time, position, "
+            f"poses is {type(poses).__name__} of shape {numbers.shape}; give (time, matrices), (time, position, "
             "quaternion) or (m, 8) numbers"
         )
     return Source(_named(numbers[:, 0], numbers[:, 1:4], numbers[:, 4:]))
@@ -409,30 +410,32 @@ def _named(time: Any, position: Any, quaternion: Any) -> Arrays:
     return {name: _array(value) for name, value in values.items()}
 
 
-def _head(given: Any) -> Source:
-    if isinstance(given, Mapping):
-        document = {"schema": _HEAD_SCHEMA, **to_plain(dict(given), digits=EXACT)}
+def _head(head: Any) -> Source:
+    if isinstance(head, Mapping):
+        document = {"schema": _HEAD_SCHEMA, **to_plain(dict(head), digits=EXACT)}
         return imports.head_source(head_geometry(document, path=Path("head")))
-    return _beside(given, HeadGeometry, imports.head_source, lambda other: other.head)
+    return _source_of(head, HeadGeometry, imports.head_source, lambda other: other.head)
 
 
-def _calibration(given: Any) -> Source:
-    if isinstance(given, tuple | list) and len(given) == 2:
-        return Source({"gain_kpa_per_count": _array(given[0]), "offset_kpa": _array(given[1])})
-    return _beside(given, ElementCalibration, imports.calibration_source, lambda other: other.element_calibration)
+def _calibration(calibration: Any) -> Source:
+    if isinstance(calibration, tuple | list) and len(calibration) == 2:
+        return Source({"gain_kpa_per_count": _array(calibration[0]), "offset_kpa": _array(calibration[1])})
+    return _source_of(
+        calibration, ElementCalibration, imports.calibration_source, lambda other: other.element_calibration
+    )
 
 
-def _landmarks(given: Any) -> Source:
-    points = None if given is None or isinstance(given, str | Path | Landmarks | Scan) else _array(given)
+def _landmarks(landmarks: Any) -> Source:
+    points = None if landmarks is None or isinstance(landmarks, str | Path | Landmarks | Scan) else _array(landmarks)
     if points is not None and points.shape in ((2, 3), (3, 3)):
         return Source({"landmarks_mm": points[:2], **({"nipple_mm": points[2]} if len(points) == 3 else {})})
-    return _beside(given, Landmarks, imports.landmark_source, lambda other: other.landmarks)
+    return _source_of(landmarks, Landmarks, imports.landmark_source, lambda other: other.landmarks)
 
 
-def _beside(given: Any, kind: type, made: Callable[[Any], Source], part: Callable[[Scan], Any]) -> Source:
-    """What stands beside the frames: nothing, a path, a record, or that of another scan."""
-    if given is None:
+def _source_of(source: Any, kind: type, make: Callable[[Any], Source], part: Callable[[Scan], Any]) -> Source:
+    """Convert a path, a record, or the scan that holds such a record; None is an empty source."""
+    if source is None:
         return Source({})
-    if isinstance(given, str | Path):
-        return made(path_of(given))
-    return made(given if isinstance(given, kind) else part(as_scan(given)))
+    if isinstance(source, str | Path):
+        return make(path_of(source))
+    return make(source if isinstance(source, kind) else part(as_scan(source)))

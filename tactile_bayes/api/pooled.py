@@ -33,28 +33,30 @@ if TYPE_CHECKING:
 # --- The maps of one mass, estimated again where they report another one.
 
 
-def reestimate_at_common_mass(found: Sequence[SizeEstimate]) -> tuple[SizeEstimate, ...]:
-    """Estimates of the mass that most maps show; those of a place that somebody gave stay as they are."""
-    same = list(found)
-    for i, place in maps_of_another_mass([one.answer.report for one in found]).items():
-        one = found[i]
-        if one.settings.centre_mm is None:
-            settings, made = replace(one.settings, centre_mm=place), one.provenance
-            there = estimate_one(one.tactile_map, settings, scans=made.scans)
-            same[i] = replace(there, provenance=replace(there.provenance, inputs=made.inputs), name=one.name)
-    return tuple(same)
+def reestimate_at_common_mass(estimates: Sequence[SizeEstimate]) -> tuple[SizeEstimate, ...]:
+    """Estimate the mass that most maps show, where a map reported another; keep estimates at a stated centre."""
+    result = list(estimates)
+    for i, place in maps_of_another_mass([estimate.answer.report for estimate in estimates]).items():
+        estimate = estimates[i]
+        if estimate.settings.centre_mm is None:
+            settings, made = replace(estimate.settings, centre_mm=place), estimate.provenance
+            again = estimate_one(estimate.tactile_map, settings, scans=made.scans)
+            result[i] = replace(again, provenance=replace(again.provenance, inputs=made.inputs), name=estimate.name)
+    return tuple(result)
 
 
 def pool_estimates(
-    found: Sequence[SizeEstimate], settings: Settings, *, names: Sequence[str], files: Sequence[Path] = ()
+    estimates: Sequence[SizeEstimate], settings: Settings, *, names: Sequence[str], files: Sequence[Path] = ()
 ) -> PooledSize:
-    """One size from the estimates of several maps, made again where they are of another mass; see `pool_answers`."""
-    same = reestimate_at_common_mass(found)
-    return replace(pool_answers([one.answer for one in same], settings, names=names, files=files), maps=same)
+    """Pool the estimates of several maps, re-estimated at their common mass; see `pool_answers`."""
+    of_one_mass = reestimate_at_common_mass(estimates)
+    return replace(
+        pool_answers([one.answer for one in of_one_mass], settings, names=names, files=files), maps=of_one_mass
+    )
 
 
 def patient_place(report: EstimateReport) -> PatientPlace | None:
-    """Where a map's reported mass lies in the patient; None without a lump or landmarks."""
+    """Place of a map's reported mass in the patient; None without a lump or landmarks."""
     centre = report.centre_patient_mm
     return None if centre is None else PatientPlace(np.array(centre.median), np.diag([centre.x.sd**2, centre.y.sd**2]))
 
@@ -75,7 +77,7 @@ class PooledSize(SizedExam, eq=False, dict=True, kw_only=True):
 
     @property
     def document(self) -> dict[str, Any]:
-        """What ``estimate --pool --json`` prints."""
+        """The document that ``estimate --pool --json`` prints."""
         return self.pooled_report.document
 
     @door
@@ -107,18 +109,18 @@ def pool_answers(
     check_one_mass(scans)
     inputs = {f"map_{i}": path for i, path in enumerate(files, start=1)}
     calibration, digests = common_calibration(answers, settings, names=names, inputs=inputs)
-    # the maps' values in sorted order are part of the seed: their order on the command line leaves no trace
-    words = sorted(answer.fingerprint for answer in answers)
+    # the maps' values in sorted order are part of the seed: the result does not depend on their order
+    fingerprints = sorted(answer.fingerprint for answer in answers)
     places = [place for one in answers if one.shape is not None and (place := patient_place(one.report)) is not None]
-    chance = one_place_probability(places) if len(places) > 1 else None
-    pooled = _no_size(reports, places, chance) or pool_maps(
+    one_place = one_place_probability(places) if len(places) > 1 else None
+    pooled = _abstention(reports, places, one_place) or pool_maps(
         [answer.shape for answer in answers],
         silent=sum(one.reason_code == CANNOT_SHOW for one in reports),
         calibration=calibration,
         priors=size_priors(settings),
-        rng=np.random.default_rng([settings.seed, *words]),
+        rng=np.random.default_rng([settings.seed, *fingerprints]),
     )
-    pooled = replace(pooled, one_place=chance)
+    pooled = replace(pooled, one_place=one_place)
     if pooled.status == DISAGREE and pooled.one_size is not None:
         *first, last = [f"{one.max_size_mm.median:.1f}" for one in reports if one.max_size_mm is not None]
         sizes = f"{', '.join(first)} and {last}" if first else last
@@ -142,10 +144,10 @@ def pool_answers(
     return PooledSize(pooled=pooled, pooled_report=report, provenance=provenance, settings=settings, name=name)
 
 
-def _no_size(
+def _abstention(
     reports: Sequence[EstimateReport], places: Sequence[PatientPlace], one_place: float | None
 ) -> PooledEstimate | None:
-    """Reason for no size: a map too far outside the calibration's range, cells too large, or several masses."""
+    """No size: a map too far outside the calibration's range, cells too large, or several masses; else None."""
     for i, report in enumerate(reports, start=1):
         if report.reason_code == "extrapolated":
             return PooledEstimate("no_estimate", f"map {i}: {report.reason}")
@@ -161,7 +163,7 @@ def _no_size(
 
 
 def without_calibration(reports: Sequence[EstimateReport]) -> str:
-    """Why the first map that has no size for want of a calibration has none; empty where all have one."""
+    """Reason of the first map that no calibration fits; empty where all have one."""
     reasons = (f"map {i}: {one.reason}" for i, one in enumerate(reports, start=1) if one.reason and not one.reason_code)
     return next(reasons, "")
 
@@ -169,7 +171,7 @@ def without_calibration(reports: Sequence[EstimateReport]) -> str:
 def common_calibration(
     answers: Sequence[Answer], settings: Settings, *, names: Sequence[str], inputs: Mapping[str, Path]
 ) -> tuple[BodyCalibration, dict[str, str]]:
-    """The calibration that sizes all these maps together, and the digests of all files by role."""
+    """The one calibration for all maps, and the digests of all files by role."""
     ways = sorted({answer.normalise for answer in answers})
     if settings.size_calibration is None and len(ways) > 1:
         way_out = "pool maps made by one recipe: make the others again with `map`"

@@ -54,11 +54,11 @@ class _Repeat(Record, eq=False):
 
 
 def exams_of_campaign(folder: Path) -> list[ExamFolder]:
-    """Exams that a campaign estimated, by its ``exams_done.csv``."""
+    """List the exams that a campaign estimated, from its ``exams_done.csv``."""
     table = folder / DONE
     if not table.is_file():
         raise BadDataError(f"holds no {DONE}", way_out="give a folder of `campaign run`", path=str(folder))
-    found = []
+    exams = []
     for row in read_raw(table).rows:
         try:
             patient, visit, mass, replicate = (row[name] for name in ("patient", "visit", "mass", "replicate"))
@@ -68,8 +68,8 @@ def exams_of_campaign(folder: Path) -> list[ExamFolder]:
         name = exam_name(of_mass, replicate)
         if Path(name).name != name:
             raise BadDataError(f"names an exam {name!r}", way_out=_AGAIN, path=str(table))
-        found.append(ExamFolder(name, of_mass, f"{patient} {mass}", folder / EXAMS / name))
-    return found
+        exams.append(ExamFolder(name, of_mass, f"{patient} {mass}", folder / EXAMS / name))
+    return exams
 
 
 def learn_from_exams(
@@ -90,7 +90,7 @@ def learn_from_exams(
         first, values = group[0].exam, np.array(alone)
         masses.append(RepeatedExams(first.of_mass, first.mass, values[:, 0], values[:, 1]))
     learned = learn_repeatability(masses, fewest=fewest or FEWEST_MASSES)
-    found = learned.repeatability
+    spread = learned.repeatability
     entries = [
         size_json.RepeatedMass(
             name=mass.name,
@@ -107,19 +107,19 @@ def learn_from_exams(
     return size_json.RepeatabilityFile(
         schema="tactile-bayes/repeatability/1",
         research_use=RESEARCH_USE,
-        between_map_sd=found.sd,
+        between_map_sd=spread.sd,
         probability=PROBABILITY,
         calibration=used,
-        half_width=_half_widths(one_by_one, found.sd),
+        half_width=_half_widths(one_by_one, spread.sd),
         repeats=entries,
         left_out=left_out,
         provenance=provenance.as_dict(),
-        **{name: getattr(found, name) for name in size_json.SPREAD},
+        **{name: getattr(spread, name) for name in size_json.SPREAD},
     )
 
 
 def _repeats(exams: Sequence[ExamFolder]) -> tuple[list[list[_Repeat]], list[str]]:
-    """Exams with a size by mass and visit, where there are several, and why others of such masses take no part."""
+    """Group repeated exams with a size by mass and visit; also say why others of these masses are left out."""
     by_mass: dict[str, list[ExamFolder]] = {}
     for exam in exams:
         by_mass.setdefault(exam.of_mass, []).append(exam)
@@ -130,7 +130,7 @@ def _repeats(exams: Sequence[ExamFolder]) -> tuple[list[list[_Repeat]], list[str
         group: list[_Repeat] = []
         scans: dict[str, str] = {}
         for exam in same:
-            repeat = _read(exam)
+            repeat = _read_repeat(exam)
             if isinstance(repeat, str):
                 left_out.append(f"{exam.name}: it has no size ({repeat})")
                 continue
@@ -144,17 +144,17 @@ def _repeats(exams: Sequence[ExamFolder]) -> tuple[list[list[_Repeat]], list[str
     return groups, left_out
 
 
-def _read(exam: ExamFolder) -> _Repeat | str:
-    """What an exam's estimate says of it, or why it has no size."""
+def _read_repeat(exam: ExamFolder) -> _Repeat | str:
+    """Read an exam's size and where it came from, or the reason for no size."""
     path = exam.folder / ESTIMATE
     report = read_record(path, EstimateReport, way_out=_AGAIN)
     if report.max_size_mm is None:
         return report.reason or "no calibration"
-    made = report.origin
-    if "size_calibration" not in made.settings or "inputs" not in report.provenance:
+    origin = report.origin
+    if "size_calibration" not in origin.settings or "inputs" not in report.provenance:
         raise BadDataError("does not say by which calibration", way_out=_AGAIN, path=str(path))
-    calibration = str(made.settings["size_calibration"]).removesuffix(" (shipped)")
-    digests = {one.role: one.sha256 for one in made.inputs}
+    calibration = str(origin.settings["size_calibration"]).removesuffix(" (shipped)")
+    digests = {one.role: one.sha256 for one in origin.inputs}
     return _Repeat(
         exam,
         calibration,
@@ -166,20 +166,20 @@ def _read(exam: ExamFolder) -> _Repeat | str:
     )
 
 
-def _calibration(repeats: Sequence[_Repeat], given: str | None) -> tuple[BodyCalibration, size_json.UsedCalibration]:
-    """The one calibration that sized all exams: the one given, or that of its name, or a shipped one."""
+def _calibration(repeats: Sequence[_Repeat], named: str | None) -> tuple[BodyCalibration, size_json.UsedCalibration]:
+    """The one calibration that sized all exams: of this name or path, else of its own name, else a shipped one."""
     name, digest = repeats[0].calibration, repeats[0].calibration_sha256
     digests = list(dict.fromkeys(one.calibration_sha256 for one in repeats))
     if len(digests) > 1:
         another = next(one for one in repeats if one.calibration_sha256 == digests[1])
-        named = ", ".join(f"{one.exam.name} by {one.calibration}" for one in (repeats[0], another))
+        examples = ", ".join(f"{one.exam.name} by {one.calibration}" for one in (repeats[0], another))
         way_out = "their spreads are not comparable: run the campaign with one"
-        raise BadDataError(f"the exams were sized by {len(digests)} calibrations ({named})", way_out=way_out)
-    names = [name, *size_json.SHIPPED] if given is None else [given]
+        raise BadDataError(f"the exams were sized by {len(digests)} calibrations ({examples})", way_out=way_out)
+    names = [name, *size_json.SHIPPED] if named is None else [named]
     paths = [path for one in names if (path := size_json.size_calibration_path(one)) is not None]
-    path = next((path for path in paths if (given is not None or path.is_file()) and sha256(path) == digest), None)
-    if path is None and given is not None:
-        what = f"{given} is not the calibration that the exams were sized by ({name})"
+    path = next((path for path in paths if (named is not None or path.is_file()) and sha256(path) == digest), None)
+    if path is None and named is not None:
+        what = f"{named} is not the calibration that the exams were sized by ({name})"
         raise BadDataError(what, way_out="give that one, or run the campaign again with this one")
     if path is None:
         raise UsageError(f"calibration {name}, which sized the exams, is not found; name it by --size-calibration")
@@ -233,8 +233,8 @@ def calibrate_repeatability(
         When the calibration's file is not found.
     """
     target = None if path is None else output_path(path, "JSON")
-    given = None if size_calibration is None else str(size_calibration)
-    learned = learn_from_exams(exams_of_campaign(required_path(folder, "folder")), size_calibration=given)
+    named = None if size_calibration is None else str(size_calibration)
+    learned = learn_from_exams(exams_of_campaign(required_path(folder, "folder")), size_calibration=named)
     if target is not None:
         learned.write(target, force=force)
     return learned.spread()

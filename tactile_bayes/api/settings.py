@@ -73,16 +73,18 @@ class Settings(FitSettings, kw_only=True):
 
     @property
     def calibration_name(self) -> str | None:
-        """The calibration's name or path; None where none was named."""
-        given = self.size_calibration
-        return given if given is None or isinstance(given, str) else GIVEN
+        """Name or path of the calibration; None where none was named."""
+        calibration = self.size_calibration
+        return calibration if calibration is None or isinstance(calibration, str) else GIVEN
 
-    def recorded(self, **used: Any) -> dict[str, Any]:
-        """Plain data of all settings but the seed, for a provenance; `used` stands in place of what was asked for."""
-        first = dict.fromkeys(("size_calibration", "method", "interval"))
-        plain: dict[str, Any] = first | {name: used.get(name, getattr(self, name)) for name in self.__struct_fields__}
+    def recorded(self, **actual: Any) -> dict[str, Any]:
+        """Plain data of all settings but the seed, for a provenance; `actual` values replace those asked for."""
+        leading = dict.fromkeys(("size_calibration", "method", "interval"))
+        plain: dict[str, Any] = leading | {
+            name: actual.get(name, getattr(self, name)) for name in self.__struct_fields__
+        }
         del plain["seed"], plain["settings_file"]
-        plain["size_calibration"] = used.get("size_calibration", self.calibration_name)
+        plain["size_calibration"] = actual.get("size_calibration", self.calibration_name)
         plain["centre_mm"] = None if self.centre_mm is None else list(self.centre_mm)
         plain["known"] = dict(self.known)
         plain["checkpoint"] = None if self.checkpoint is None else self.checkpoint.name
@@ -102,41 +104,41 @@ SettingsFile: Final = subrecord(
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """What a settings file sets, by the names of `Settings`."""
+    """Read a settings file: values by the names of `Settings`."""
     from tactile_bayes.files.documents import load_toml, parse_record
 
     document = load_toml(path, way_out="see settings.schema.json")
-    read = parse_record(document, SettingsFile, path=path)
-    found = {name: getattr(read, name) for name in document}
-    if "checkpoint" in found:
-        found["checkpoint"] = path.parent / found["checkpoint"]
-    return found | {"settings_file": path}
+    parsed = parse_record(document, SettingsFile, path=path)
+    values = {name: getattr(parsed, name) for name in document}
+    if "checkpoint" in values:
+        values["checkpoint"] = path.parent / values["checkpoint"]
+    return values | {"settings_file": path}
 
 
 def refuse_checkpoint(settings: Settings) -> None:
-    """Refuse a checkpoint where several maps are estimated: they would all go on from one."""
+    """Refuse a checkpoint where several maps are estimated: all would resume from one state."""
     if settings.checkpoint is not None:
         raise UsageError("a checkpoint is of one map; give one map, or leave checkpoint out of the settings")
 
 
-# --- When the visits of a comparison were.
+# --- Times of the visits of a comparison.
 
 
 def days_from_first(days: Sequence[float] | None, dates: Sequence[str] | None) -> tuple[float, ...] | None:
-    """Time of each visit in days, the first at 0, from the later ones' days or from all dates; None for neither."""
+    """Days of all visits from the first, from the later ones' days or from all dates; None for neither."""
     if days is not None and dates is not None:
         raise UsageError("days and dates both say when the visits were; give one of them")
     if dates is None:
         return None if days is None else (0.0, *days)
-    found = []
+    parsed = []
     for text in dates:
         try:
-            found.append(date.fromisoformat(str(text).strip()))
+            parsed.append(date.fromisoformat(str(text).strip()))
         except ValueError:
             raise UsageError(f"{str(text).strip()!r} is no date; give year-month-day, such as 2026-03-01") from None
-    return tuple(float((one - found[0]).days) for one in found)
+    return tuple(float((one - parsed[0]).days) for one in parsed)
 
 
 def split_dates(text: str | None) -> tuple[str, ...]:
-    """Dates from a list with commas, such as 2026-01-15,2026-04-20; none of no text."""
+    """Split dates at commas, such as 2026-01-15,2026-04-20; None gives no date."""
     return () if text is None else tuple(one.strip() for one in text.split(","))

@@ -42,7 +42,7 @@ _MAPS: Final = ("normalise", "background", "fit_radius_mm", "noise")  #: How a t
 
 
 class LearnedCalibration(Record, eq=False):
-    """A learned or corrected size calibration, with what its file holds besides."""
+    """A learned or corrected size calibration, with settings, inputs and diagnostics of its learning."""
 
     calibration: Calibration
     settings: dict[str, Any]  #: For the provenance.
@@ -51,7 +51,7 @@ class LearnedCalibration(Record, eq=False):
     base: dict[str, Any] | None = None  #: Document of the calibration that was corrected.
     lumps: eq6.SizeTable | None = None  #: The table as Eq 6 takes it, where that was learned.
     not_left_out: str = ""  #: Why no geometry could be left out; empty where they were, or the table is no study.
-    other_fit: eq6.OtherFit | None = None  #: What the other of the two fits makes of the table; None where it has none.
+    other_fit: eq6.OtherFit | None = None  #: The table by the other of the two fits; None where that does not exist.
 
     def write(self, path: Path, *, force: bool = False) -> None:
         """Write the file that `estimate --size-calibration` takes."""
@@ -61,154 +61,156 @@ class LearnedCalibration(Record, eq=False):
 
 def learn(
     table: Path | Sheet,
-    asked: LearnOptions,
-    given: Collection[str],
+    options: LearnOptions,
+    typed: Collection[str],
     *,
     correct: str | None = None,
     against: Path | None = None,
     progress: Progress | None = None,
 ) -> LearnedCalibration:
-    """Learn a size calibration in the way that table and options ask for; those of another way are refused.
+    """Learn a size calibration by the form of table and options; options of another form are refused.
 
-    `given`: names of the options that somebody gave; `correct`: name or path of the calibration to correct; `against`:
+    `typed`: names of the options that were typed; `correct`: name or path of the calibration to correct; `against`:
     lumps of another origin, for one over bodies.
     """
     if correct is not None:
         why = "is for learning a calibration; leave it out with --correct"
-        _refuse(given, why, "form", "against", "fit", "least_stiffness_ratio", "figure")
-        return _corrected(table, correct, asked, progress)
-    if asked.form != "eq6" or {"body", "exam"} <= set(header_of(table)):
+        _refuse(typed, why, "form", "against", "fit", "least_stiffness_ratio", "figure")
+        return _corrected(table, correct, options, progress)
+    if options.form != "eq6" or {"body", "exam"} <= set(header_of(table)):
         why = "is for tables of lumps: a table of `population` fixes how its maps were made"
-        _refuse(given, why, "fit", *_MAPS[1:], "least_stiffness_ratio", "figure", "seed")
-        return _over_bodies(table, asked, against)
-    _refuse(given, "is for a table of `population`; leave it out", "against")
-    return _eq6(table, asked, progress)
+        _refuse(typed, why, "fit", *_MAPS[1:], "least_stiffness_ratio", "figure", "seed")
+        return _over_bodies(table, options, against)
+    _refuse(typed, "is for a table of `population`; leave it out", "against")
+    return _eq6(table, options, progress)
 
 
-def _refuse(given: Collection[str], why: str, *others: str) -> None:
-    for name in others:
-        if name in given:
+def _refuse(typed: Collection[str], why: str, *names: str) -> None:
+    for name in names:
+        if name in typed:
             raise UsageError(f"--{name.replace('_', '-')} {why}")
 
 
 def _files(**tables: Path | Sheet | None) -> dict[str, Path]:
-    """Those of the tables that are files, by role."""
+    """The tables that are files, by role."""
     return {role: table for role, table in tables.items() if isinstance(table, Path)}
 
 
-def _eq6(table: Path | Sheet, asked: LearnOptions, progress: Progress | None) -> LearnedCalibration:
-    """Learn Eq 6 from a table of lumps, of which those softer than asked take no part.
+def _eq6(table: Path | Sheet, options: LearnOptions, progress: Progress | None) -> LearnedCalibration:
+    """Learn Eq 6 from a table of lumps, without those below the least stiffness ratio.
 
-    By the posterior of all coefficients from all rows (``"joint"``), or as printed, with a bootstrap (``"two-stage"``).
+    By the joint posterior of all coefficients (``"joint"``), or as the paper does, with a bootstrap (``"two-stage"``).
     """
     rows = read_table(table, "size_table.table.json")
-    recipe, least = table_recipe(rows, asked), asked.least_stiffness_ratio
+    recipe, least = table_recipe(rows, options), options.least_stiffness_ratio
     with in_file(rows.path):
         lumps = size_table(rows, least_stiffness_ratio=least)
-        rng = np.random.default_rng(asked.seed)
-        if asked.fit == "two-stage":
+        rng = np.random.default_rng(options.seed)
+        if options.fit == "two-stage":
             calibration = eq6.learn_two_stage(lumps, recipe=recipe, rng=rng)
         else:
             calibration = eq6.learn_size_calibration(lumps, recipe=recipe, rng=rng, progress=progress)
         other = eq6.other_fit(calibration, lumps)
-        one_axis = eq6.axis_in_two_stages if asked.fit == "two-stage" else None
-        left_out, silent = None, ""  # cross-validated errors, or why Eq 6 has none
+        one_axis = eq6.axis_in_two_stages if options.fit == "two-stage" else None
+        left_out, not_left_out = None, ""  # cross-validated errors, or why Eq 6 has none
         try:
             left_out = eq6.cross_validate(lumps, least_stiffness_ratio=least, fit=one_axis)
         except (NotConvergedError, BadDataError) as error:
-            silent = str(error)
+            not_left_out = str(error)
     made = (recipe.normalise, recipe.background, recipe.radius_mm, recipe.noise)
-    settings = {**dict(zip(_MAPS, made, strict=True)), "least_stiffness_ratio": least, "fit": asked.fit}
+    settings = {**dict(zip(_MAPS, made, strict=True)), "least_stiffness_ratio": least, "fit": options.fit}
     cautions = table_cautions(rows.columns, least_stiffness_ratio=least)
     learned = replace(calibration, left_out=left_out, cautions=cautions)
-    return LearnedCalibration(learned, settings, _files(table=table), asked.seed, None, lumps, silent, other)
+    return LearnedCalibration(learned, settings, _files(table=table), options.seed, None, lumps, not_left_out, other)
 
 
 def table_cautions(columns: Mapping[str, Sequence[Any]], *, least_stiffness_ratio: float = 0.0) -> tuple[str, ...]:
-    """What makes sizes by Eq 6 of a table of lumps doubtful, in words; see docs/decisions/0093 for the figures."""
-    found, seats = [], set(columns["seat"])
+    """Cautions on sizes by Eq 6 from a table of lumps; see docs/decisions/0093 for the figures."""
+    cautions, seats = [], set(columns["seat"])
     if set(columns["sigma_y_mm"]) == {None}:
-        found.append(
+        cautions.append(
             "its lumps have one width; if they were cylinders, as in a study in two dimensions, "
             "balls come out 40 to 110 % too large"
         )
     if len(seats) == 1 and None not in seats:
-        found.append(f"its lumps have one seat ({seats.pop()}); one of another seat may come out half too large")
+        cautions.append(f"its lumps have one seat ({seats.pop()}); one of another seat may come out half too large")
     softest = min((ratio for ratio in columns["stiffness_ratio"] if ratio is not None), default=LEAST_HARD_RATIO)
     if max(softest, least_stiffness_ratio) < LEAST_HARD_RATIO:
-        found.append("it holds soft lumps, beside which hard ones come out too large (--least-stiffness-ratio 8)")
-    return tuple(found)
+        cautions.append("it holds soft lumps, beside which hard ones come out too large (--least-stiffness-ratio 8)")
+    return tuple(cautions)
 
 
-def _over_bodies(table: Path | Sheet, asked: LearnOptions, against: Path | None) -> LearnedCalibration:
-    """Learn a calibration from a table of `population`; lumps `against` it tell by how much such bodies depart."""
-    given = None if against is None else read_table(against, "population.table.json")
+def _over_bodies(table: Path | Sheet, options: LearnOptions, against: Path | None) -> LearnedCalibration:
+    """Learn a calibration from a table of `population`; the lumps `against` it give the SD of other bodies."""
+    other_rows = None if against is None else read_table(against, "population.table.json")
     rows, fit = read_table(table, "population.table.json"), measuring_options()
-    way, columns = rows_of_one_way(rows, asked.normalise)
-    bodies, residual = table_bodies(columns), asked.form == "eq6-residual"
-    settings: dict[str, Any] = {"form": asked.form, "masses": len(set(columns["body"])), "bodies": bodies}
+    way, columns = rows_of_one_way(rows, options.normalise)
+    bodies, residual = table_bodies(columns), options.form == "eq6-residual"
+    settings: dict[str, Any] = {"form": options.form, "masses": len(set(columns["body"])), "bodies": bodies}
     with in_file(rows.path):
         head = table_head(columns)
         recipe = Recipe(
             way, fit.background, fit.fit_radius_mm, declared=False, noise=fit.noise, flat_field=False, head=head
         )
-        found = learning.learn_population(population_table(columns), recipe=recipe, source=_SOURCE, residual=residual)
-    if residual and found.residual is None:
+        calibration = learning.learn_population(
+            population_table(columns), recipe=recipe, source=_SOURCE, residual=residual
+        )
+    if residual and calibration.residual is None:
         raise BadDataError(
             f"fewer than {learning.LEAST_BODIES} bodies have a lump and a head profile: too few for a residual",
             way_out="give a larger population, or --form eq6",
             path=str(rows.path),
         )
-    found = replace(found, bodies=bodies)
-    if given is not None:
-        other_table = population_table(rows_of_one_way(given, way)[1])
+    calibration = replace(calibration, bodies=bodies)
+    if other_rows is not None:
+        other_table = population_table(rows_of_one_way(other_rows, way)[1])
         settings["other_masses"] = len(set(other_table.body.tolist()))
-        source = f"{settings['other_masses']} lumps of {given.path.name}"
-        found = learning.learn_other_sd(found, other_table, source=source)
-    return LearnedCalibration(found, settings, _files(table=table, against=against))
+        source = f"{settings['other_masses']} lumps of {other_rows.path.name}"
+        calibration = learning.learn_other_sd(calibration, other_table, source=source)
+    return LearnedCalibration(calibration, settings, _files(table=table, against=against))
 
 
-def table_recipe(table: Table, asked: LearnOptions) -> Recipe:
+def table_recipe(table: Table, options: LearnOptions) -> Recipe:
     """Recipe of a size table's maps: from its columns, else as the options declare, else the default."""
-    said = {name: _alike(table, name) for name in (*_MAPS, "flat_field")}
-    found = {name: getattr(asked, name) if said[name] is None else said[name] for name in _MAPS}
-    for name, value in found.items():
-        if getattr(asked, name) not in (None, value):
+    stated = {name: _constant(table, name) for name in (*_MAPS, "flat_field")}
+    settings = {name: getattr(options, name) if stated[name] is None else stated[name] for name in _MAPS}
+    for name, value in settings.items():
+        if getattr(options, name) not in (None, value):
             option, also = f"--{name.replace('_', '-')}", ""
             if name == "normalise":
                 also = f", and size maps made with `map --normalise {value}`; "
                 also += "`population` gives a table for --normalise gain"
-            what = f"its {name} is {value}, not {getattr(asked, name)} as {option} says"
+            what = f"its {name} is {value}, not {getattr(options, name)} as {option} says"
             raise BadDataError(what, way_out=f"leave out {option}{also}", path=str(table.path))
-    normalise: Normalise = found["normalise"] or "mean"
-    background: Background = found["background"] or ("free" if normalise == "none" else "fixed")
+    normalise: Normalise = settings["normalise"] or "mean"
+    background: Background = settings["background"] or ("free" if normalise == "none" else "fixed")
     if normalise == "none" and background == "fixed":
         raise UsageError("maps of --normalise none have no level to fix a background at; give --background free")
     return Recipe(
         normalise,
         background,
-        found["fit_radius_mm"] or FIT_RADIUS_MM,
-        declared=any(said[name] is None for name in _MAPS),
-        noise=found["noise"] or "independent",
-        flat_field=said["flat_field"],
+        settings["fit_radius_mm"] or FIT_RADIUS_MM,
+        declared=any(stated[name] is None for name in _MAPS),
+        noise=settings["noise"] or "independent",
+        flat_field=stated["flat_field"],
         head=_named_head(table),
     )
 
 
 def _named_head(table: Table) -> HeadShape | None:
-    """Head that a table of lumps names; None where it does not."""
+    """Head that a table of lumps names; None where it names none."""
     names = ("head_rows", "head_columns", "head_pitch_mm")
-    values = [_alike(table, name) for name in names]
+    values = [_constant(table, name) for name in names]
     if values == [None, None, None]:
         return None
     if None in values:
         what = f"names a head without {names[values.index(None)]}"
         raise BadDataError(what, way_out=f"give {', '.join(names)} and head_radius_mm", path=str(table.path))
-    return HeadShape(values[0], values[1], values[2], _alike(table, "head_radius_mm"))
+    return HeadShape(values[0], values[1], values[2], _constant(table, "head_radius_mm"))
 
 
-def _alike(table: Table, name: str) -> Any:
-    """Value of a column that must be the same in all rows."""
+def _constant(table: Table, name: str) -> Any:
+    """Value of a column that must be constant."""
     values = table.columns[name]
     if len(set(values)) > 1:
         what = f"{name} differs between rows"
@@ -222,25 +224,25 @@ def rows_of_one_way(rows: Table, normalise: str | None) -> tuple[Normalise, dict
     Tables without the column, and empty cells, are of maps normalised by the mean.
     """
     ways = [str(value or "mean") for value in rows.columns.get("normalise", ["mean"] * len(rows))]
-    found = sorted(set(ways))
-    chosen, several = normalise or found[0], normalise is None and len(found) > 1
-    if several or chosen not in found:
+    present = sorted(set(ways))
+    chosen, several = normalise or present[0], normalise is None and len(present) > 1
+    if several or chosen not in present:
         what = f"none of its maps were made with --normalise {chosen}"
-        what = f"its maps were normalised in several ways ({', '.join(found)})" if several else what
+        what = f"its maps were normalised in several ways ({', '.join(present)})" if several else what
         advice = "learn from the rows of one way:" if several else "give"
-        raise BadDataError(what, way_out=f"{advice} --normalise {found[0]}", path=str(rows.path))
-    kept = [i for i, way in enumerate(ways) if way == chosen]
-    return cast("Normalise", chosen), {name: [values[i] for i in kept] for name, values in rows.columns.items()}
+        raise BadDataError(what, way_out=f"{advice} --normalise {present[0]}", path=str(rows.path))
+    indices = [i for i, way in enumerate(ways) if way == chosen]
+    return cast("Normalise", chosen), {name: [values[i] for i in indices] for name, values in rows.columns.items()}
 
 
 def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> eq6.SizeTable:
-    """Columns of a table as arrays, with Delta sigma where depths are given; without softer lumps."""
+    """Columns of a table as arrays, with Delta sigma where depths are stated; without softer lumps."""
     # only lumps marked as detectable: fits to the others describe a trough
-    shown = [
+    hard = [
         flag is not False and (ratio is None or ratio >= least_stiffness_ratio)
         for flag, ratio in zip(table.columns["detectable"], table.columns["stiffness_ratio"], strict=True)
     ]
-    columns = {name: list(compress(values, shown)) for name, values in table.columns.items()}
+    columns = {name: list(compress(values, hard)) for name, values in table.columns.items()}
 
     def array(name: str) -> FloatArray | None:
         values = columns[name]
@@ -257,8 +259,10 @@ def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> eq6.SizeT
         raise BadDataError("no rows", way_out="give a row for each lump", path=str(table.path))
     if depth is None:
         return eq6.SizeTable(d_mm, amplitude, sigma_x, sigma_y)
-    same = [columns[name] for name in ("seat", "d_mm", "stiffness_ratio", "thickness_mm", "head_radius_mm", "head")]
-    group = list(zip(*same, strict=True))
+    lump_columns = [
+        columns[name] for name in ("seat", "d_mm", "stiffness_ratio", "thickness_mm", "head_radius_mm", "head")
+    ]
+    group = list(zip(*lump_columns, strict=True))
     change_x, change_y = (
         None if one is None else eq6.width_changes(one, depth_ratio=depth, group=group) for one in (sigma_x, sigma_y)
     )
@@ -275,7 +279,7 @@ HARDEST_RATIO = 100.0
 """Largest E2/E1 of the simulated bodies; a harder lump counts as this one, because widths hardly change beyond it."""
 
 
-def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Progress | None) -> LearnedCalibration:
+def _corrected(table: Path | Sheet, base: str, options: LearnOptions, progress: Progress | None) -> LearnedCalibration:
     """Correct a calibration over bodies by phantoms.
 
     `table`: a row for each map of a phantom: its bump (size_table) or its file (phantom_maps); `base`: name or path of
@@ -291,7 +295,7 @@ def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Pr
     by_files, inputs = "file" in header_of(table), {**_files(table=table), "size_calibration": path}
     with in_file(table if isinstance(table, Path) else table.name):
         if by_files:
-            declared = [name for name in _MAPS if getattr(asked, name) is not None]
+            declared = [name for name in _MAPS if getattr(options, name) is not None]
             _refuse(declared, "is for tables of amplitudes and widths: map files state how they were made", *_MAPS)
             rows = read_table(table, "phantom_maps.table.json")
             names = [str(one) for one in rows.columns["file"]]
@@ -299,9 +303,9 @@ def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Pr
             inputs |= {f"map_{i}": folder / name for i, name in enumerate(names, start=1)}
         else:
             rows = read_table(table, "size_table.table.json")
-            _check_table(rows, calibration, asked)
+            _check_table(rows, calibration, options)
             names = [f"line {line}" for line in rows.line_numbers]
-        maps, left_out, by_recipe = [], [], Settings(size_calibration=base, seed=asked.seed)
+        maps, left_out, by_recipe = [], [], Settings(size_calibration=base, seed=options.seed)
         lines = [dict(zip(rows.columns, cells, strict=True)) for cells in zip(*rows.columns.values(), strict=True)]
         for i, (phantom, row) in enumerate(zip(_names(rows, lines, names), lines, strict=True)):
             bump = None if by_files else _bump(rows, i, row)
@@ -320,7 +324,7 @@ def _corrected(table: Path | Sheet, base: str, asked: LearnOptions, progress: Pr
         name = base if base in SHIPPED else path.name
         corrected = correct_calibration(calibration, maps, base=name, left_out=left_out)
     document: Any = load_json(path)
-    settings = {"correct": name, "of": "maps" if by_files else "bumps", "seed": asked.seed}
+    settings = {"correct": name, "of": "maps" if by_files else "bumps", "seed": options.seed}
     return LearnedCalibration(corrected, settings, inputs, base=document)
 
 
@@ -328,12 +332,12 @@ def _bump(rows: Table, i: int, row: Mapping[str, Any]) -> ShapeDraws:
     if row["sigma_y_mm"] is None:
         raise rows.error(i, "sigma_y_mm", "is blank", way_out="give both widths of the map")
     a, x, y = (np.array([row[one]], dtype=np.float64) for one in ("amplitude", "sigma_x_mm", "sigma_y_mm"))
-    told = tuple(row[one] for one in HEAD_PROFILE)
-    return ShapeDraws.of(BumpDraws(a, x, y, np.zeros(1)), profile=None if None in told else told)
+    profile = tuple(row[one] for one in HEAD_PROFILE)
+    return ShapeDraws.of(BumpDraws(a, x, y, np.zeros(1)), profile=None if None in profile else profile)
 
 
 def _names(rows: Table, lines: Sequence[Mapping[str, Any]], otherwise: Sequence[str]) -> list[str]:
-    """Name of the phantom of each row; rows of one phantom must state the same properties."""
+    """Phantom of each row; rows of one phantom must state the same properties."""
     names = [other if row["phantom"] is None else row["phantom"] for row, other in zip(lines, otherwise, strict=True)]
     first: dict[str, Mapping[str, Any]] = {}
     for i, (name, row) in enumerate(zip(names, lines, strict=True)):
@@ -347,21 +351,21 @@ def _names(rows: Table, lines: Sequence[Mapping[str, Any]], otherwise: Sequence[
 
 def _known(rows: Table, i: int, row: Mapping[str, Any]) -> dict[str, float]:
     """The properties of a row's phantom, by the names of `HiddenTerms`."""
-    found: dict[str, float] = {}
+    properties: dict[str, float] = {}
     if row["depth_ratio"] is not None:
-        found["depth_mm"] = row["depth_ratio"] * row["d_mm"]
+        properties["depth_mm"] = row["depth_ratio"] * row["d_mm"]
     if row["stiffness_ratio"] is not None:
-        found["stiffness_ratio"] = min(row["stiffness_ratio"], HARDEST_RATIO)
+        properties["stiffness_ratio"] = min(row["stiffness_ratio"], HARDEST_RATIO)
     if row["seat"] is not None:
         try:
-            found["seat"] = parse_seat(row["seat"])
+            properties["seat"] = parse_seat(row["seat"])
         except BadDataError as error:
             raise rows.error(i, "seat", f"is {row['seat']!r}", way_out=error.way_out) from None
-    return found
+    return properties
 
 
 def _unfit(row: Mapping[str, Any]) -> str:
-    """Why a lump takes no part: not shown, or too soft for a calibration over bodies with hard ones."""
+    """Reason why a lump is left out: not detectable, or softer than the calibration's; empty where it is used."""
     if row.get("detectable") is False:
         return "its row says that it is not detectable"
     ratio = row["stiffness_ratio"]
@@ -370,10 +374,10 @@ def _unfit(row: Mapping[str, Any]) -> str:
     return f"its stiffness_ratio is {ratio:g}, and the calibration's lumps have {LEAST_HARD_RATIO:g} and more"
 
 
-def _check_table(rows: Table, calibration: BodyCalibration, asked: LearnOptions) -> None:
+def _check_table(rows: Table, calibration: BodyCalibration, options: LearnOptions) -> None:
     """Refuse a table of maps that were made or fitted otherwise than the calibration's, or with another head."""
     ours = calibration.recipe
-    if differs := ours.differences(table_recipe(rows, asked)):
+    if differs := ours.differences(table_recipe(rows, options)):
         raise BadDataError(
             f"its maps were made by another recipe: {'; '.join(differs)}",
             way_out=f"a correction needs maps made with {ours.map_command}, fitted by `estimate` with the calibration "
@@ -428,9 +432,9 @@ def calibrate_size(
     UsageError
         When a keyword's value cannot be one, or goes with another form.
     """
-    asked = LearnOptions(**{name: plain(value) for name, value in options.items()})
+    learn_options = LearnOptions(**{name: plain(value) for name, value in options.items()})
     target = None if path is None else output_path(path, "JSON")
-    learned = learn(table_of(table, "table"), asked, options, correct=None if correct is None else str(correct))
+    learned = learn(table_of(table, "table"), learn_options, options, correct=None if correct is None else str(correct))
     if target is not None:
         learned.write(target, force=force)
     return learned.calibration

@@ -1,4 +1,4 @@
-"""What an estimate is: its draws, sizes, tables, report and files, of a mass and of a map."""
+"""Results of estimates: draws, sizes, tables, report and files, of a mass and of a map."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     import pandas
     from matplotlib.figure import Figure
 
-# --- What all estimates of a size have in common, and the masses of a map.
+# --- Base of all size results, and the masses of a map.
 
 
 class SizeResult(Record, eq=False, dict=True):
@@ -55,7 +55,7 @@ class SizeResult(Record, eq=False, dict=True):
 
     @property
     def why(self) -> str:
-        """Why there is no size, or no estimate at all; empty where there is a size."""
+        """Reason for no size or no estimate; empty where there is a size."""
         return "" if self._size is not None else self._result.reason
 
     def _draws(self, size: SizePosterior | None, name: str) -> Draws | None:
@@ -65,7 +65,7 @@ class SizeResult(Record, eq=False, dict=True):
 
     @property
     def probability(self) -> float:
-        """Of the intervals that are shown where none is asked for."""
+        """Probability of the intervals shown by default."""
         raise NotImplementedError
 
     @property
@@ -92,8 +92,8 @@ class SizeResult(Record, eq=False, dict=True):
         return self._draws(None if self._size is None else self._size.another_exam, "max_size_mm")
 
     def _columns(self) -> dict[str, Draws]:
-        found = {name: self._draws(self._size, name) for name in SIZES}
-        return {name: draws for name, draws in found.items() if draws is not None}
+        draws_by_name = {name: self._draws(self._size, name) for name in SIZES}
+        return {name: draws for name, draws in draws_by_name.items() if draws is not None}
 
     def to_dataframe(self) -> pandas.DataFrame:
         """One row for each draw: chain, draw and a column for each quantity; no rows without an estimate."""
@@ -123,7 +123,7 @@ class SizeResult(Record, eq=False, dict=True):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What speaks against the size, cautions first."""
+        """Findings against the size, cautions first."""
         return self._result.findings
 
     @property
@@ -150,11 +150,11 @@ class SizeResult(Record, eq=False, dict=True):
             yield "probability of a lump", f"{chance:.2f}"
 
     def _repr_html_(self) -> str:
-        told = "".join(f"<p>{escape(line)}</p>" for line in finding_lines(self.findings, paper=True))
+        lines = "".join(f"<p>{escape(line)}</p>" for line in finding_lines(self.findings, paper=True))
         cells = [f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in self._rows()]
         why = "" if self._size is not None else f"<p>No size: {escape(self.why)}</p>"
         table = f"<table>{''.join(cells)}</table>" if cells else ""
-        return f"{told}{why}{table}<p><small>{escape(RESEARCH_USE)}</small></p>"
+        return f"{lines}{why}{table}<p><small>{escape(RESEARCH_USE)}</small></p>"
 
 
 class MassEstimate(SizeResult, eq=False, dict=True):
@@ -183,7 +183,7 @@ class MassEstimate(SizeResult, eq=False, dict=True):
 
     @property
     def reported(self) -> bool:
-        """Whether the estimate's own size is this mass's."""
+        """True for the mass whose size the estimate itself reports."""
         return self.mass.reported
 
     def _words(self) -> str:
@@ -191,17 +191,17 @@ class MassEstimate(SizeResult, eq=False, dict=True):
         return f"{self.number} at ({x:.1f}, {y:.1f}) mm: {super()._words()}"
 
 
-# --- The answer for one map, as processes and campaigns pass it on, and the estimate with all that it was made of.
+# --- The answer for one map, which worker processes return, and the whole estimate.
 
 
 class Answer(Record):
     """Answer for one map: its report and its text, without map and draws."""
 
     report: EstimateReport
-    shape: ShapeDraws | None  #: What pooling needs of a map on which a lump was found.
+    shape: ShapeDraws | None  #: Draws for pooling; None where no lump was found.
     normalise: str  #: How the map's frames were normalised.
-    fingerprint: int  #: What the map's values seed random numbers with.
-    head: HeadShape | None  #: What the map was made with.
+    fingerprint: int  #: Hash of the map's values, part of the random seed.
+    head: HeadShape | None  #: Head that the map was made with.
     text: str = ""  #: The report in at most 12 lines.
     full_text: str = ""  #: All of the report.
 
@@ -212,12 +212,12 @@ class Answer(Record):
 
     @property
     def document(self) -> dict[str, Any]:
-        """What ``estimate --json`` prints."""
+        """The document that ``estimate --json`` prints."""
         return self.report.document
 
 
 class Failure(Record):
-    """Why a map of several has no answer, with its exit code."""
+    """Error of one map of several, with its exit code."""
 
     text: str
     exit_code: int
@@ -232,25 +232,26 @@ class SizedExam(SizeResult, eq=False, dict=True, kw_only=True):
 
     @property
     def probability(self) -> float:
-        """Of the intervals that are shown where none is asked for."""
+        """Probability of the intervals shown by default."""
         return self.settings.interval
 
     @property
     def _title(self) -> str:
-        """Name for the titles of figures: what the scans say of the exam, and the map's own."""
+        """Name for the titles of figures: the scans' codes of the exam, and the map's name."""
         return exam_title(self.name, self.provenance.scans)
 
     def _draw_size(self, size: SizePosterior, path: Path | None, *, force: bool) -> Figure:
-        shown: dict[str, Any] = {"name": self._title, "probability": self.probability, "findings": self.findings}
-        return draw_size(size, path, **shown, force=force)
+        return draw_size(
+            size, path, name=self._title, probability=self.probability, findings=self.findings, force=force
+        )
 
     def exam(self) -> ShownExam:
-        """What a page of the exam shows: its map, or all maps and the size that was pooled from them."""
+        """Make the exam of a page: its map, or all maps and their pooled size."""
         scans = self.provenance.scans
         check_one_mass(scans)
         maps: Sequence[Any] = getattr(self, "maps", (self,))
-        shown = tuple(exam_map(one.tactile_map, one.answer.report, side=side_of(scans)) for one in maps)
-        return ShownExam(shown, getattr(self, "pooled_report", None), scans)
+        exam_maps = tuple(exam_map(one.tactile_map, one.answer.report, side=side_of(scans)) for one in maps)
+        return ShownExam(exam_maps, getattr(self, "pooled_report", None), scans)
 
     @door
     def report(
@@ -275,7 +276,7 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
     """The estimate of one map."""
 
     tactile_map: TactileMap
-    estimate: Estimate  #: Posterior and size, or why there is none.
+    estimate: Estimate  #: Posterior and size, or the reason for none.
     calibration: Calibration | None = None  #: The one that sized the lump, at its depth.
 
     @property
@@ -289,7 +290,7 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
 
     @property
     def advice(self) -> str:
-        """What would help where there is no size."""
+        """Advice where there is no size."""
         return options_as_keywords(self.estimate.advice)
 
     @property
@@ -325,25 +326,25 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
     @property
     def masses(self) -> tuple[MassEstimate, ...]:
         """All masses of the map, the surest first; this estimate is of the one that is `reported`."""
-        found, tactile_map = self.estimate, self.tactile_map
+        estimate, tactile_map = self.estimate, self.tactile_map
         return tuple(
             MassEstimate(
                 number,
                 mass,
                 patient_mm(tactile_map, mass.x_mm, mass.y_mm),
                 self.probability,
-                "" if mass.estimate.size is not None else found.reason if mass.reported else mass.estimate.reason,
+                "" if mass.estimate.size is not None else estimate.reason if mass.reported else mass.estimate.reason,
             )
-            for number, mass in enumerate(found.masses, start=1)
+            for number, mass in enumerate(estimate.masses, start=1)
         )
 
     def _of_shape(self, name: str) -> Draws | None:
-        found = self.estimate
-        if found.map_posterior is None or found.draws is None:
+        estimate = self.estimate
+        if estimate.map_posterior is None or estimate.draws is None:
             return None
         unit = "mm" if name.endswith("_mm") else "rad" if name.endswith("_rad") else ""
-        values = getattr(found.map_posterior, name)
-        return Draws(values, unit, self.probability, found.draws.labels, found.draws.effective_draws)
+        values = getattr(estimate.map_posterior, name)
+        return Draws(values, unit, self.probability, estimate.draws.labels, estimate.draws.effective_draws)
 
     def _columns(self) -> dict[str, Draws]:
         shapes = {name: draws for name in OF_A_MAP if (draws := self._of_shape(name)) is not None}
@@ -356,7 +357,7 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
 
     @cached_property
     def answer(self) -> Answer:
-        """The report: `document` is what ``estimate --json`` prints, `text` what it prints for people."""
+        """Report and text: `document` is printed by ``estimate --json``, `text` by ``estimate``."""
         tactile_map, estimate, settings = self.tactile_map, self.estimate, self.settings
         prior, provenance, probability = settings.prior, self.provenance, settings.interval
         report = estimate_report(estimate, tactile_map, probability=probability, prior=prior, provenance=provenance)
@@ -410,7 +411,7 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
 
 
 def size_priors(settings: Settings) -> SizePriors:
-    """Priors of a size; a spread between maps that is stated, or learned at the site, leaves it one interval."""
+    """Priors of a size; with a stated or learned spread between maps it has one interval instead of two."""
     fixed, learned = settings.between_map_sd, settings.repeatability
     if learned is None and fixed is None:
         return SizePriors(known=dict(settings.known))
@@ -419,7 +420,7 @@ def size_priors(settings: Settings) -> SizePriors:
 
 
 def pooling_shape(tactile_map: TactileMap, estimate: Estimate) -> ShapeDraws | None:
-    """Draws that pooling needs of a map, with the direction of its axes if landmarks define it."""
+    """Draws of a map for pooling, with the direction of its axes if landmarks define it."""
     posterior, turn = estimate.map_posterior, tactile_map.patient_from_plane
     if posterior is None:
         return None

@@ -50,27 +50,27 @@ class TrialResult(TextResult, eq=False):
 
     @property
     def document(self) -> dict[str, Any]:
-        """What ``validate --json`` prints."""
+        """The document that ``validate --json`` prints."""
         document: dict[str, Any] = to_plain(self.report, digits=DIGITS)
         return document
 
     @property
     def text(self) -> str:
-        """What ``validate --methods`` prints."""
-        return self.told(methods=True)
+        """The text that ``validate --methods`` prints."""
+        return self.text_with(methods=True)
 
-    def told(self, *, methods: bool) -> str:
+    def text_with(self, *, methods: bool) -> str:
         """The report as text, with or without the table of methods."""
         return trial_text(self.report, left_out=self.trial.other_visits.lines(), methods=methods)
 
     def write_json(self, path: Path, *, force: bool = False) -> None:
-        """Write what ``validate -o`` writes."""
+        """Write the file of ``validate -o``."""
         write_text(path, dump_json(self.document), force=force)
 
     def write_html(
         self, path: Path, *, growth: Sequence[Growth] = (), pdf: Path | None = None, force: bool = False
     ) -> None:
-        """Write what ``validate --html`` and ``--pdf`` write, with what became of masses with several visits."""
+        """Write the page of ``validate --html`` and ``--pdf``, with the growth of masses that have several visits."""
         page = trial_html(self.report, self.trial, text=self.text, growth=growth)
         PageFiles(path, pdf, force).write(page)
 
@@ -83,8 +83,8 @@ class TrialResult(TextResult, eq=False):
                     counted = name == "detected"  # the interval beside it is of the share
                     low, high = (None, None) if counted else figures.get(f"{name}_interval") or (None, None)
                     rows.append((modality, name, value, low, high))
-        found = dataframe(rows, columns=["modality", "figure", "value", "low", "high"])
-        return found.astype({"value": float, "low": float, "high": float})
+        table = dataframe(rows, columns=["modality", "figure", "value", "low", "high"])
+        return table.astype({"value": float, "low": float, "high": float})
 
     def __repr__(self) -> str:
         counts, names = self.report.counts, ", ".join(self.report.modalities)
@@ -92,15 +92,15 @@ class TrialResult(TextResult, eq=False):
 
 
 def settings_by(
-    protocol: Path | None, given: Mapping[str, Any] = {}, *, typed: Collection[str] = ()
+    protocol: Path | None, settings: Mapping[str, Any] = {}, *, typed: Collection[str] = ()
 ) -> tuple[str | None, TrialSettings]:
     """Title and settings of a protocol, if there is one, over those given; refuses typed ones that contradict it."""
     title, fixed = (None, {}) if protocol is None else read_protocol(protocol)
     for name, value in fixed.items():
-        if name in typed and given[name] != value:
-            option = f"--{name.replace('_', '-')} {given[name]}"
+        if name in typed and settings[name] != value:
+            option = f"--{name.replace('_', '-')} {settings[name]}"
             raise UsageError(f"{option} contradicts {protocol}, which fixes {name} = {value}; leave the option out")
-    return title, TrialSettings(**{**given, **fixed})
+    return title, TrialSettings(**{**settings, **fixed})
 
 
 def analyse(
@@ -108,14 +108,14 @@ def analyse(
 ) -> TrialResult:
     """Analyse a trial; `protocol` and `title` are of the pre-specified analysis, where there is one."""
     intervals = Intervals(INTERVAL, method=settings.intervals, resamples=settings.resamples, seed=settings.seed)
-    kept = {name: value for name, value in as_dict(settings).items() if name != "seed"}
+    recorded = {name: value for name, value in as_dict(settings).items() if name != "seed"}
     inputs = hash_inputs(**trial.files, protocol=protocol)
-    made = Provenance("validate", {"interval_probability": INTERVAL, **kept}, inputs, seed=settings.seed)
-    report = summarise(trial, intervals=intervals, error_ratio=settings.error_ratio, provenance=made.as_dict())
-    more: dict[str, Any] = {} if title is None else {"title": title}
+    provenance = Provenance("validate", {"interval_probability": INTERVAL, **recorded}, inputs, seed=settings.seed)
+    report = summarise(trial, intervals=intervals, error_ratio=settings.error_ratio, provenance=provenance.as_dict())
+    extra: dict[str, Any] = {} if title is None else {"title": title}
     if settings.bayes:
-        more["next_mass"] = next_mass(trial, rng=np.random.default_rng(settings.seed))
-    return TrialResult(replace(report, **more), trial)
+        extra["next_mass"] = next_mass(trial, rng=np.random.default_rng(settings.seed))
+    return TrialResult(replace(report, **extra), trial)
 
 
 # --- Input of `validate` and `plan`: the tables of a trial, tidy or wide, and the estimates that they name.
@@ -134,18 +134,18 @@ def load_trial(trial: Path | Sheet, excision: Path | Sheet, columns: Path | None
     else:
         table = read_wide(trial, mapping, mapping.reading)
     check_references(table, "trial.table.json", targets={"excision": sizes})
-    filled: Mapping[str, list[Any]] = table.columns
+    columns_filled: Mapping[str, list[Any]] = table.columns
     posteriors: list[Path] = []
-    if any(filled.get("posterior", ())):
+    if any(columns_filled.get("posterior", ())):
         from tactile_bayes.files.estimate_json import fill_from_posteriors  # h5py and the estimates' declarations
 
-        filled, posteriors = fill_from_posteriors(table)
+        columns_filled, posteriors = fill_from_posteriors(table)
     keys = list(zip(sizes.columns["patient"], sizes.columns["mass"], strict=True))
-    readings = readings_from_columns(filled, fault=table.error)
+    readings = readings_from_columns(columns_filled, fault=table.error)
     excised_on = dict(zip(keys, sizes.columns["date"], strict=True))
     analysed, other_visits = at_excision(readings, excised_on, fault=table.error)
-    given = {"trial": trial, "excision": excision, "columns": columns}
-    files = {role: path for role, path in given.items() if isinstance(path, Path)}
+    tables = {"trial": trial, "excision": excision, "columns": columns}
+    files = {role: path for role, path in tables.items() if isinstance(path, Path)}
     return Trial(
         readings=analysed,
         other_visits=other_visits,
@@ -189,8 +189,8 @@ def validate(
     BadDataError
         Naming the table, the line (1 is the header), the column, the value and the way out.
     """
-    used = TrialSettings(**{name: plain(value) for name, value in settings.items()})
-    return analyse(load_trial(table_of(trial, "trial"), table_of(excision, "excision"), path_of(columns)), used)
+    own_settings = TrialSettings(**{name: plain(value) for name, value in settings.items()})
+    return analyse(load_trial(table_of(trial, "trial"), table_of(excision, "excision"), path_of(columns)), own_settings)
 
 
 MAPS_OF_AIMS = 3  #: Maps of a mass where the number of patients is asked for, by default.
@@ -205,21 +205,21 @@ class TrialPlan(TextResult, eq=False):
 
     @property
     def document(self) -> dict[str, Any]:
-        """What ``plan --json`` prints."""
+        """The document that ``plan --json`` prints."""
         document: dict[str, Any] = to_plain(self.report, digits=EXACT)
         return document
 
     @property
     def text(self) -> str:
-        """What ``plan`` prints."""
+        """The text that ``plan`` prints."""
         return plan_text(self.report)
 
     def write_json(self, path: Path, *, force: bool = False) -> None:
-        """Write what ``plan -o`` writes."""
+        """Write the file of ``plan -o``."""
         write_text(path, dump_json(self.document), force=force)
 
     def draw(self, path: Path, *, force: bool = False) -> None:
-        """Draw what ``plan --figure`` draws."""
+        """Draw the figure of ``plan --figure``."""
         plan_figure(self.report, path, force=force)
 
     def __repr__(self) -> str:
@@ -228,32 +228,32 @@ class TrialPlan(TextResult, eq=False):
 
 
 class Pilot(Record, eq=False):
-    """An earlier trial that errors are taken from."""
+    """An earlier trial, whose errors a plan assumes."""
 
     trial: Trial
-    path: Path  #: Of its readings, for errors; the name of a DataFrame.
+    path: Path  #: Of its readings, for error messages; the name of a DataFrame.
 
     def doubts(self) -> Iterator[str]:
-        """What speaks against its tables, a line each."""
+        """Doubts about the tables, a line each."""
         yield from self.trial.other_visits.lines()
         sizes, ex_vivo = self.trial.sizes(), np.array(list(self.trial.ex_vivo_mm.values()))
         yield from (f"doubtful: {doubt}" for doubt in unit_doubts(sizes, ex_vivo))
 
-    def errors(self, against: str, given: Mapping[str, float]) -> dict[str, float]:
-        """Errors of ln size, those that are given as they are."""
+    def errors(self, against: str, stated: Mapping[str, float]) -> dict[str, float]:
+        """Errors of ln size: the stated ones, else the pilot's."""
         sizes = self.trial.sizes()
         for name in ("tactile", against):
             if name not in sizes:
                 way_out = f"it has {', '.join(sizes)}; choose one with --against"
                 raise BadDataError(f"holds no readings by {name}", way_out=way_out, path=str(self.path))
-        found = planning.pilot_errors(sizes["tactile"], sizes[against], map_sd=given.get("map_sd"))
-        if found is None:
+        errors = planning.pilot_errors(sizes["tactile"], sizes[against], map_sd=stated.get("map_sd"))
+        if errors is None:
             way_out = "give the errors by options"
             raise BadDataError("has fewer than 3 masses found by a modality", way_out=way_out, path=str(self.path))
-        if "map_sd" not in found:
+        if "map_sd" not in errors:
             what = "has no mass with two tactile readings, so the SD of single maps is unknown"
             raise BadDataError(what, way_out="give it with --map-sd", path=str(self.path))
-        return {**found, **given}
+        return {**errors, **stated}
 
     @property
     def files(self) -> dict[str, Path]:
@@ -265,8 +265,8 @@ class Pilot(Record, eq=False):
 def read_pilot(pilot: Path | Sheet | None, excision: Path | Sheet | None, against: str | None) -> Pilot | None:
     """Read a pilot's tables, None without one; refuses what goes only with one, and a pilot without its excision."""
     if pilot is None:
-        for name, given in (("excision", excision), ("against", against)):
-            if given is not None:
+        for name, value in (("excision", excision), ("against", against)):
+            if value is not None:
                 raise UsageError(f"--{name} says how a pilot is read; give --pilot TRIAL.csv, or leave it out")
         return None
     if excision is None:
@@ -310,27 +310,27 @@ def plan(
     >>> tb.plan(patients=[24], maps=[3], trials=50).report.designs[0].patients
     24
     """
-    given = {name: plain(value) for name, value in options.items() if value is not None}
-    for name in {"patients", "maps"} & set(given):
-        given[name] = tuple(map(plain, list_of(name, given[name], "whole numbers")))
+    values = {name: plain(value) for name, value in options.items() if value is not None}
+    for name in {"patients", "maps"} & set(values):
+        values[name] = tuple(map(plain, list_of(name, values[name], "whole numbers")))
     readings = None if pilot is None else table_of(pilot, "pilot")
     sizes = None if excision is None else table_of(excision, "excision")
-    return planned(given, read_pilot(readings, sizes, given.get("against")), progress)
+    return planned(values, read_pilot(readings, sizes, values.get("against")), progress)
 
 
-def planned(given: Mapping[str, Any], pilot: Pilot | None, progress: Progress) -> TrialPlan:
-    """Plan with the options and errors that are given, then the errors of the pilot, then the defaults."""
-    asked = PlanOptions(**{name: value for name, value in given.items() if name not in _ERRORS})
-    stated = {name: value for name, value in given.items() if name in _ERRORS}
-    wanted = asked.targets
-    if wanted and "patients" in given:
+def planned(values: Mapping[str, Any], pilot: Pilot | None, progress: Progress) -> TrialPlan:
+    """Plan with the stated options and errors, then the pilot's errors, then the defaults."""
+    options = PlanOptions(**{name: value for name, value in values.items() if name not in _ERRORS})
+    stated = {name: value for name, value in values.items() if name in _ERRORS}
+    aims = options.targets
+    if aims and "patients" in values:
         raise UsageError("--power and --precision find the number of patients; leave out --patients")
     by_default = as_dict(PlanErrors(**stated))
-    errors = by_default if pilot is None else pilot.errors(asked.against, stated)
-    rest: planning.ErrorSource = "default" if pilot is None else "pilot"
-    case = partial(planning.PlanCase, **errors, trials=asked.trials, seed=asked.seed)
-    each_maps = (MAPS_OF_AIMS,) if wanted and "maps" not in given else sorted(set(asked.maps))
-    with open_executor(workers=asked.workers) as executor:
+    errors = by_default if pilot is None else pilot.errors(options.against, stated)
+    unstated: planning.ErrorSource = "default" if pilot is None else "pilot"
+    case = partial(planning.PlanCase, **errors, trials=options.trials, seed=options.seed)
+    each_maps = (MAPS_OF_AIMS,) if aims and "maps" not in values else sorted(set(options.maps))
+    with open_executor(workers=options.workers) as executor:
 
         def run(cases: Sequence[planning.PlanCase]) -> tuple[planning.Design, ...]:
             outcomes = run_batch(
@@ -341,24 +341,24 @@ def planned(given: Mapping[str, Any], pilot: Pilot | None, progress: Progress) -
                     raise BadDataError(f"{outcome.key}: {outcome.error}", way_out="change the errors assumed")
             return tuple(outcome.value for outcome in outcomes if outcome.value is not None)
 
-        if wanted:
-            found, needed = _needed(each_maps, wanted, case, run)
+        if aims:
+            designs, needed = _needed(each_maps, aims, case, run)
         else:
-            designs = itertools.product(sorted(set(asked.patients)), each_maps)
-            found, needed = run([case(patients=patients, maps=number) for patients, number in designs]), ()
+            pairs = itertools.product(sorted(set(options.patients)), each_maps)
+            designs, needed = run([case(patients=patients, maps=number) for patients, number in pairs]), ()
     assumed = {name: float(f"{errors[name]:.9g}") for name in _ERRORS}
-    sources: dict[str, planning.ErrorSource] = {name: "option" if name in stated else rest for name in _ERRORS}
+    sources: dict[str, planning.ErrorSource] = {name: "option" if name in stated else unstated for name in _ERRORS}
     inputs = hash_inputs(**({} if pilot is None else pilot.files))
-    settings: dict[str, Any] = {"trials": asked.trials, "errors": assumed, "errors_from": sources}
-    settings |= {str(aim): target for aim, target in wanted.items()}
+    settings: dict[str, Any] = {"trials": options.trials, "errors": assumed, "errors_from": sources}
+    settings |= {str(aim): target for aim, target in aims.items()}
     report = planning.PlanReport(
         schema="tactile-bayes/plan/1",
         errors=assumed,
         errors_from=sources,
-        designs=found,
-        gains=() if wanted else planning.map_gains(found),
+        designs=designs,
+        gains=() if aims else planning.map_gains(designs),
         needed=needed,
-        provenance=Provenance("plan", settings, inputs, seed=asked.seed).as_dict(),
+        provenance=Provenance("plan", settings, inputs, seed=options.seed).as_dict(),
         research_use=RESEARCH_USE,
     )
     return TrialPlan(report, () if pilot is None else tuple(pilot.doubts()))
@@ -370,8 +370,8 @@ def _needed(
     case: Callable[..., planning.PlanCase],
     run: Callable[[Sequence[planning.PlanCase]], tuple[planning.Design, ...]],
 ) -> tuple[tuple[planning.Design, ...], tuple[planning.Needed, ...]]:
-    """Designs about the numbers of patients that reach the aims, and these numbers."""
-    found: dict[tuple[int, int], planning.Design] = {}
+    """Simulate designs near the numbers of patients that reach the aims; return them and these numbers."""
+    designs: dict[tuple[int, int], planning.Design] = {}
     needed = []
     for number, (aim, target) in itertools.product(maps, aims.items()):
         first = case(patients=MIN_PATIENTS, maps=number)
@@ -381,9 +381,9 @@ def _needed(
             raise BadDataError(str(undefined), way_out="change the errors assumed") from None
         for _ in range(planning.ROUNDS):
             about = planning.patients_around(guess)
-            cases = [case(patients=one, maps=number) for one in about if (number, one) not in found]
-            found |= {(number, one.patients): one for one in run(cases)}
-            answer = planning.patients_needed([found[number, one] for one in about], aim, target, trials=first.trials)
+            cases = [case(patients=one, maps=number) for one in about if (number, one) not in designs]
+            designs |= {(number, one.patients): one for one in run(cases)}
+            answer = planning.patients_needed([designs[number, one] for one in about], aim, target, trials=first.trials)
             if answer is None or about[0] <= answer.patients <= about[-1] or answer.patients == guess:
                 break
             guess = answer.patients
@@ -391,4 +391,4 @@ def _needed(
             what = f"{MOST_PATIENTS} patients do not reach {aim} {target:g} (maps of each mass: {number})"
             raise BadDataError(what, way_out="ask for less, or change the errors assumed")
         needed.append(answer)
-    return tuple(found[key] for key in sorted(found)), tuple(needed)
+    return tuple(designs[key] for key in sorted(designs)), tuple(needed)

@@ -407,7 +407,7 @@ def _write_report(folder: Path, settings: CampaignSettings, growth: Sequence[Gro
         return "", error.what
     analysis.write_json(folder / REPORT, force=True)
     analysis.write_html(folder / PAGE, growth=growth, force=True)
-    return analysis.told(methods=False), ""
+    return analysis.text_with(methods=False), ""
 
 
 def index_html(

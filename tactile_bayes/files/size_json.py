@@ -177,12 +177,12 @@ def parse_size_calibration(document: Any, *, path: Path) -> Calibration:
         return BodyCalibration(**{name: getattr(file, name) for name in BodyLaw.__struct_fields__})
     if form != "site":
         return parse_record(document, Eq6File, path=path)
-    corrected = parse_record(document, SiteFile, path=path)
-    base = parse_size_calibration(corrected.base, path=path)
+    site_file = parse_record(document, SiteFile, path=path)
+    base = parse_size_calibration(site_file.base, path=path)
     if not isinstance(base, BodyCalibration) or base.site is not None:
         what = "its base is no uncorrected calibration over bodies"
         raise BadDataError(what, way_out="learn the correction anew: `calibrate size --correct`", path=str(path))
-    return replace(base, site=corrected.site)
+    return replace(base, site=site_file.site)
 
 
 # --- A site's repeatability as JSON.
@@ -268,6 +268,6 @@ class RepeatabilityFile(Record, kw_only=True, omit_defaults=True):
 
 
 def read_repeatability(path: Path) -> Repeatability:
-    """Read what `RepeatabilityFile.write` wrote."""
+    """Read a file of `calibrate repeatability`."""
     file = read_record(path, RepeatabilityFile, way_out="give a file of `calibrate repeatability`")
     return file.spread(sha256(path))

@@ -4,7 +4,7 @@ With u, v and w as in `eq6`,
 
 .. math:: \ln d = \ln\text{Eq 6}(u, v, w) + h(u, v, w) + B + E
 
-Eq 6 has constants that depend on the depth of the fat. h is what it leaves (`Residual`); a calibration by Eq 6
+Eq 6 has constants that depend on the depth of the fat. h is its residual (`Residual`); a calibration by Eq 6
 alone has none. B differs from body to body by what a map does not show (seat, stiffness, moduli): ln SD(B) is a full
 quadratic in u, v and w. E differs from exam to exam of one body. A body of another origin than the table's departs by
 more, `other_sd`.
@@ -74,7 +74,7 @@ class Spread(Record, eq=False):
     log_exam_sd: float  #: ln SD between exams of a body.
     log_exam_sd_variance: terms.Share
     other_sd: Annotated[float, Meta(ge=0)]  #: By which bodies of another origin depart.
-    other_source: str  #: What told it.
+    other_source: str  #: Where it comes from.
 
     def __post_init__(self) -> None:
         s = len(self.powers)
@@ -132,12 +132,12 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         if self.depth is None or self.fat_mm is not None or self.fat_note:
             return self
         if self.site is not None and not self.site.uses_fat:
-            return self._at_any_depth(NO_PROFILE)
+            return self._without_depth(NO_PROFILE)
         if all(one is None for one in profiles):
-            return self._at_any_depth("the map has no pressure profile of the head")
-        fat_mm, why_not = self.depth.of_mass(profiles)
+            return self._without_depth("the map has no pressure profile of the head")
+        fat_mm, why_not = self.depth.from_maps(profiles)
         if fat_mm is None:
-            return self._at_any_depth(why_not).widened_for_atypical_body()
+            return self._without_depth(why_not).widened_for_atypical_body()
         return replace(self, fat_mm=fat_mm)
 
     def at_depth_or_fallback(
@@ -148,21 +148,21 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         if self.fat_mm is None or self.leverage(amplitude, sigma_mm) <= terms.MOST_LEVERAGE:
             return self
         what = f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm over {self.fat_mm:.3g} mm of fat"
-        return self._at_any_depth(f"{what} {UNLIKE}").widened_for_atypical_body()
+        return self._without_depth(f"{what} {UNLIKE}").widened_for_atypical_body()
 
     def for_maps(self, maps: Sequence[ShapeDraws]) -> BodyCalibration:
-        """The calibration at the depth of fat that the maps of a mass tell, if all of them go with that depth."""
+        """The calibration at the depth of fat estimated from a mass's maps, if all lie in its table there."""
         calibration = self.at_fat([one.profile for one in maps])
         for one in maps:
             calibration = calibration.at_depth_or_fallback(*one.middle)
         return calibration
 
     def widened_for_atypical_body(self) -> BodyCalibration:
-        """This calibration with room for a body unlike any of the table's: intervals without it held 38 of 48."""
+        """This calibration with a wider spread for a body unlike the table's: intervals without it covered 38 of 48."""
         return self.with_other_sd(float(np.hypot(self.other_sd, UNLIKE_SD)))
 
     def with_other_sd(self, other_sd: float, **source: str) -> BodyCalibration:
-        """This calibration for bodies that depart by so much."""
+        """This calibration with another `other_sd`."""
         return replace(self, spread=replace(self.spread, other_sd=other_sd, **source))
 
     @property
@@ -177,7 +177,7 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
 
     @property
     def unknowns(self) -> dict[str, float]:
-        """Share of the variance between bodies that knowing each property alone would take away."""
+        """Share of the variance between bodies that each property alone would explain."""
         return {} if self.hidden is None else {name: self.hidden.share(name) for name in self.hidden.names}
 
     def constants(self, sigma_mm: float | None = None, *, fat_mm: float | None = None) -> dict[str, float]:
@@ -196,14 +196,14 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
     def terms(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
         """(..., k + m) derivatives of ln d by the coefficients; NaN where Eq 6 has no positive size."""
         values = self._values(log_amplitude, log_width)
-        terms = eq6_terms(*values, self.eq6.mean, self.eq6.powers)
+        derivatives = eq6_terms(*values, self.eq6.mean, self.eq6.powers)
         if self.residual is not None:
             functions = self.residual.functions(np.stack(np.broadcast_arrays(*values), axis=-1))
-            terms = np.concatenate([terms, functions], axis=-1)
-        return self._averaged(terms)
+            derivatives = np.concatenate([derivatives, functions], axis=-1)
+        return self._averaged(derivatives)
 
     def features(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
-        """(..., c) features, in which a map's leverage and what it leads one to expect of a body are linear."""
+        """(..., c) features of maps: regressors of the hidden properties, and basis of the leverage."""
         return self._averaged(self._monomials(log_amplitude, log_width, self.feature_powers))
 
     def log_size(self, log_amplitude: FloatArray, log_width: FloatArray) -> FloatArray:
@@ -233,13 +233,13 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         x = self._monomials(log_amplitude, log_width, self.spread.powers)
         sd = np.sqrt(np.maximum(np.sum(x @ self.spread.covariance * x, axis=-1), 0.0))
         variance = self._averaged(np.exp(2.0 * (x @ self.spread.mean + sd * score)))
-        if self._averages:
+        if self._marginalised:
             sizes = self._log_sizes(log_amplitude, log_width)
             variance = variance + self._averaged((sizes - self._averaged(sizes)) ** 2)
         return np.sqrt(variance + self.other_sd**2)
 
-    def own_sd(self, body_sd: FloatArray) -> FloatArray:
-        """(n,) SD(B) without `other_sd`, of which nothing that is known of a body tells anything."""
+    def table_sd(self, body_sd: FloatArray) -> FloatArray:
+        """(n,) SD(B) without `other_sd`, which no known property explains."""
         return np.asarray(np.sqrt(np.maximum(body_sd**2 - self.other_sd**2, 0.0)))
 
     @property
@@ -247,8 +247,8 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         """(k + m, k + m) of Eq 6's coefficients and the residual's weights, which are independent."""
         if self.residual is None:
             return self.eq6.covariance
-        apart = np.zeros((len(self.eq6.mean), len(self.residual.mean)))
-        return np.block([[self.eq6.covariance, apart], [apart.T, self.residual.covariance]])
+        zeros = np.zeros((len(self.eq6.mean), len(self.residual.mean)))
+        return np.block([[self.eq6.covariance, zeros], [zeros.T, self.residual.covariance]])
 
     def coefficient_variance(self, terms: FloatArray) -> FloatArray:
         """(n,) variance of ln d by the coefficients' error, for (n, k + m) terms."""
@@ -262,9 +262,9 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
     def outside(
         self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float | None = None, *, far: bool = False
     ) -> list[str]:
-        """In what a map lies outside the table, or so `far` outside that there is no size, in words.
+        """Texts on a map outside the table, or so `far` outside that there is no size.
 
-        That is its amplitude or width, where one is outside its range, or else the pair, unlike those of the table.
+        They name the amplitude or width outside its range, or else the pair, unlike those of the table.
         """
         sigma_mm = mean_width_mm(sigma_x_mm, sigma_y_mm)
         texts = terms.outside_domain(self.domain, amplitude, sigma_mm, far=far)
@@ -277,14 +277,14 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         return texts
 
     def within_reach(self, amplitude: FloatArray, sigma_x_mm: FloatArray, sigma_y_mm: FloatArray) -> BoolArray:
-        """(n,) True for maps that do not lie so far outside."""
+        """(n,) True for maps near enough to the table for a size."""
         sigma_mm = np.sqrt(sigma_x_mm * sigma_y_mm)
         inside = terms.within_reach(self.domain, amplitude, sigma_mm)
         inside[inside] = self.leverage(amplitude[inside], sigma_mm[inside]) <= FARTHEST_LEVERAGE
         return inside
 
     def beyond_lumps(self, largest_mm: float) -> list[str]:
-        """In what a size lies beyond the table's lumps, in words; empty when it lies within."""
+        """Text on a size beyond the table's lumps; empty within."""
         return terms.beyond_lumps(self.domain, largest_mm)
 
     def omissions(self) -> list[str]:
@@ -296,12 +296,12 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
             notes.append(text + (wider if self.other_sd else ""))
         return [*notes, terms.untabled_bodies(self.bodies)] if self.bodies else notes
 
-    def _at_any_depth(self, why: str) -> BodyCalibration:
+    def _without_depth(self, why: str) -> BodyCalibration:
         return replace(self, fat_mm=None, fat_note=why, hidden=self.hidden_any)
 
     @property
-    def _averages(self) -> bool:
-        """True where sizes are averaged over depths of fat."""
+    def _marginalised(self) -> bool:
+        """True where sizes are marginalised over the depth of fat."""
         return self.depth is not None and self.fat_mm is None
 
     def _values(self, log_amplitude: FloatArray, log_width: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -315,8 +315,8 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         return u, v, np.full_like(u, np.log(self.fat_mm) - w0)
 
     def _averaged(self, values: FloatArray) -> FloatArray:
-        """Over the depths of fat where these are not known."""
-        return np.asarray(np.tensordot(terms.WEIGHTS, values, 1)) if self._averages else values
+        """Average values over the depths of fat, where these are unknown."""
+        return np.asarray(np.tensordot(terms.WEIGHTS, values, 1)) if self._marginalised else values
 
     def _monomials(self, log_amplitude: FloatArray, log_width: FloatArray, exponents: Powers) -> FloatArray:
         return terms.monomials(np.broadcast_arrays(*self._values(log_amplitude, log_width)), exponents)
@@ -339,12 +339,12 @@ def known_body(
     known: Mapping[str, float],
     log_amplitude: FloatArray,
     log_width: FloatArray,
-    own_sd: FloatArray,
+    table_sd: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """(n,) mean and variance of B given known properties, for ln a and p of maps and `BodyCalibration.own_sd` there."""
+    """(n,) mean and variance of B given known properties, for ln a and p of maps, and `BodyCalibration.table_sd`."""
     hidden = calibration.hidden
     if not known:
-        return np.zeros(len(log_width)), own_sd**2
+        return np.zeros(len(log_width)), table_sd**2
     names = () if hidden is None else hidden.names
     for name, value in known.items():
         if name not in names:
@@ -357,8 +357,8 @@ def known_body(
             check_number(f"known {name}", value, low / BEYOND, most)
     assert hidden is not None
     expected = hidden.expected_departure(known, calibration.features(log_amplitude, log_width))
-    explained_sd = np.minimum(own_sd, hidden.most_sd)
-    return expected * explained_sd, own_sd**2 - hidden.share(*known) * explained_sd**2
+    explained_sd = np.minimum(table_sd, hidden.most_sd)
+    return expected * explained_sd, table_sd**2 - hidden.share(*known) * explained_sd**2
 
 
 def suppositions(
@@ -371,17 +371,17 @@ def suppositions(
     hidden, supposed = calibration.hidden, {}
     if hidden is None:
         return {}
-    at = np.array([middle[0]]), np.array([middle[1]])
-    own_sd = calibration.own_sd(calibration.body_sd(*at, np.zeros(1)))
-    expected, spread = known_body(calibration, known, *at, own_sd)
-    features = calibration.features(*at)[0]
+    middle_map = np.array([middle[0]]), np.array([middle[1]])
+    table_sd = calibration.table_sd(calibration.body_sd(*middle_map, np.zeros(1)))
+    expected, spread = known_body(calibration, known, *middle_map, table_sd)
+    features = calibration.features(*middle_map)[0]
     for label, (name, value) in SUPPOSED.items():
         low, high = calibration.bodies.get(name, (value, value))
         if name not in hidden.names or name in known or not low <= value <= high:
             continue
         if hidden.score(name, value, features) <= LIKELY_SDS:
-            then, left = known_body(calibration, {**known, name: value}, *at, own_sd)
+            shifted, left = known_body(calibration, {**known, name: value}, *middle_map, table_sd)
             remaining = float(np.clip(variance - float((spread - left)[0]), 0.0, variance))
             sds = float(np.sqrt(variance)), float(np.sqrt(remaining))
-            supposed[label] = Supposition(name, value, float((then - expected)[0]), sds)
+            supposed[label] = Supposition(name, value, float((shifted - expected)[0]), sds)
     return supposed

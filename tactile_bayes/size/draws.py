@@ -76,7 +76,7 @@ class ShapeDraws(Record, eq=False):
 
     @classmethod
     def of(cls, bump: BumpDraws, *, turn_rad: float = 0.0, profile: tuple[float, ...] | None = None) -> ShapeDraws:
-        """Prepare from draws of Eq 7; a draw without a rise becomes NaN."""
+        """Convert draws of Eq 7; a draw whose amplitude is not positive becomes NaN."""
         with np.errstate(invalid="ignore", divide="ignore"):
             log_a = np.log(np.where(bump.amplitude > 0, bump.amplitude, np.nan)).ravel()
         half, angle = 0.5 * np.log(bump.sigma_x_mm / bump.sigma_y_mm).ravel(), bump.angle_rad.ravel()
@@ -114,7 +114,7 @@ def first_axis(q: FloatArray, r: FloatArray) -> FloatArray:
 def matched_draws(
     maps: Sequence[ShapeDraws], number: int | None, rng: np.random.Generator
 ) -> tuple[Sequence[ShapeDraws], Labels]:
-    """As many draws of each map, matched by replicate, with their labels; one map's own where no number is given."""
+    """Equally many draws of each map, matched by replicate, with their labels; a single map keeps its own."""
     if number is None and len(maps) == 1:
         return maps, maps[0].replicates
     replicates = even_replicates(len(maps[0].q) if number is None else number)
@@ -189,11 +189,11 @@ def normal_log_density(x: FloatArray, covariance: FloatArray) -> float:
 
 
 class Supposition(Record):
-    """The size if one more property of the body, by the names of `HiddenTerms`, had this value."""
+    """The size under a supposed value of one more property of the body, by the names of `HiddenTerms`."""
 
     name: str
     value: float
-    log_shift: float  #: By which the median of ln d moves.
+    log_shift: float  #: Shift of the median of ln d.
     sds: tuple[float, float]  #: SDs of ln d without and with it.
 
     @property
@@ -207,10 +207,10 @@ class Supposition(Record):
         return float(np.expm1(self.log_shift))
 
     def moved(self, size: Quantity) -> tuple[float, float, float]:
-        """Where the median of a size and its interval's ends come to lie."""
-        middle, spread = float(size.median * np.exp(self.log_shift)), self.sd_ratio
-        low, high = (float(middle * (end / size.median) ** spread) for end in (size.low, size.high))
-        return middle, low, high
+        """Median and interval's ends of a size under this supposition."""
+        median, ratio = float(size.median * np.exp(self.log_shift)), self.sd_ratio
+        low, high = (float(median * (end / size.median) ** ratio) for end in (size.low, size.high))
+        return median, low, high
 
 
 class SizePosterior(Record, eq=False):
@@ -228,9 +228,9 @@ class SizePosterior(Record, eq=False):
     figures: Mapping[str, float] = field(default_factory=dict)
     """Further figures: the probability of a lump that is not round, the spread between maps..."""
     another_exam: SizePosterior | None = None
-    """The same if another exam of the mass may come out as far apart as in the paper's trial; None where not told."""
+    """The same if exams of a mass differ as much as in the paper's trial; None without a second interval."""
     supposing: Mapping[str, Supposition] = field(default_factory=dict)
-    """Sizes if something more were known of the body, by the names of `bodies.SUPPOSED`."""
+    """Sizes under suppositions on the body, by the names of `bodies.SUPPOSED`."""
 
     @property
     def max_size_mm(self) -> FloatArray:
@@ -245,12 +245,12 @@ class SizePosterior(Record, eq=False):
     @property
     def median_mm(self) -> float:
         """Median of the largest diameter over the draws that gave one; NaN where none did."""
-        given = self.max_size_mm[np.isfinite(self.max_size_mm)]
-        return float(np.median(given)) if given.size else float("nan")
+        finite = self.max_size_mm[np.isfinite(self.max_size_mm)]
+        return float(np.median(finite)) if finite.size else float("nan")
 
     @property
     def leading(self) -> SizePosterior:
-        """The sizes that lead, as `files.reports.Sized.leading` has it."""
+        """The sizes that reports lead with, as `files.reports.Sized.leading`."""
         return self if self.another_exam is None else self.another_exam
 
     def reshaped(self, shape: tuple[int, ...]) -> SizePosterior:
@@ -270,7 +270,7 @@ def shares(variances: Mapping[str, float]) -> dict[str, float]:
     return {name: float(100.0 * value / total) if total > 0 else 0.0 for name, value in variances.items()}
 
 
-# --- How far sizes of one mass lie apart between its maps: prior, posterior, outlying maps, and tests of one size.
+# --- Spread of the sizes of one mass between its maps: prior, posterior, outlying maps, and tests of one size.
 #
 # Map i gives :math:`g_i = m + E_i`, :math:`E_i \sim N(0, s_i^2 + \tau^2)`, s its own noise. One map says nothing of
 # tau, so there the prior speaks; several maps tell it by their restricted likelihood. Given tau, Cochran's :math:`Q
@@ -370,7 +370,7 @@ def one_size_by_draws(log_sizes: Sequence[FloatArray], known: BetweenMaps | None
 
 
 def cochran_probability(centre: FloatArray, noise: FloatArray, grid: FloatArray) -> FloatArray:
-    """(n,) probability of a Q as large or larger, for each tau of a grid."""
+    """(n,) probability of Cochran's Q as large or larger, for each tau of a grid."""
     weight = 1.0 / (noise[:, None] + grid**2)
     mean = np.sum(weight * centre[:, None], axis=0) / weight.sum(axis=0)
     q = np.sum(weight * (centre[:, None] - mean) ** 2, axis=0)

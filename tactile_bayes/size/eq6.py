@@ -108,18 +108,18 @@ class AxisCalibration(Record, eq=False):
         For (n,) values and (n, 6) or (6,) draws, the mean of the posterior when left out; NaN where the amplitude is
         not positive. Wellman & Howe (1999) eq. 6 with their Delta sigma as a ratio of widths, 1 at one diameter depth.
         """
-        use = self.draws.mean(axis=0) if draws is None else draws
-        m, b, e, f = (use[..., i] for i in range(4))
+        coefficients = self.draws.mean(axis=0) if draws is None else draws
+        m, b, e, f = (coefficients[..., i] for i in range(4))
         with np.errstate(invalid="ignore", divide="ignore"):
             width_change = e * np.where(amplitude > 0, amplitude, np.nan) ** f
             return np.asarray(m * sigma_mm / width_change + b)
 
     def scatter(self, amplitude: FloatArray, *, draws: FloatArray | None = None) -> FloatArray:
         """(n,) residual standard deviation of ln d at each amplitude."""
-        use = self.draws.mean(axis=0) if draws is None else draws
+        coefficients = self.draws.mean(axis=0) if draws is None else draws
         with np.errstate(invalid="ignore", divide="ignore"):
             ratio = np.where(amplitude > 0, amplitude, np.nan) / self.reference_amplitude
-            return np.asarray(use[..., 4] * ratio ** -use[..., 5])
+            return np.asarray(coefficients[..., 4] * ratio ** -coefficients[..., 5])
 
 
 class LeftOutErrors(Record):
@@ -161,20 +161,22 @@ class SizeCalibration(Record, eq=False):
     at_depth_or_fallback = at_fat
 
     def outside(self, amplitude: float, sigma_x_mm: float, sigma_y_mm: float, *, far: bool = False) -> list[str]:
-        """In what a map lies or may lie outside the axes' tables, or so `far` that there is no size, in words."""
+        """Texts on a map that lies or may lie outside the axes' tables, or so `far` outside that there is no size."""
         axes = (("x", self.x.domain, sigma_x_mm), ("y", self.y.domain, sigma_y_mm))
         texts = [
-            f"{name}: {text}" for name, own, mm in axes for text in terms.outside_domain(own, amplitude, mm, far=far)
+            f"{name}: {text}"
+            for name, domain, mm in axes
+            for text in terms.outside_domain(domain, amplitude, mm, far=far)
         ]
         return texts if far else [*self.cautions, *texts]
 
     def within_reach(self, amplitude: FloatArray, sigma_x_mm: FloatArray, sigma_y_mm: FloatArray) -> BoolArray:
-        """(n,) True for maps that do not lie so far outside."""
+        """(n,) True for maps near enough to the tables for a size."""
         by_x = terms.within_reach(self.x.domain, amplitude, sigma_x_mm)
         return np.asarray(by_x & terms.within_reach(self.y.domain, amplitude, sigma_y_mm))
 
     def beyond_lumps(self, largest_mm: float) -> list[str]:
-        """In what a size lies beyond the tables' lumps, in words; empty when it lies within."""
+        """Text on a size beyond the tables' lumps; empty within."""
         return terms.beyond_lumps(self.x.domain, largest_mm)
 
     def omissions(self) -> list[str]:
@@ -222,14 +224,14 @@ def push_sizes(
     }
     size = SizePosterior(d_x, d_y, shares(parts), int((~valid).sum()), replicates)
     if another_exam is not None:
-        size = replace(size, another_exam=_another(size, parts, another_exam, rng))
+        size = replace(size, another_exam=_of_another_exam(size, parts, another_exam, rng))
     return size.reshaped(shape)
 
 
-def _another(
+def _of_another_exam(
     size: SizePosterior, parts: Mapping[str, float], between: BetweenMaps, rng: np.random.Generator
 ) -> SizePosterior:
-    """The sizes with a spread between exams beside what one exam has, a factor that both axes share."""
+    """The sizes with a further spread between exams, one factor for both axes."""
     points = paired_points(size.max_size_mm, size.replicates, 2, rng)
     tau = between.at(points[:, 0])
     factor = np.exp(tau * ndtri(points[:, 1]))

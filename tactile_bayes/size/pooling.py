@@ -43,7 +43,7 @@ from tactile_bayes.size.terms import extrapolated
 # what no map shows of a body, is common to all maps of a mass and does not average out.
 
 Calibration = SizeCalibration | BodyCalibration
-"""One learned from a study or phantoms, or over a population: whoever uses it needs to know no more."""
+"""A calibration from a study or phantoms, or over a population; both have the same methods."""
 POOLED_DRAWS = 8192
 DIMENSIONS = 6
 """Coordinates of the points: ln d given all else, tau, the spread of B, oval or round, and an oval's two components."""
@@ -66,7 +66,7 @@ class SizePriors(Record):
 
     @property
     def spread_of_others(self) -> BetweenMaps:
-        """The prior from which maps teach the spread that a further one is held against."""
+        """Prior of the spread between a mass's other maps, with which each map is compared."""
         learned = self.between_maps is not None and self.between_maps.log_sd > 0  # else it is stated
         return self.another_exam or (self.between_maps if learned else None) or BetweenMaps()
 
@@ -109,7 +109,7 @@ class MassMaps(Record, eq=False):
 
     @classmethod
     def of(cls, maps: Sequence[ShapeDraws], calibration: BodyCalibration) -> MassMaps:
-        """By a calibration."""
+        """From the maps' draws, by a calibration."""
         by_map = np.stack(log_sizes(calibration, maps))
         terms = np.stack([calibration.terms(one.log_amplitude, one.log_width) for one in maps])
         return cls(maps, by_map, np.nanmean(by_map, axis=1), np.nanvar(by_map, axis=1), terms)
@@ -132,28 +132,28 @@ class MassMaps(Record, eq=False):
 def lump_shape(
     calibration: BodyCalibration, maps: Sequence[ShapeDraws], sizes: Sequence[FloatArray], prior: ShapePrior
 ) -> tuple[Elongation, float]:
-    """Posterior of the lump's shape in the axes the maps share, and the share of it that they show."""
+    """Posterior of the lump's elongation in the maps' common axes, and the share of it that the maps show."""
     excess, covariance, shown = np.zeros(2), np.zeros((2, 2)), 0.0
     k = len(maps)
-    for one, size in zip(maps, sizes, strict=True):
-        mean, spread = _axis_ratio(one)
-        mean[0] -= float(np.nanmean(calibration.round_excess(one.log_amplitude, one.log_width)))
-        turn = log_ratio_rotation(-one.turn_rad)
+    for shape, size in zip(maps, sizes, strict=True):
+        mean, spread = _axis_ratio(shape)
+        mean[0] -= float(np.nanmean(calibration.round_excess(shape.log_amplitude, shape.log_width)))
+        turn = log_ratio_rotation(-shape.turn_rad)
         excess += mean @ turn / k
         covariance += turn.T @ spread @ turn / k**2
-        shown += shown_share(size, one.log_width) / k
+        shown += shown_share(size, shape.log_width) / k
     balls = calibration.round_lumps
-    whole = balls.map_factor * covariance + (balls.variance(np.zeros(()), maps=k) + 1e-12) * np.eye(2)
-    return elongation(excess, whole, shown=shown, prior=prior), shown
+    total = balls.map_factor * covariance + (balls.variance(np.zeros(()), maps=k) + 1e-12) * np.eye(2)
+    return elongation(excess, total, shown=shown, prior=prior), shown
 
 
-def _axis_ratio(one: ShapeDraws) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance of q and r; where nobody measured r, as no map speaks for it, within twice q's SD of 0."""
-    both = np.stack([one.q, one.r], axis=-1)
+def _axis_ratio(shape: ShapeDraws) -> tuple[FloatArray, FloatArray]:
+    """Mean and covariance of q and r; an r that was not measured has mean 0 and twice q's SD."""
+    both = np.stack([shape.q, shape.r], axis=-1)
     both = both[np.isfinite(both).all(axis=1)]
     mean, covariance = both.mean(axis=0), np.cov(both.T)
     if not covariance[1, 1] > 0:
-        mean[1], sd = one.oblique or (0.0, 2.0 * float(np.sqrt(covariance[0, 0])))
+        mean[1], sd = shape.oblique or (0.0, 2.0 * float(np.sqrt(covariance[0, 0])))
         covariance[1, 1] = sd**2
     return mean, covariance
 
@@ -179,7 +179,7 @@ def pooled_size(
     calibration = calibration.at_fat([one.profile for one in maps])
     used, replicates = matched_draws(maps, number, rng)
     log_size = log_sizes(calibration, maps)
-    centre, noise = (np.array([of(one) for one in log_size]) for of in (np.nanmean, np.nanvar))
+    centre, noise = (np.array([moment(one) for one in log_size]) for moment in (np.nanmean, np.nanvar))
     drawn = replace(MassMaps.of(used, calibration), centre=centre, noise=noise)
     oval, shown = lump_shape(calibration, maps, log_size, priors.shape)
     points = paired_points(drawn.by_map.mean(axis=0), replicates, DIMENSIONS, rng)
@@ -218,7 +218,7 @@ class _Pool(Record, eq=False, dict=True):
         """Sizes under a prior of the spread between maps."""
         tau = between.at(self.points[:, 1], (self.drawn.centre, self.drawn.noise))
         maps = self.drawn.averaged(tau)
-        known, variances = self._left_open(maps)
+        known, variances = self._beyond_maps(maps)
         longer = np.hypot(self.half[:, 0], self.half[:, 1])
         mean = maps.mean + known + longer
         sd = np.sqrt(sum(variances.values()) + (OVAL_SD * longer) ** 2)
@@ -248,22 +248,22 @@ class _Pool(Record, eq=False, dict=True):
         body_sd = self.calibration.body_sd(maps.log_amplitude, maps.log_width, ndtri(self.points[:, _SCORE]))
         return body_sd, self.calibration.coefficient_variance(maps.terms)
 
-    def _left_open(self, maps: AveragedMaps) -> tuple[FloatArray, dict[str, FloatArray]]:
-        """(n,) mean of what the maps leave open of ln d, and its variances by source."""
+    def _beyond_maps(self, maps: AveragedMaps) -> tuple[FloatArray, dict[str, FloatArray]]:
+        """(n,) mean of ln d beyond the maps' own, and its variances by source."""
         body_sd, error = self._of_one if len(maps.weight) == 1 else self._errors(maps)
         # what is known of a body explains the spread of the population's bodies, and nothing of other kinds
-        own_sd, site = self.calibration.own_sd(body_sd), self.calibration.site
-        expected, left = known_body(self.calibration, self.known, maps.log_amplitude, maps.log_width, own_sd)
+        table_sd, site = self.calibration.table_sd(body_sd), self.calibration.site
+        expected, unexplained = known_body(self.calibration, self.known, maps.log_amplitude, maps.log_width, table_sd)
         form_sd = IRREGULAR_SD * self.figures["irregular_outline"]
         return expected, {
             "between_maps": maps.variance,
             "calibration": error,
-            "body": left + self.calibration.other_sd**2 + form_sd**2,
+            "body": unexplained + self.calibration.other_sd**2 + form_sd**2,
             **({} if site is None else {"site": site.variance(maps.log_width)}),
         }
 
     def _smoothed(self, mean: FloatArray, sd: FloatArray, longer: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Logs of both sizes, smoothed separately for round and oval draws, so that a round lump's sizes stay equal."""
+        """Logs of both sizes as stratified quantiles, apart for round and oval draws: a round lump has one size."""
         z = ndtri(self.points[:, 0])
         largest = stratified_quantiles(mean + sd * z, mean, sd, 2 * self.replicates + (longer > 0))
         smallest, o = largest.copy(), longer > 0
@@ -310,7 +310,7 @@ def pool_maps(
     few = f"a lump was found on {found_on} of {len(shapes)} maps"
     if 2 * found_on < len(shapes) - silent or not found_on:
         return PooledEstimate("no_estimate", few)
-    # one order whatever the caller's, so that the order leaves no trace in the draws
+    # sorted, so that the draws do not depend on the caller's order
     in_order = sorted(((shape, i) for i, shape in enumerate(shapes) if shape is not None), key=lambda one: one[0].order)
     used, places = [shape for shape, _ in in_order], [i for _, i in in_order]
     depth, at_depth = calibration.depth, calibration.for_maps(used)
@@ -324,7 +324,7 @@ def pool_maps(
     centre, noise = np.array(list(centres.values())), np.array([np.nanvar(one) for one in sizes])
     outlying = tuple(sorted(places[i] for i in outlying_maps(centre, noise, priors.spread_of_others)))
     another = None if priors.between_maps is not None or len(used) < 2 else priors.another_exam
-    found = PooledEstimate(
+    pooled = PooledEstimate(
         DISAGREE,
         "the maps show different sizes",
         centres=centres,
@@ -334,8 +334,8 @@ def pool_maps(
         one_size=None if len(used) < 2 else one_size_probability(centre, noise, priors.between_maps),
         one_size_apart=None if another is None else one_size_probability(centre, noise, another),
     )
-    if found.one_size is not None and found.one_size < LEAST_PROBABILITY:
-        return found
+    if pooled.one_size is not None and pooled.one_size < LEAST_PROBABILITY:
+        return pooled
     size = pooled_size(used, calibration=at_depth, priors=priors, rng=rng, number=POOLED_DRAWS)
     if size.invalid > MOST_INVALID * size.d_x_mm.size:
         return PooledEstimate("no_estimate", f"no positive size in {size.invalid} of {size.d_x_mm.size} draws")
@@ -343,10 +343,10 @@ def pool_maps(
     outside += at_depth.beyond_lumps(size.median_mm)
     reason = "" if found_on == len(shapes) else few
     if found_on > 1:
-        at = {i: number for number, i in enumerate(sorted(places), start=1)}
-        weights = {f"weight_{at[i]}": size.figures[f"weight_{j}"] for j, i in enumerate(places, start=1)}
+        map_numbers = {i: number for number, i in enumerate(sorted(places), start=1)}
+        weights = {f"weight_{map_numbers[i]}": size.figures[f"weight_{j}"] for j, i in enumerate(places, start=1)}
         size = replace(size, figures={**size.figures, **weights})
-    return replace(found, status="estimate", reason=reason, size=size, outside=tuple(outside))
+    return replace(pooled, status="estimate", reason=reason, size=size, outside=tuple(outside))
 
 
 # --- A site's repeatability: how far sizes of one mass lie apart between its exams, learned from repeated exams there.
@@ -386,7 +386,7 @@ class Repeatability(Record):
         return BetweenMaps(self.sd, self.log_sd)
 
     def as_dict(self) -> dict[str, float]:
-        """The part that a size used, as plain data."""
+        """The part that a size depends on, as plain data."""
         return {"between_map_sd": self.sd, "log_sd": self.log_sd, "masses": self.masses, "maps": self.maps}
 
     def words(self) -> str:
@@ -400,7 +400,7 @@ def _percent(share: float) -> str:
 
 
 def log_size_alone(calibration: BodyCalibration, shape: ShapeDraws) -> tuple[float, float]:
-    """Mean and variance of ln d by a map alone, without what no map shows."""
+    """Mean and variance of ln d by a map alone, without B."""
     (log_size,) = log_sizes(calibration.for_maps([shape]), [shape])
     return float(np.nanmean(log_size)), float(np.nanvar(log_size))
 
@@ -408,5 +408,5 @@ def log_size_alone(calibration: BodyCalibration, shape: ShapeDraws) -> tuple[flo
 def size_alone(
     shape: ShapeDraws, *, calibration: BodyCalibration, priors: SizePriors, rng: np.random.Generator
 ) -> SizePosterior:
-    """Size by a map alone from the draws that pooling keeps of it, one by one as `estimate_map` gives them."""
+    """Size by a map alone from its draws for pooling, draw by draw as `estimate_map` gives it."""
     return pooled_size([shape], calibration=calibration.for_maps([shape]), priors=priors, rng=rng)

@@ -52,12 +52,12 @@ def check_shapes(record: object, *, finite: bool = True, **shapes: tuple[int, ..
     for name, shape in shapes.items():
         values = getattr(record, name)
         if values.shape != shape or (finite and not np.isfinite(values).all()):
-            there, wanted = ("x".join(map(str, one)) for one in (values.shape, shape))
-            raise BadDataError(f"{name} has {there} numbers for {wanted} finite ones", way_out=LEARN_ANEW)
+            actual, expected = ("x".join(map(str, one)) for one in (values.shape, shape))
+            raise BadDataError(f"{name} has {actual} numbers for {expected} finite ones", way_out=LEARN_ANEW)
 
 
 def check_domain(domain: Domain) -> None:
-    """Refuse ranges of which one is missing."""
+    """Refuse ranges without amplitude, sigma_mm or d_mm."""
     if missing := [name for name in sorted(_RANGES) if name not in domain]:
         raise BadDataError(f"domain has no {missing[0]}", way_out=LEARN_ANEW)
 
@@ -69,14 +69,14 @@ def powers(order: int) -> tuple[tuple[int, int], ...]:
 
 def monomials(values: Sequence[FloatArray], exponents: Sequence[tuple[int, ...]]) -> FloatArray:
     """(..., terms) products of the (...) values' powers."""
-    highest = max(max(one) for one in exponents)
+    highest = max(max(power) for power in exponents)
     raised = []
     for value in values:
-        one = np.asarray(value, dtype=np.float64)
-        raised.append(list(accumulate([np.ones_like(one), *[one] * highest], np.multiply)))
-    products = np.stack([raised[0][one[0]] for one in exponents], axis=-1)
+        base = np.asarray(value, dtype=np.float64)
+        raised.append(list(accumulate([np.ones_like(base), *[base] * highest], np.multiply)))
+    products = np.stack([raised[0][power[0]] for power in exponents], axis=-1)
     for i in range(1, len(values)):
-        products *= np.stack([raised[i][one[i]] for one in exponents], axis=-1)
+        products *= np.stack([raised[i][power[i]] for power in exponents], axis=-1)
     return products
 
 
@@ -93,22 +93,22 @@ class Recipe(Record):
 
     @property
     def _settings(self) -> dict[str, str]:
-        """What is known of it, in words."""
+        """The known settings in words, by name."""
         radius = f"{self.radius_mm:g} mm"
-        known = {
+        words = {
             "normalise": self.normalise, "background": self.background, "fit radius": radius, "noise": self.noise
         }  # fmt: skip
-        return known if self.flat_field is None else known | {"flat field": "on" if self.flat_field else "off"}
+        return words if self.flat_field is None else words | {"flat field": "on" if self.flat_field else "off"}
 
     def differences(self, other: Recipe) -> list[str]:
         """Differences from another recipe in words; empty without any. Unknown settings do not differ."""
-        theirs = other._settings
-        pairs = [(name, ours, theirs.get(name, ours)) for name, ours in self._settings.items()]
-        texts = [f"{name} {that} (the calibration: {ours})" for name, ours, that in pairs if that != ours]
+        other_settings = other._settings
+        pairs = [(name, mine, other_settings.get(name, mine)) for name, mine in self._settings.items()]
+        texts = [f"{name} {theirs} (the calibration: {mine})" for name, mine, theirs in pairs if theirs != mine]
         return texts + self.head_differences(other.head)
 
     def head_differences(self, head: HeadShape | None) -> list[str]:
-        """In what a map's head departs from the calibration's; empty where one of them is unknown."""
+        """Differences of a map's head from the calibration's, in words; none where one of them is unknown."""
         return [] if self.head is None or head is None else self.head.differences(head)
 
     @property
@@ -139,7 +139,7 @@ class RoundLumps(Record, eq=False):
 class HiddenTerms(Record, eq=False, omit_defaults=True):
     """Properties of a body that no map shows, jointly normal with its departure B given the map.
 
-    Each is about what a map leads one to expect of it, which is linear in the map's features.
+    Each is centred on its expectation given the map, which is linear in the map's features.
     """
 
     names: Annotated[tuple[str, ...], Meta(min_length=1)]
@@ -166,16 +166,16 @@ class HiddenTerms(Record, eq=False, omit_defaults=True):
         """(...,) mean of B over its SD, given known properties, for (..., c) features of the map."""
         at = [self.names.index(name) for name in known]
         gain = np.linalg.solve(self.covariance[np.ix_(at, at)], self.with_body[at]) / np.sqrt(self.body_variance)
-        given = np.array([self._entered(name, value) for name, value in known.items()])
-        return np.asarray((given - features @ self.expected[at].T) @ gain)
+        values = np.array([self._transformed(name, value) for name, value in known.items()])
+        return np.asarray((values - features @ self.expected[at].T) @ gain)
 
     def score(self, name: str, value: float, features: FloatArray) -> float:
-        """How far a value is from what a map's (c,) features lead one to expect of a property, in SDs."""
+        """Distance of a value from its expectation given a map's (c,) features, in SDs."""
         at = self.names.index(name)
-        off = self._entered(name, value) - features @ self.expected[at]
+        off = self._transformed(name, value) - features @ self.expected[at]
         return float(abs(off) / np.sqrt(self.covariance[at, at]))
 
-    def _entered(self, name: str, value: float) -> float:
+    def _transformed(self, name: str, value: float) -> float:
         if name in self.inverted:
             return 1.0 / value
         return float(np.log(value)) if name in LOGGED else value
@@ -212,11 +212,11 @@ class SiteShift(Record, eq=False):
             raise BadDataError("the site's correction is not finite or has no covariance", way_out="learn it anew")
 
     def log_shift(self, log_width: FloatArray) -> FloatArray:
-        """(...,) mean of what is added to ln d for maps with this p."""
+        """(...,) mean shift of ln d for maps with this p."""
         return np.asarray(self.mean[0] + self.mean[1] * (log_width - self.centre))
 
     def variance(self, log_width: FloatArray) -> FloatArray:
-        """(...,) variance of the same."""
+        """(...,) variance of that shift."""
         v, c = log_width - self.centre, self.covariance
         return np.asarray(c[0, 0] + 2.0 * v * c[0, 1] + v**2 * c[1, 1])
 
@@ -254,7 +254,7 @@ def within_reach(domain: Domain, amplitude: FloatArray, sigma_mm: FloatArray) ->
 
 
 def beyond_lumps(domain: Domain, largest_mm: float) -> list[str]:
-    """A size beyond the lumps of a table, in words; empty within. There it is the form that speaks, not the table."""
+    """Text on a size beyond the lumps of a table, where the law extrapolates; empty within."""
     low, high = domain["d_mm"]
     if not (largest_mm < low or largest_mm > high):
         return []
@@ -272,12 +272,12 @@ def extrapolated(far: Sequence[str]) -> Abstention:
 
 
 def unknown_head(calibration_head: object) -> str:
-    """An unknown head as a source of error left out, where the calibration names its own."""
+    """Note on an unknown head as a source of error that the size leaves out."""
     return f"whether the map's head is the calibration's ({calibration_head}): the map does not name its head"
 
 
 def untabled_bodies(ranges: Mapping[str, tuple[float, float]]) -> str:
-    """Bodies unlike those that a calibration was learned over as a source left out; these by their columns."""
+    """Note on bodies outside the calibration's `ranges`, by column, as a source of error that the size leaves out."""
     words = {
         "stiffness_ratio": "lumps {:.3g} to {:.3g} times as stiff as fat",
         "gland_ratio": "gland {:.3g} to {:.3g} times",
@@ -340,7 +340,7 @@ class FatDepth(Record, eq=False):
         """(...) ln F, F in mm, of (..., 3) profiles."""
         return np.asarray(self.terms(profile) @ self.coefficients)
 
-    def unlike(self, profile: FloatArray) -> FloatArray:
+    def relative_leverage(self, profile: FloatArray) -> FloatArray:
         """(...) leverage over the table's largest; above 1 the profile lies outside the table."""
         x = self.terms(profile)
         return np.asarray(np.einsum("...i,ij,...j->...", x, self.information_inverse, x) / self.most_leverage)
@@ -351,7 +351,7 @@ class FatDepth(Record, eq=False):
         expected = np.clip(monomials((u, v), powers(2)) @ self.expected, low, high)
         return np.asarray(expected + self.expected_sd * NODES.reshape(-1, *([1] * expected.ndim)))
 
-    def of_mass(self, profiles: Sequence[tuple[float, ...] | None]) -> tuple[float | None, str]:
+    def from_maps(self, profiles: Sequence[tuple[float, ...] | None]) -> tuple[float | None, str]:
         """F of a mass in mm from its maps' profiles, of which one is known, or the reason why there is none.
 
         Profiles unlike the table's are left out; those of one mass are averaged, for its exams share the body.
@@ -378,7 +378,7 @@ class FatDepth(Record, eq=False):
         """(n,) ln F of the profiles that resemble the table's."""
         known = np.array([one for one in profiles if one is not None], dtype=np.float64)
         known = known.reshape(-1, len(self.centre))
-        return self.log_depth(known[self.unlike(known) <= MOST_LEVERAGE])
+        return self.log_depth(known[self.relative_leverage(known) <= MOST_LEVERAGE])
 
 
 def profile_terms(z: FloatArray) -> FloatArray:

@@ -60,7 +60,7 @@ class PatientPlace(Record, eq=False):
 
 
 class PlaceShift(Record):
-    """How far apart the masses of two visits lie."""
+    """Shift of a mass's place between two visits."""
 
     shift_mm: tuple[float, float]  #: From the earlier visit's place to the later one's.
     sd_mm: float  #: SD of the distance of one mass between visits, in the direction of the shift.
@@ -91,14 +91,14 @@ def contradictions(visits: Sequence[Sequence[Mapping[str, str]]]) -> list[str]:
     """Contradictions between the exam facts that the scans of all visits give, in words."""
     texts = []
     for key, plural in CODES.items():
-        said: dict[str, int] = {}
+        first_visit: dict[str, int] = {}
         for number, scans in enumerate(visits, start=1):
             for scan in scans:
                 if scan.get(key):
-                    said.setdefault(scan[key], number)
-        if len(said) > 1:
-            listed = ", ".join(f"{value} (visit {number})" for value, number in said.items())
-            texts.append(f"the scans name different {plural}: {listed}")
+                    first_visit.setdefault(scan[key], number)
+        if len(first_visit) > 1:
+            names = ", ".join(f"{value} (visit {number})" for value, number in first_visit.items())
+            texts.append(f"the scans name different {plural}: {names}")
     return texts
 
 
@@ -142,9 +142,9 @@ class SharedBody(Record):
 SHARED_BODY: Final = SharedBody(0.11, 0.48)
 """Learned from simulated visits, see record 0132: ``python -m validation visits law``."""
 SHARED_WITHOUT_DEPTH: Final = SharedBody(0.19, 0.39)
-"""Where maps tell no depth of fat: most of what they hide is that depth, which stays as the lump grows."""
+"""Without a depth of fat: most of B is then that depth, which stays as the lump grows."""
 STRANGERS: Final = SharedBody(1.0, 1.0)
-"""Nothing shared: each visit's size for itself, as two separate estimates have it."""
+"""Nothing shared: visits as independent estimates."""
 
 
 class AmplitudeLaw(Record):
@@ -175,16 +175,16 @@ class AmplitudeLaw(Record):
     def at_common_depth(
         self, parts: Sequence[AveragedMaps], fitted: Sequence[BodyCalibration]
     ) -> tuple[FloatArray, FloatArray]:
-        """(v, n) ln a corrected to the mean depth of fat, and (v,) variances of what posture and exams leave in it."""
+        """(v, n) ln a corrected to the mean depth of fat, and its (v,) remaining variances by posture and exams."""
         log_amplitude = np.stack([one.log_amplitude for one in parts])
         exams = self.exam_factor**2 * np.array([np.mean(one.variance) for one in parts])
-        told, posture = np.zeros(len(parts)), self.posture_sd**2
-        fats = [one.fat_mm for one in fitted if one.fat_mm is not None]
-        if len(fats) == len(fitted):
-            told = posture / (posture + self.fat_sd**2 / np.array([len(one.weight) for one in parts]))
-            log_fat = np.log(fats)
-            log_amplitude += (self.posture * told * (log_fat - log_fat.mean()))[:, None]
-        return log_amplitude, exams + self.posture**2 * posture * (1.0 - told)
+        trust, posture = np.zeros(len(parts)), self.posture_sd**2
+        depths = [one.fat_mm for one in fitted if one.fat_mm is not None]
+        if len(depths) == len(fitted):
+            trust = posture / (posture + self.fat_sd**2 / np.array([len(one.weight) for one in parts]))
+            log_fat = np.log(depths)
+            log_amplitude += (self.posture * trust * (log_fat - log_fat.mean()))[:, None]
+        return log_amplitude, exams + self.posture**2 * posture * (1.0 - trust)
 
 
 AMPLITUDE_LAW: Final = AmplitudeLaw(1.0, 6.2, 3.5, 0.04, 0.02, 3.6, 0.1)
@@ -283,11 +283,14 @@ def joint_sizes(
     flat = [one for maps in visits for one in maps]
     used, replicates = matched_draws(flat, number, rng)
     ends = np.cumsum([len(maps) for maps in visits])
-    parts = [MassMaps.of(used[end - len(maps) : end], at) for maps, end, at in zip(visits, ends, fitted, strict=True)]
+    parts = [
+        MassMaps.of(used[end - len(maps) : end], calibrated)
+        for maps, end, calibrated in zip(visits, ends, fitted, strict=True)
+    ]
     middle = np.mean([one.by_map.mean(axis=0) for one in parts], axis=0)
     points = draws.paired_points(middle, replicates, DIMENSIONS, rng)
     tau = between.at(points[:, 0], *[(one.centre, one.noise) for one in parts])  # one for all visits
-    sizes = [one for maps, at in zip(visits, fitted, strict=True) for one in log_sizes(at, maps)]
+    sizes = [one for maps, calibrated in zip(visits, fitted, strict=True) for one in log_sizes(calibrated, maps)]
     oval, _ = lump_shape(fitted[0], flat, sizes, priors.shape)
     half = oval.at(points[:, 2:5])
     averaged = [one.averaged(tau) for one in parts]
@@ -299,17 +302,17 @@ def joint_sizes(
     if amplitudes is not None:
         left, noise = amplitudes.at_common_depth(averaged, fitted)
         mean, covariance = _with_amplitudes(mean, covariance, left, noise, amplitudes, points[:, 5])
-    drawn = _drawn(mean, covariance, rng.standard_normal((len(replicates), len(visits))), replicates)
+    drawn = _draw_sizes(mean, covariance, rng.standard_normal((len(replicates), len(visits))), replicates)
     spread = float(np.sqrt(np.mean(tau**2)))
     return JointSizes(drawn, mean, covariance, replicates, spread, correlation, tuple(fitted))
 
 
 def visit_calibrations(visits: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration) -> list[BodyCalibration]:
-    """The calibration at the depth of fat that each visit's maps tell.
+    """The calibration at the depth of fat estimated from each visit's maps.
 
     Posture changes that depth by some per cent, and the lump's own with it: at one depth for all visits that would
-    count as a change of size. Where a visit tells none, none is used: what the maps hide would be something else with
-    it than without.
+    count as a change of size. Where one visit gives no depth, none is used: B with a depth is another quantity than B
+    without.
     """
     fitted = [calibration.for_maps(maps) for maps in visits]
     without = [one for one in fitted if one.fat_mm is None]
@@ -356,11 +359,11 @@ def _with_amplitudes(
     finite = np.isfinite(departs).all(axis=(0, 1))
     if finite.sum() < 2:
         return mean, covariance
-    within, left = covariance[finite].mean(axis=0) @ contrasts.T, contrasts * noise @ contrasts.T
+    within, noise_covariance = covariance[finite].mean(axis=0) @ contrasts.T, contrasts * noise @ contrasts.T
     gains, scores = [], []
     for alpha, one in zip(exponents, departs[:, :, finite], strict=True):
         of_draws = np.cov(mean[:, finite], one)[:, v:]
-        spread = of_draws[v:] + alpha**2 * contrasts @ within + left
+        spread = of_draws[v:] + alpha**2 * contrasts @ within + noise_covariance
         gains.append((of_draws[:v] - alpha * within) @ np.linalg.inv(spread))
         scores.append(normal_log_density(one.mean(axis=1), spread))
     changed = (contrasts @ log_amplitude)[:, finite].mean(axis=1)
@@ -372,12 +375,14 @@ def _with_amplitudes(
     gains.append(np.zeros_like(gains[0]))
     gain = np.stack(gains)[index]
     moved = np.einsum("nvc,nc->vn", gain, departs[index, :, np.arange(len(points))])
-    kept = np.eye(v) + exponents[index, None, None] * gain @ contrasts
-    turned = kept @ covariance @ np.swapaxes(kept, 1, 2) + gain @ left @ np.swapaxes(gain, 1, 2)
-    return mean - moved, turned
+    projection = np.eye(v) + exponents[index, None, None] * gain @ contrasts
+    corrected = projection @ covariance @ np.swapaxes(projection, 1, 2) + gain @ noise_covariance @ np.swapaxes(
+        gain, 1, 2
+    )
+    return mean - moved, corrected
 
 
-def _drawn(mean: FloatArray, covariance: FloatArray, z: FloatArray, replicates: draws.Labels) -> FloatArray:
+def _draw_sizes(mean: FloatArray, covariance: FloatArray, z: FloatArray, replicates: draws.Labels) -> FloatArray:
     """(v, n) draws of ln d, each visit's with the evenly spaced quantiles of its mixture of normals."""
     v = len(mean)
     finite = np.isfinite(covariance).all(axis=(1, 2))

@@ -4,7 +4,7 @@ The regression is that of `regression`, of ln d on Eq 6 where that is linear in 
 replaced by its tangent, :math:`g(\theta) \approx g(\theta_0) + J(\theta - \theta_0)`, until the mode stays where the
 tangent touches.
 
-Bodies that took no part are sized by the mean of their exams. Where lumps come from another simulator, or are phantoms,
+Held-out bodies are sized by the mean of their exams. Where lumps come from another simulator, or are phantoms,
 their errors :math:`e_j \sim N(0, s_j^2 + \tau^2)`, with :math:`s_j^2` what the calibration states: tau is `other_sd`.
 """
 
@@ -36,7 +36,7 @@ _OTHER_SDS = np.linspace(0.0, 0.3, 301)  #: Grid of tau.
 def learn_population(
     table: regression.PopulationTable, *, recipe: Recipe, source: str = "", residual: bool = True
 ) -> BodyCalibration:
-    """Learn the calibration: Eq 6, by the depth of the fat where maps have a head profile, and what it leaves.
+    """Learn the calibration: Eq 6, by the depth of the fat where maps have a head profile, and its residual.
 
     Without `residual`, and from a table without profiles, it is Eq 6 alone. `BadDataError` when bodies are too few or
     do not vary, `NotConvergedError` when the posterior has no mode.
@@ -80,16 +80,16 @@ class TableRows(Record, eq=False):
         """The rows with a profile, or all where too few bodies have one."""
         maps, depth, log_depth = table, None, np.zeros(len(table))
         if table.profile is not None and table.log_fat is not None:
-            told = np.isfinite(table.profile.sum(axis=1))
-            if len(np.unique(table.body[told])) >= LEAST_BODIES:
-                maps, depth = table.rows(told), learn_depth(table.profile[told], table.log_fat[told])
-                log_depth = depth.log_depth(table.profile[told])
+            known = np.isfinite(table.profile.sum(axis=1))
+            if len(np.unique(table.body[known])) >= LEAST_BODIES:
+                maps, depth = table.rows(known), learn_depth(table.profile[known], table.log_fat[known])
+                log_depth = depth.log_depth(table.profile[known])
         rows = np.column_stack([maps.log_amplitude, maps.log_width, log_depth])
         centre = [round(float(column.mean()), 3) for column in rows.T]
         values = rows - centre
         if depth is None:
             return cls(maps, None, Centre(*centre), values)
-        x = monomials(list(values.T[:2]), powers(2))  # what amplitude and width lead one to expect of w
+        x = monomials(list(values.T[:2]), powers(2))  # E[w | amplitude, width]
         expected = np.asarray(np.linalg.lstsq(x, values[:, 2], rcond=None)[0])
         depth = replace(depth, expected=expected, expected_sd=float(np.std(values[:, 2] - x @ expected)))
         return cls(maps, depth, Centre(*centre), values, BY_DEPTH, CUBIC, QUADRATIC)
@@ -103,12 +103,12 @@ class TableRows(Record, eq=False):
         return monomials(list(self.of_bodies(data).T), self.spread_powers)
 
     def log_size(self, theta: FloatArray, *, du: float = 0.0, dv: float = 0.0) -> FloatArray:
-        """(n,) ln d by Eq 6 of the maps, moved by `du` and `dv`."""
+        """(n,) ln d of the maps by Eq 6, at u + `du` and v + `dv`."""
         u, v, w = self.values.T
         return eq6_log_size(u + du, v + dv, w, theta, self.eq6_powers)
 
     def map_slopes(self, theta: FloatArray) -> FloatArray:
-        """(2, n) derivatives of the same by ln a and p, by central differences."""
+        """(2, n) derivatives of ln d by ln a and p, by central differences."""
         by_u = self.log_size(theta, du=_STEP) - self.log_size(theta, du=-_STEP)
         by_v = self.log_size(theta, dv=_STEP) - self.log_size(theta, dv=-_STEP)
         return np.stack([by_u, by_v]) / (2 * _STEP)
@@ -128,8 +128,8 @@ def learn_depth(profile: FloatArray, log_fat: FloatArray) -> FatDepth:
     x = profile_terms((profile - centre) / scale)
     inverse = np.asarray(np.linalg.pinv(x.T @ x), dtype=np.float64)
     coefficients = inverse @ (x.T @ log_fat)
-    told = x @ coefficients
-    rest = log_fat - told
+    fitted = x @ coefficients
+    rest = log_fat - fitted
     return FatDepth(
         centre,
         scale,
@@ -137,7 +137,7 @@ def learn_depth(profile: FloatArray, log_fat: FloatArray) -> FatDepth:
         inverse,
         float(np.einsum("ni,ij,nj->n", x, inverse, x).max()),
         float(np.sqrt(np.sum(rest**2) / max(len(rest) - x.shape[1], 1))),
-        fat_mm=(float(np.exp(told.min())), float(np.exp(told.max()))),
+        fat_mm=(float(np.exp(fitted.min())), float(np.exp(fitted.max()))),
         expected=np.zeros(len(powers(2))),
         expected_sd=0.0,
     )
@@ -162,7 +162,7 @@ def _calibration(
     recipe: Recipe,
     source: str,
 ) -> BodyCalibration:
-    """The calibration by (b,) ln d less what the other bodies lead one to expect of it, and its variance without B."""
+    """The calibration, from the bodies' (b,) held-out residuals of ln d and their variance without B."""
     data, maps, features = eq6.data, rows.maps, monomials(list(rows.values.T), rows.feature_powers)
     spread, of_spread = regression.body_spread(rows.spread_terms(data), left, noise)
     body_sd = np.exp(rows.spread_terms(data) @ spread)
@@ -238,7 +238,7 @@ def fit_eq6(rows: TableRows) -> Eq6Fit:
 
 
 def _least_squares(rows: TableRows) -> FloatArray:
-    """(k,) coefficients by least squares of the bodies' means: Gauss-Newton steps, halved while they lead uphill."""
+    """(k,) coefficients by least squares of the bodies' means: Gauss-Newton, steps halved while the misfit grows."""
     theta = np.zeros(len(rows.eq6_powers))
     theta[rows.eq6_powers.index((MU, 0, 0))] = np.log(rows.maps.d_mm).mean()
     theta[rows.eq6_powers.index((F, 0, 0))] = -0.3
@@ -261,7 +261,7 @@ def _misfit(data: regression.BodyRegression, theta: FloatArray) -> float:
 
 
 class SizeErrors(Record):
-    """Bodies that took no part: (b,) ln of sized over true size, and the variance stated."""
+    """Errors of held-out bodies: (b,) ln of estimated over true size, and the stated variance."""
 
     error: FloatArray
     variance: FloatArray
@@ -270,7 +270,7 @@ class SizeErrors(Record):
 def size_errors(
     calibration: BodyCalibration, table: regression.PopulationTable, *, known: Sequence[str] = ()
 ) -> SizeErrors:
-    """The bodies of a table, each by all its exams; of the properties in `known` the true value is told."""
+    """Errors of a table's bodies, each by all its exams, given the true values of the properties in `known`."""
     bodies = np.unique(table.body)
     errors = np.array([size_error(calibration, table.rows(table.body == one), known=known) for one in bodies])
     return SizeErrors(*errors.T)
@@ -279,27 +279,29 @@ def size_errors(
 def size_error(
     calibration: BodyCalibration, exams: regression.PopulationTable, *, known: Sequence[str] = ()
 ) -> tuple[float, float]:
-    """Log error of one body by the mean of its exams, and the variance that the calibration states."""
+    """Log error of one body by the mean of its exams, and its variance by the calibration."""
     profiles = [None] * len(exams) if exams.profile is None else exams.profile.tolist()
-    at = calibration.at_fat([tuple(one) if one and np.isfinite(one).all() else None for one in profiles])
+    calibrated = calibration.at_fat([tuple(one) if one and np.isfinite(one).all() else None for one in profiles])
     a, p = exams.log_amplitude, exams.log_width
-    by_a = (at.log_size(a + _MAP_STEP, p) - at.log_size(a - _MAP_STEP, p)) / (2 * _MAP_STEP)
-    noise = regression.map_variance(exams, np.stack([by_a, at.width_slope(a, p)]))
-    terms = at.terms(a, p).mean(axis=0, keepdims=True)
+    by_a = (calibrated.log_size(a + _MAP_STEP, p) - calibrated.log_size(a - _MAP_STEP, p)) / (2 * _MAP_STEP)
+    noise = regression.map_variance(exams, np.stack([by_a, calibrated.width_slope(a, p)]))
+    terms = calibrated.terms(a, p).mean(axis=0, keepdims=True)
     middle = a.mean(keepdims=True), p.mean(keepdims=True)
-    told = {name: float(exams.unknowns[name][0]) for name in known}
-    told = {name: float(np.exp(value)) if name in LOGGED else value for name, value in told.items()}
-    expected, left = known_body(at, told, *middle, at.own_sd(at.body_sd(*middle, np.zeros(1))))
-    exam = (noise.mean() + np.exp(2 * at.spread.log_exam_sd)) / len(exams)
-    variance = left[0] + at.other_sd**2 + at.coefficient_variance(terms)[0] + exam
-    size = at.log_size(a, p).mean() + expected[0]
+    values = {name: float(exams.unknowns[name][0]) for name in known}
+    values = {name: float(np.exp(value)) if name in LOGGED else value for name, value in values.items()}
+    expected, variance_left = known_body(
+        calibrated, values, *middle, calibrated.table_sd(calibrated.body_sd(*middle, np.zeros(1)))
+    )
+    exam = (noise.mean() + np.exp(2 * calibrated.spread.log_exam_sd)) / len(exams)
+    variance = variance_left[0] + calibrated.other_sd**2 + calibrated.coefficient_variance(terms)[0] + exam
+    size = calibrated.log_size(a, p).mean() + expected[0]
     return float(size - np.log(exams.d_mm[0])), float(variance)
 
 
 def learn_other_sd(calibration: BodyCalibration, table: regression.PopulationTable, *, source: str) -> BodyCalibration:
     """The calibration with `other_sd` from lumps of another origin: the most probable tau, even a priori.
 
-    Its fit tells ``other_masses``, ``other_sd_most``, below which tau lies with 95 % probability, and the errors.
+    Its `fit` holds ``other_masses``, ``other_sd_most``, below which tau lies with 95 % probability, and the errors.
     """
     others = size_errors(calibration.with_other_sd(0.0), table)
     variance = others.variance + _OTHER_SDS[:, None] ** 2
@@ -314,5 +316,5 @@ def learn_other_sd(calibration: BodyCalibration, table: regression.PopulationTab
         "other_bias_percent": float(100 * off.mean()),
         "other_standard_sd": float(np.sqrt(np.mean(others.error**2 / (others.variance + other_sd**2)))),
     }
-    found_out = calibration.with_other_sd(other_sd, other_source=source)
-    return replace(found_out, fit={**calibration.fit, **fit})
+    widened = calibration.with_other_sd(other_sd, other_source=source)
+    return replace(widened, fit={**calibration.fit, **fit})

@@ -1,4 +1,4 @@
-"""Eq 6 learned from a study, held out geometry by geometry."""
+"""Learning of Eq 6 from a study or phantoms, and its cross-validation by geometry."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def learn_size_calibration(
     table: SizeTable, *, recipe: Recipe, rng: np.random.Generator, progress: Progress | None = None
 ) -> SizeCalibration:
     """Learn Eq 6 from a table of at least eight rows with positive amplitude; `BadDataError` when they do not vary."""
-    return _by_axes(table, recipe, lambda data: _learn_axis(data, rng=rng, progress=progress))
+    return _learn_axes(table, recipe, lambda data: _learn_axis(data, rng=rng, progress=progress))
 
 
 def axis_rows(table: SizeTable) -> list[AxisRows]:
@@ -109,16 +109,16 @@ def axis_rows(table: SizeTable) -> list[AxisRows]:
         raise BadDataError("all rows have one diameter", way_out="a calibration needs lumps of several sizes")
     if any(s is not None and np.ptp(s[rising]) <= 0 for s in (table.sigma_x_mm, table.sigma_y_mm)):
         raise BadDataError("all rows have one width", way_out="m and b need maps of several widths to be told apart")
-    kept = rows_of(table, rising)
-    widths = (kept.sigma_x_mm, kept.width_change_x), (kept.sigma_y_mm, kept.width_change_y)
+    usable = rows_of(table, rising)
+    widths = (usable.sigma_x_mm, usable.width_change_x), (usable.sigma_y_mm, usable.width_change_y)
     return [
-        AxisRows(kept.d_mm, kept.amplitude, sigma, change, kept.depth_ratio)
+        AxisRows(usable.d_mm, usable.amplitude, sigma, change, usable.depth_ratio)
         for sigma, change in widths
         if sigma is not None
     ]
 
 
-def _by_axes(table: SizeTable, recipe: Recipe, learn: Callable[[AxisRows], AxisCalibration]) -> SizeCalibration:
+def _learn_axes(table: SizeTable, recipe: Recipe, learn: Callable[[AxisRows], AxisCalibration]) -> SizeCalibration:
     """Calibration of the axes across and along the head; both alike where the table has one width."""
     rows = axis_rows(table)
     axes = [learn(data) for data in rows]
@@ -144,7 +144,7 @@ def axis_at_mode(data: AxisRows) -> AxisCalibration:
 
 
 def _mode(data: AxisRows) -> tuple[AxisRows, FloatArray, FloatArray]:
-    """Rows used, with mode and covariance; without width changes where they are too few to estimate e."""
+    """The rows with posterior mode and covariance; without width changes where these are too few to estimate e."""
     a0, s0 = data.centre
     ratio = np.log(data.d_mm) - np.log(data.sigma_mm / s0)
     f = -float(np.polyfit(np.log(data.amplitude / a0), ratio, 1)[0]) if np.ptp(data.amplitude) > 0 else 0.0
@@ -162,8 +162,10 @@ def _learn_axis(data: AxisRows, *, rng: np.random.Generator, progress: Progress 
     options, density = EnsembleOptions(keep=DRAWS_KEPT, max_steps=20_000, block=300), partial(_log_density, data=data)
     draws = ensemble(density, mode, covariance, rng=rng, options=options, progress=progress)
     axis = data.calibration(_coefficients(draws.flat, data))
-    told = {name: draws.diagnostics[name] for name in ("rhat", "ess_tail")}
-    return replace(axis, fit={**agreement(axis, data), "e_identified": float(data.width_change is not None), **told})
+    diagnostics = {name: draws.diagnostics[name] for name in ("rhat", "ess_tail")}
+    return replace(
+        axis, fit={**agreement(axis, data), "e_identified": float(data.width_change is not None), **diagnostics}
+    )
 
 
 def agreement(axis: AxisCalibration, data: AxisRows) -> dict[str, float]:
@@ -216,7 +218,7 @@ _WAY_OUT = "give depth_ratio and at least 3 diameters at depth_ratio 1, or use -
 
 
 class OtherFit(Record):
-    """The same rows by the other of the two fits, joint or two-stage."""
+    """Fit of the same rows by the other of the two methods, joint or two-stage."""
 
     name: str
     coefficients: tuple[tuple[float, ...], ...]  #: m, b (mm), e, f of each axis.
@@ -236,7 +238,7 @@ def learn_two_stage(table: SizeTable, *, recipe: Recipe, rng: np.random.Generato
     fainter its map is. Both agree where Eq 6 holds; decision record 0098 gives how far they part where it does not.
     `BadDataError` when rows are too few, do not vary, have no depths, or not three diameters at h/d 1.
     """
-    return _by_axes(table, recipe, lambda data: _learn_in_two_stages(data, rng))
+    return _learn_axes(table, recipe, lambda data: _learn_in_two_stages(data, rng))
 
 
 def axis_in_two_stages(data: AxisRows) -> AxisCalibration:
@@ -263,19 +265,19 @@ def other_fit(calibration: SizeCalibration, table: SizeTable) -> OtherFit | None
 def _learn_in_two_stages(data: AxisRows, rng: np.random.Generator) -> AxisCalibration:
     fitted = axis_in_two_stages(data)
     draws = _two_stages(data, _resampled(data, rng))
-    _stretch(draws, diameters=len(np.unique(data.d_mm)))
+    _widen_for_few_clusters(draws, diameters=len(np.unique(data.d_mm)))
     # the estimate is the fit to the table itself, not the mean over its resamples
     scaled = [2, 4]
     draws[:, scaled] *= fitted.draws[0, scaled] / draws[:, scaled].mean(axis=0)
     shifted = [0, 1, 3, 5]
     draws[:, shifted] += fitted.draws[0, shifted] - draws[:, shifted].mean(axis=0)
     axis = data.calibration(draws)
-    level, known = _stages(data)
-    told = {"level_rows": float(level.sum()), "width_change_rows": float(known.sum())}
-    return replace(axis, fit={**agreement(axis, data), "e_identified": 1.0, "two_stage": 1.0, **told})
+    level, known = _stage_rows(data)
+    counts = {"level_rows": float(level.sum()), "width_change_rows": float(known.sum())}
+    return replace(axis, fit={**agreement(axis, data), "e_identified": 1.0, "two_stage": 1.0, **counts})
 
 
-def _stretch(draws: FloatArray, *, diameters: int) -> None:
+def _widen_for_few_clusters(draws: FloatArray, *, diameters: int) -> None:
     """Widen the draws of m, b, ln e and f about their means, for few clusters.
 
     Resamples of g clusters vary by (g - 1) / g too little, and normal intervals of few clusters hold too seldom. A
@@ -289,8 +291,8 @@ def _stretch(draws: FloatArray, *, diameters: int) -> None:
     draws[:, 2] = np.exp(draws[:, 2])
 
 
-def _stages(data: AxisRows) -> tuple[BoolArray, BoolArray]:
-    """Rows of either stage."""
+def _stage_rows(data: AxisRows) -> tuple[BoolArray, BoolArray]:
+    """Masks of the rows of stage one (h/d = 1) and of stage two (known width changes)."""
     if data.depth_ratio is None or data.width_change is None:
         raise BadDataError("the table has no depth_ratio, and the two-stage fit needs it", way_out=_WAY_OUT)
     level, known = np.abs(data.depth_ratio - 1.0) < 1e-9, np.isfinite(data.width_change)
@@ -303,14 +305,14 @@ def _stages(data: AxisRows) -> tuple[BoolArray, BoolArray]:
 
 
 def _resampled(data: AxisRows, rng: np.random.Generator) -> FloatArray:
-    """(draws, rows) how often each row is drawn: all rows of one diameter together.
+    """(draws, rows) bootstrap counts of the rows, resampled by diameter.
 
     Cluster bootstrap (Davison & Hinkley 1997, section 3.8). The depths of a lump share the width that their changes
     refer to, and lumps of one diameter that differ in stiffness have almost one map. Resamples with fewer than three
     diameters at one diameter depth (two, where the table has three) are drawn anew: a line through two neighbours may
     have any slope.
     """
-    level, _ = _stages(data)
+    level, _ = _stage_rows(data)
     names, group = np.unique(data.d_mm, return_inverse=True)
     usable = np.isin(names, data.d_mm[level])
     least = min(LEAST_DIAMETERS, int(usable.sum()) - 1)
@@ -324,7 +326,7 @@ def _resampled(data: AxisRows, rng: np.random.Generator) -> FloatArray:
 
 def _two_stages(data: AxisRows, counts: FloatArray) -> FloatArray:
     """(k, 6) coefficients of (k, rows) resamples, with s and g of ln d about them by maximum likelihood on a grid."""
-    level, known = _stages(data)
+    level, known = _stage_rows(data)
     assert data.width_change is not None
     m, b = _line(data.sigma_mm[level], data.d_mm[level], counts[:, level])
     f, log_e = _line(np.log(data.amplitude[known]), np.log(data.width_change[known]), counts[:, known])
@@ -386,9 +388,9 @@ def cross_validate(
     eq6, quadratic = ({name: np.empty(len(geometry)) for name in (*widths, "both")} for _ in range(2))
     for out in (geometry == i for i in range(number)):  # the sizes of each geometry, predicted from the others
         for name, sigma in (widths | {"both": both}).items():
-            quadratic[name][out] = _quadratic(table, sigma, ~out)[out]
+            quadratic[name][out] = _predict_by_quadratic(table, sigma, ~out)[out]
             if name in widths:
-                eq6[name][out] = _eq6(table, cases, sigma, ~out, fit or axis_at_mode)[out]
+                eq6[name][out] = _predict_by_eq6(table, cases, sigma, ~out, fit or axis_at_mode)[out]
     eq6["both"] = np.exp(np.mean([np.log(np.maximum(eq6[name], 1e-3)) for name in widths], axis=0))
     errors = [
         {
@@ -408,22 +410,24 @@ def geometry_numbers(d_mm: FloatArray, cases: StudyCases) -> IndexArray:
     return np.array([number[name] for name in names], dtype=np.intp)
 
 
-def _eq6(table: SizeTable, cases: StudyCases, sigma_mm: FloatArray, kept: BoolArray, fit: FitAxis) -> FloatArray:
-    """(n,) sizes in mm by Eq 6 from the rows kept."""
-    d_mm, depth = table.d_mm[kept], cases.depth_ratio[kept]
-    change = width_changes(sigma_mm[kept], depth_ratio=depth, group=rows_of(cases, kept).lumps(d_mm))
+def _predict_by_eq6(
+    table: SizeTable, cases: StudyCases, sigma_mm: FloatArray, training: BoolArray, fit: FitAxis
+) -> FloatArray:
+    """(n,) sizes in mm by Eq 6 fitted to the training rows."""
+    d_mm, depth = table.d_mm[training], cases.depth_ratio[training]
+    change = width_changes(sigma_mm[training], depth_ratio=depth, group=rows_of(cases, training).lumps(d_mm))
     try:
-        axis = fit(AxisRows(d_mm, table.amplitude[kept], sigma_mm[kept], change, depth))
+        axis = fit(AxisRows(d_mm, table.amplitude[training], sigma_mm[training], change, depth))
     except NotConvergedError:
-        out = int(np.flatnonzero(~kept)[0])
+        out = int(np.flatnonzero(~training)[0])
         where = f"{cases.seat[out]}, d {table.d_mm[out]:g} mm, h/d {cases.depth_ratio[out]:g}"
         raise NotConvergedError(f"Eq 6 has no mode without the geometry {where}") from None
     return axis.size_mm(sigma_mm, table.amplitude)
 
 
-def _quadratic(table: SizeTable, sigma_mm: FloatArray, kept: BoolArray) -> FloatArray:
-    """(n,) the same by least squares of ln d on a quadratic in ln a and ln sigma."""
+def _predict_by_quadratic(table: SizeTable, sigma_mm: FloatArray, training: BoolArray) -> FloatArray:
+    """(n,) sizes in mm by least squares of ln d on a quadratic in ln a and ln sigma, in the training rows."""
     u, v = np.log(table.amplitude), np.log(sigma_mm)
     terms = monomials((u - u.mean(), v - v.mean()), powers(2))
-    coefficients = np.linalg.lstsq(terms[kept], np.log(table.d_mm[kept]), rcond=None)[0]
+    coefficients = np.linalg.lstsq(terms[training], np.log(table.d_mm[training]), rcond=None)[0]
     return np.asarray(np.exp(terms @ coefficients))

@@ -1,4 +1,4 @@
-"""Regression of sizes on maps, and the process that is left."""
+"""Regression of sizes on maps, and the Gaussian process of its residuals."""
 
 from __future__ import annotations
 
@@ -64,14 +64,14 @@ def rows_of(columns: T, keep: BoolArray) -> T:
     """A copy of a table, whose fields are columns or tables or None, with the rows where `keep` is true."""
     if columns is None:
         return columns
-    whole: Any = columns
-    if isinstance(whole, np.ndarray):
-        return cast("T", whole[keep])
-    if isinstance(whole, tuple):
-        return cast("T", tuple(compress(whole, keep)))
-    if isinstance(whole, dict):
-        return cast("T", {name: rows_of(one, keep) for name, one in whole.items()})
-    return cast("T", replace(whole, **{name: rows_of(getattr(whole, name), keep) for name in whole.__struct_fields__}))
+    value: Any = columns
+    if isinstance(value, np.ndarray):
+        return cast("T", value[keep])
+    if isinstance(value, tuple):
+        return cast("T", tuple(compress(value, keep)))
+    if isinstance(value, dict):
+        return cast("T", {name: rows_of(one, keep) for name, one in value.items()})
+    return cast("T", replace(value, **{name: rows_of(getattr(value, name), keep) for name in value.__struct_fields__}))
 
 
 class BodyRegression(Record, eq=False):
@@ -160,7 +160,7 @@ def map_variance(table: PopulationTable, slope: FloatArray) -> FloatArray:
 
 
 def check_population(table: PopulationTable) -> None:
-    """Raise `BadDataError` where bodies are too few, do not vary or hold a number that is not finite."""
+    """Refuse bodies that are too few, do not vary or hold a number that is not finite."""
     bodies = len(np.unique(table.body))
     if bodies < LEAST_BODIES:
         raise BadDataError(f"{bodies} bodies with a map", way_out=f"a calibration needs at least {LEAST_BODIES}")
@@ -173,14 +173,14 @@ def check_population(table: PopulationTable) -> None:
 
 
 def value_ranges(values: Mapping[str, FloatArray]) -> dict[str, tuple[float, float]]:
-    """Least and largest of each."""
+    """Minimum and maximum of each array, by name."""
     return {name: (float(v.min()), float(v.max())) for name, v in values.items()}
 
 
 def hidden_terms(
     table: PopulationTable, data: BodyRegression, *, body: FloatArray, body_sd: FloatArray, features: FloatArray
 ) -> HiddenTerms | None:
-    """Second moments of what was varied, about what the map leads one to expect of it by its features, and with B.
+    """Second moments of the varied properties about their regression on the map's features, and with B.
 
     `body` and `body_sd` are (groups,): B of each body, which took no part in the fit that says so, and SD(B) at its
     place. Bodies count by their B in that SD: faint and deep lumps, of which B is large, would decide alone otherwise.
@@ -194,13 +194,13 @@ def hidden_terms(
     coefficients = np.linalg.lstsq(design, varied, rcond=None)[0]
     rest = varied - design @ coefficients
     most_sd = float(np.quantile(body_sd, EXPLAINED))
-    told = np.minimum(1.0, most_sd / body_sd)
+    weight = np.minimum(1.0, most_sd / body_sd)
     freedom = max(len(design) - design.shape[1], 1)
     return HiddenTerms(
         names=tuple(table.unknowns),
         expected=np.asarray(coefficients.T),
         covariance=np.asarray(rest.T @ rest / freedom),
-        with_body=np.asarray(rest.T @ (told * body / body_sd) / (freedom * np.mean(told**2))),
+        with_body=np.asarray(rest.T @ (weight * body / body_sd) / (freedom * np.mean(weight**2))),
         body_variance=1.0,
         inverted=inverted,
         most_sd=most_sd,
@@ -208,7 +208,7 @@ def hidden_terms(
 
 
 def learn_round_lumps(table: PopulationTable, terms: FloatArray) -> RoundLumps:
-    r"""How balls' maps look, by maximum likelihood: :math:`q_i \sim N(q_0(x_i), s^2 + \kappa V_i)`.
+    r"""Elongation of balls' maps, by maximum likelihood: :math:`q_i \sim N(q_0(x_i), s^2 + \kappa V_i)`.
 
     :math:`q_0` is linear in (n, c) terms, V the variance of a map's posterior. Deep and faint lumps have a V a hundred
     times that of clear ones, so least squares without it fit :math:`q_0` to the faintest maps and take their noise for
@@ -220,10 +220,10 @@ def learn_round_lumps(table: PopulationTable, terms: FloatArray) -> RoundLumps:
         return np.asarray(np.exp(values[0]) ** 2 + np.exp(values[1]) * variance)
 
     def misfit(values: FloatArray) -> float:
-        whole = spread_at(values)
-        left = q - terms @ _weighted(terms, q, whole)
+        total = spread_at(values)
+        left = q - terms @ _weighted(terms, q, total)
         prior = np.sum(((values - _ROUND_START) / _ROUND_PRIOR_SD) ** 2)
-        return float(0.5 * (np.sum(left**2 / whole + np.log(whole)) + prior))
+        return float(0.5 * (np.sum(left**2 / total + np.log(total)) + prior))
 
     mode = np.asarray(minimize(misfit, _ROUND_START, method="Nelder-Mead").x)
     body_sd, map_factor = (float(one) for one in np.exp(mode))
@@ -236,7 +236,7 @@ def _weighted(terms: FloatArray, values: FloatArray, variance: FloatArray) -> Fl
     return np.asarray(np.linalg.lstsq(terms * root[:, None], values * root, rcond=None)[0])
 
 
-# --- Learning of what Eq 6 leaves of a population's sizes, see `size.terms`, and of the spread between bodies.
+# --- Learning of the residual of Eq 6 over a population, see `size.terms`, and of the spread between bodies.
 #
 # Given the kernel and the spread of B, the weights have a normal posterior in closed form, and with them each
 # body's size as the others predict it. Kernel and spread are those by which bodies left out are most probable, with
@@ -265,8 +265,8 @@ class BodyResiduals(Record, eq=False):
 class FittedResidual(Record, eq=False):
     """The residual given its kernel and the spread of B: (m,), (m, m) moments of its weights.
 
-    `predicted` and `variance` are (b,): what the other bodies lead one to expect of each body's residual, and the
-    variance by the weights.
+    `predicted` and `variance` are (b,): leave-one-out prediction of each body's residual, and its variance by the
+    weights.
     """
 
     kernel: Kernel
@@ -281,14 +281,14 @@ class FittedResidual(Record, eq=False):
 
     @property
     def residual(self) -> Residual:
-        """As part of a calibration."""
+        """The residual as a part of a calibration."""
         factor = np.linalg.cholesky(self.covariance).tolist()
         rows = tuple(tuple(row[: i + 1]) for i, row in enumerate(factor))
         return Residual(self.kernel.points, self.kernel.lengths, self.kernel.scale, self.mean, rows)
 
 
 def fit_residual(bodies: BodyResiduals) -> FittedResidual:
-    """Kernel and spread with half of the points, then with all, by the better of two starts."""
+    """Fit kernel and spread with half of the points, then with all, from the better of two starts."""
     count = max(min(POINTS, len(bodies.left) // BODIES_PER_POINT), 1)
     k, slopes = bodies.x.shape[1], np.zeros(bodies.features.shape[1] - 1)
     starts = [np.array([*[np.log(length)] * k, _SCALE[0], _BODY_SD[0], *slopes]) for length in _START_LENGTHS]
@@ -297,14 +297,14 @@ def fit_residual(bodies: BodyResiduals) -> FittedResidual:
         # incomplete Cholesky factor lie at the table's ends first, and left bodies out with larger errors (0122)
         chosen = np.random.default_rng(SEED).choice(len(bodies.x), points_now, replace=False)
         points = bodies.x[chosen]
-        fits = [_best(bodies, one, points) for one in starts]
+        fits = [_mode_near(bodies, one, points) for one in starts]
         theta, _ = min(fits, key=lambda one: one[1])
         starts = [theta]
-    return given(bodies, points, theta)
+    return weights_posterior(bodies, points, theta)
 
 
-def given(bodies: BodyResiduals, points: FloatArray, theta: FloatArray) -> FittedResidual:
-    """Posterior of the weights for one kernel and spread, and each body as the others predict it.
+def weights_posterior(bodies: BodyResiduals, points: FloatArray, theta: FloatArray) -> FittedResidual:
+    """Posterior of the weights given kernel and spread, and each body's leave-one-out prediction.
 
     `theta` holds the logs of the lengths and of the scale, and the coefficients of ln SD(B).
     """
@@ -322,9 +322,9 @@ def given(bodies: BodyResiduals, points: FloatArray, theta: FloatArray) -> Fitte
 
 
 def body_spread(features: FloatArray, error: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(s,) coefficients of ln SD(B) by which bodies left out are most probable, and their (s, s) covariance.
+    """(s,) coefficients of ln SD(B) that maximise the density of held-out bodies, and their (s, s) covariance.
 
-    `error` and `noise` are (b,): of each body as the others predict it, and its variance without B's.
+    `error` and `noise` are (b,): leave-one-out error of each body, and its variance without B's.
     """
 
     def density(spreads: FloatArray) -> FloatArray:
@@ -341,12 +341,12 @@ def _log_density(features: FloatArray, error: FloatArray, noise: FloatArray, log
     return float(-0.5 * np.sum(np.log(variance) + error**2 / variance))
 
 
-def _best(bodies: BodyResiduals, start: FloatArray, points: FloatArray) -> tuple[FloatArray, float]:
-    """Logs of kernel and spread at the mode next to a start, and the mode's negative log density."""
+def _mode_near(bodies: BodyResiduals, start: FloatArray, points: FloatArray) -> tuple[FloatArray, float]:
+    """Logs of kernel and spread at the mode near a start, and the negative log density there."""
     k = bodies.x.shape[1]
 
     def cost(theta: FloatArray) -> float:
-        fitted, spread = given(bodies, points, theta), theta[k + 1 :]
+        fitted, spread = weights_posterior(bodies, points, theta), theta[k + 1 :]
         error, noise = bodies.left - fitted.predicted, bodies.noise + fitted.variance
         of_kernel = np.sum(((theta[:k] - _LENGTH[0]) / _LENGTH[1]) ** 2) + ((theta[k] - _SCALE[0]) / _SCALE[1]) ** 2
         prior = -0.5 * float(of_kernel) + _spread_prior(spread)

@@ -97,7 +97,7 @@ class ShiftPosterior(Record, eq=False):
 
 
 def shift_posterior(data: PhantomResiduals, prior: SitePrior = PRIOR) -> ShiftPosterior:
-    """Posterior of a site's shift given what the calibration leaves of its phantoms."""
+    """Posterior of a site's shift given the residuals of its phantoms under the calibration."""
     x, y, precision = data.design, data.residual, np.diag(1.0 / np.append(prior.sd, 1.0) ** 2)
     weight = 1.0 / (_GRID[:, None] ** 2 * data.spread_variance + data.map_variance)
     squares = (x[:, :, None] * x[:, None, :]).reshape(len(x), -1)
@@ -110,9 +110,9 @@ def shift_posterior(data: PhantomResiduals, prior: SitePrior = PRIOR) -> ShiftPo
     share = np.exp(log - log.max())  # even steps in ln k, in which the prior is normal
     share /= share.sum()
     centre = share @ mean
-    apart = mean - centre
-    whole = np.tensordot(share, covariance, 1) + (share * apart.T) @ apart
-    return ShiftPosterior(centre, whole, float(share @ _GRID), float(share @ _GRID**2))
+    deviation = mean - centre
+    covariance_total = np.tensordot(share, covariance, 1) + (share * deviation.T) @ deviation
+    return ShiftPosterior(centre, covariance_total, float(share @ _GRID), float(share @ _GRID**2))
 
 
 def correct_calibration(
@@ -121,7 +121,7 @@ def correct_calibration(
     """The calibration, called `base` in reports, with a site's correction.
 
     It takes at least `LEAST_PHANTOMS` phantoms in the calibration's range, made and fitted by its recipe; `left_out`
-    says in words which take no part for reasons found before. A calibration that is corrected already is a
+    says in words which phantoms were left out before. A calibration that is corrected already is a
     `BadDataError`.
     """
     if calibration.site is not None:
@@ -133,12 +133,12 @@ def correct_calibration(
     with_fat, out = 0, list(left_out)
     for name, group in groups.items():
         rises = all(np.isfinite(one.shape.log_amplitude).any() for one in group)
-        used = calibration.for_maps([one.shape for one in group]) if rises else calibration
-        if why := _misfit(used, group) if rises else "a map does not rise above its background":
+        applied = calibration.for_maps([one.shape for one in group]) if rises else calibration
+        if why := _misfit(applied, group) if rises else "a map does not rise above its background":
             out.append(f"{name}: {why}")
             continue
-        rows[name] = _row(used, group)
-        with_fat += used.fat_mm is not None or calibration.depth is None
+        rows[name] = _row(applied, group)
+        with_fat += applied.fat_mm is not None or calibration.depth is None
     if len(rows) < LEAST_PHANTOMS:
         why = f" ({'; '.join(out)})" if out else ""
         raise BadDataError(
@@ -168,54 +168,54 @@ def correct_calibration(
     return replace(calibration, site=site)
 
 
-def _misfit(used: BodyCalibration, maps: Sequence[PhantomMap]) -> str:
-    """Why a phantom takes no part; empty where it does."""
-    note = used.fat_note  # beyond the depth's range it is sized without the depth, as any map is
+def _misfit(applied: BodyCalibration, maps: Sequence[PhantomMap]) -> str:
+    """Reason why a phantom is left out; empty where it is used."""
+    note = applied.fat_note  # beyond the depth's range it is sized without the depth, as any map is
     for one in maps:
-        if outside := [text for text in used.outside(*one.shape.middle) if not (note and text.startswith(note))]:
+        if outside := [text for text in applied.outside(*one.shape.middle) if not (note and text.startswith(note))]:
             return "; ".join(outside)
     return ""
 
 
-def _row(used: BodyCalibration, maps: Sequence[PhantomMap]) -> tuple[float, ...]:
-    """A phantom under the calibration, as the columns of `PhantomResiduals`."""
-    log_size = log_sizes(used, [one.shape for one in maps])
+def _row(applied: BodyCalibration, maps: Sequence[PhantomMap]) -> tuple[float, ...]:
+    """Residual of a phantom under the calibration, as the columns of `PhantomResiduals`."""
+    log_size = log_sizes(applied, [one.shape for one in maps])
     log_a, log_width = (
         np.array([np.nanmean(getattr(m.shape, n)) for m in maps]) for n in ("log_amplitude", "log_width")
     )
     left = np.array([np.log(m.d_mm) - np.nanmean(size) for m, size in zip(maps, log_size, strict=True)])
-    body_sd = used.body_sd(log_a, log_width, np.zeros(len(maps))).mean()
-    own_sd = float(used.own_sd(body_sd))
-    expected, alone, together = _known(used, maps[0].known, (float(log_a.mean()), float(log_width.mean())), own_sd)
+    body_sd = applied.body_sd(log_a, log_width, np.zeros(len(maps))).mean()
+    table_sd = float(applied.table_sd(body_sd))
+    expected, alone, together = _known(applied, maps[0].known, (float(log_a.mean()), float(log_width.mean())), table_sd)
     n = len(maps)
-    exam = used.between_exams.sd**2 / n
+    exam = applied.between_exams.sd**2 / n
     noise = float(np.mean([np.nanvar(size) for size in log_size])) / n
-    width = float(log_width.mean()) - used.centre.log_width
-    variance = alone + used.other_sd**2 + exam
+    width = float(log_width.mean()) - applied.centre.log_width
+    variance = alone + applied.other_sd**2 + exam
     return float(left.mean()) - expected, width, variance, noise, float(np.sqrt(together))
 
 
 def _known(
-    calibration: BodyCalibration, known: Mapping[str, float], middle: tuple[float, float], own_sd: float
+    calibration: BodyCalibration, known: Mapping[str, float], middle: tuple[float, float], table_sd: float
 ) -> tuple[float, float, float]:
-    """E[B] given known properties, and of the variance of B what is the phantom's own and what its set's.
+    """E[B] given known properties, and the variance of B that is the phantom's own and that its set shares.
 
-    `middle` is ln a and p of its maps; `own_sd` is SD(B) there.
+    `middle` is ln a and p of its maps; `table_sd` is SD(B) there.
     """
     hidden = calibration.hidden
     if hidden is None:
-        return 0.0, own_sd**2, 0.0
-    explained_sd = min(own_sd, hidden.most_sd)
+        return 0.0, table_sd**2, 0.0
+    explained_sd = min(table_sd, hidden.most_sd)
     stated = {name: value for name, value in known.items() if name in hidden.names}
     shared = [name for name in SHARED if name in hidden.names and name not in stated]
     by_stated = explained_sd**2 * hidden.share(*stated) if stated else 0.0
     by_both = explained_sd**2 * hidden.share(*stated, *shared) if stated or shared else 0.0
-    lack = LACK * (own_sd**2 - explained_sd**2 * hidden.share(*hidden.names))
-    own, common = own_sd**2 - by_both - lack, by_both - by_stated + lack
+    lack = LACK * (table_sd**2 - explained_sd**2 * hidden.share(*hidden.names))
+    individual, common = table_sd**2 - by_both - lack, by_both - by_stated + lack
     if not stated:
-        return 0.0, own, common
+        return 0.0, individual, common
     features = calibration.features(np.array(middle[0]), np.array(middle[1]))
-    return explained_sd * float(hidden.expected_departure(stated, features)), own, common
+    return explained_sd * float(hidden.expected_departure(stated, features)), individual, common
 
 
 def _cautions(
@@ -224,7 +224,7 @@ def _cautions(
     data: PhantomResiduals,
     posterior: ShiftPosterior,
 ) -> tuple[str, ...]:
-    """Oddities of a correction by the phantoms of these names, of which these properties are known, in words."""
+    """Cautions on a correction, from the phantoms' known properties by name."""
     lines = []
     without = sum("depth_mm" not in one for one in known.values())
     if without and calibration.hidden is not None and "depth_mm" in calibration.hidden.names:
@@ -280,7 +280,7 @@ class LearnedSpread(Record, eq=False):
 
     density: FloatArray
     by_chance: tuple[float, ...]
-    """For each of the given exams of a mass: the probability of a spread as large as theirs, by the other masses."""
+    """Probability, by the other masses, of exams as far apart as those of each mass and visit."""
     repeatability: Repeatability
 
 
