@@ -9,9 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, TextResult, door, list_of, path_of, plain, takes
+from tactile_bayes.api.arguments import PathLike, TextResult, door, list_of, path_of, plain, required_path, takes
 from tactile_bayes.api.estimates import estimate_each, settings_of
-from tactile_bayes.api.pooled import common_calibration, patient_place, reestimate_at_common_mass, without_calibration
+from tactile_bayes.api.pooled import (
+    common_calibration,
+    patient_place,
+    reestimate_at_common_mass,
+    refuse_repeated_maps,
+    without_calibration,
+)
 from tactile_bayes.api.settings import Settings, days_from_first, refuse_checkpoint
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.declarations import as_dict, replace
@@ -144,7 +150,7 @@ class Comparison(TextResult, eq=False):
         self, path: PathLike, *, pdf: PathLike | None = None, title: str = "", name: str = "", force: bool = False
     ) -> None:
         """Write one page of the mass over time as HTML, as ``compare -o`` does, and with `pdf` also print it."""
-        files = PageFiles(path_of(path), path_of(pdf), force)
+        files = PageFiles(required_path(path, "the path"), path_of(pdf), force)
         files.check()
         PageLabels(title, name)
         files.write(self.page_text(title=title, name=name))
@@ -406,9 +412,7 @@ def compare(
         estimate_each(one if isinstance(one, Sequence) and not isinstance(one, str) else [one], settings)
         for one in (first, second, *more)
     ]
-    fingerprints = [one.tactile_map.fingerprint for visit in visits for one in visit]
-    if len(set(fingerprints)) < len(fingerprints):
-        raise UsageError("a map is given twice; give each map once, at its own visit")
+    refuse_repeated_maps(list(chain.from_iterable(visits)), way_out="give each map once, at its own visit")
     names = [[one.name or f"visit {v} map {i}" for i, one in enumerate(visit, 1)] for v, visit in enumerate(visits, 1)]
     comparison = compare_estimates(visits, own_settings, comparing, names=names)
     return replace(comparison, dates=tuple(map(str, visit_dates or ())))

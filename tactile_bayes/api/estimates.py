@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, list_of, path_of, plain, takes
+from tactile_bayes.api.arguments import PathLike, list_of, path_of, plain, required_path, takes
 from tactile_bayes.api.estimating import Notice, estimate_file, estimate_one
 from tactile_bayes.api.maps import Map, map_of
-from tactile_bayes.api.pooled import PooledSize, pool_estimates
+from tactile_bayes.api.pooled import PooledSize, pool_estimates, refuse_repeated_maps
 from tactile_bayes.api.settings import Settings, refuse_checkpoint
 from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import Record, replace
@@ -59,7 +59,11 @@ def settings_of(options: Mapping[str, Any]) -> Settings:
 def _properties(known: Any) -> tuple[tuple[str, float], ...]:
     """Known properties of a body from a mapping, or from pairs."""
     pairs = list(known.items()) if isinstance(known, Mapping) else known
-    if isinstance(pairs, str) or not isinstance(pairs, Sequence) or any(np.shape(one) != (2,) for one in pairs):
+    if (
+        isinstance(pairs, str)
+        or not isinstance(pairs, Sequence)
+        or not all(isinstance(one, Sequence) and len(one) == 2 for one in pairs)
+    ):
         raise UsageError(f'known is {known!r}; give a mapping such as {{"seat": 1.2}}')
     for name, value in pairs:
         check_number(f"known {name}", value)
@@ -134,9 +138,7 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
     estimates = estimate_each(list_of("maps", maps, "maps, paths or estimates"), settings)
     if not estimates:
         raise UsageError("there is no map to pool; give at least one")
-    fingerprints = [one.tactile_map.fingerprint for one in estimates]
-    if len(set(fingerprints)) < len(fingerprints):
-        raise UsageError("a map is given twice; give each map once")
+    refuse_repeated_maps(estimates)
     names = [one.name or f"map {i}" for i, one in enumerate(estimates, start=1)]
     return pool_estimates(estimates, own_settings, names=names)
 
@@ -200,6 +202,7 @@ def exam_from_estimates(
     """Exam of maps that were estimated; several are pooled."""
     if len(estimates) == 1:
         return estimates[0].exam()
+    refuse_repeated_maps(estimates)
     names = [f"map {number}" for number in range(1, len(estimates) + 1)]
     return pool_estimates(estimates, settings, names=names, files=files).exam()
 
@@ -265,7 +268,7 @@ def exam_report(
     BadDataError
         When a file is damaged or of another kind, or the maps are of different exams.
     """
-    page, labels = PageFiles(path_of(path), path_of(pdf), force), PageLabels(title, name, day)
+    page, labels = PageFiles(required_path(path, "the path"), path_of(pdf), force), PageLabels(title, name, day)
     page.check()
     sources = as_list(files)
     if not sources:
@@ -286,8 +289,6 @@ def exam_report(
 
 
 # --- Export of maps and estimates to the files that other systems take.
-
-_IN_PYTHON = Path("what was given in Python")  #: What messages call a map or an estimate that is in no file.
 
 
 class ExportedFiles(Record):
@@ -350,28 +351,34 @@ def export(
             raise UsageError(f"{name} is {value!r}; give a text")
     refuse_unsupported(to, identity)
     sources = as_list(files)
+    if to in ("fhir", "csv") and any(isinstance(one, Map) for one in sources):
+        raise UsageError(f"{to} files hold sizes, and a map has none; give its estimate alone")
     outputs = Outputs(path_of(path), path_of(dictionary), to=to, force=force)
     outputs.check(files=bool(sources))
     exported, notes = dict[str, bytes](), tuple[str, ...]()
     if sources:
-        records = [_export_records(one) for one in sources]
+        named = [(Path(f"item {i}"), source) for i, source in enumerate(sources, start=1)]  # for error messages
+        records = [_export_records(source, name) for name, source in named]
         if to == "dicom" and not any(isinstance(one, MapFile) for one in records):  # a report refers to its maps
-            records = [*(_map_file(*one) for estimate in sources for one in _maps_of(estimate)), *records]
+            records = [
+                *(_map_file(one, name, digest) for name, source in named for one, digest in _maps_of(source)),
+                *records,
+            ]
         patient = merged_identity(path_of(worklist), identity)
         exported, notes = exported_files(records, to=to, identity=patient, id_from_scan=patient_id_from_scan)
     return ExportedFiles(outputs.write(exported), notes)
 
 
-def _export_records(source: Any) -> MapFile | Sequence[EstimateFile]:
-    """Convert a map, an estimate or the path of one to what the formats write."""
+def _export_records(source: Any, name: Path) -> MapFile | Sequence[EstimateFile]:
+    """Convert a map, an estimate or the path of one to what the formats write; `name` stands for its path."""
     if isinstance(source, str | Path):
         return read_exam(path_of(source))
     if isinstance(source, Map):
-        return _map_file(source)
+        return _map_file(source, name)
     if isinstance(source, SizeEstimate | PooledSize):
         document = source.answer.document if isinstance(source, SizeEstimate) else source.document
-        digests = tuple(_map_file(*one).digest for one in _maps_of(source))
-        return [replace(parse_estimate(document, _IN_PYTHON), maps=digests)]
+        digests = tuple(_map_file(one, name, digest).digest for one, digest in _maps_of(source))
+        return [replace(parse_estimate(document, name), maps=digests)]
     raise UsageError(f"{type(source).__name__} is nothing to export; give a map, an estimate, or the path of one")
 
 
@@ -384,13 +391,13 @@ def _maps_of(source: Any) -> list[tuple[Map, str]]:
     ]
 
 
-def _map_file(source: Map, digest: str = "") -> MapFile:
+def _map_file(source: Map, name: Path, digest: str = "") -> MapFile:
     """Convert a map for export; one that is in no file gets the digest of the file that `save` would write."""
     facts = shared_facts(source.scans)
     if digest or source.path is not None:
-        path = source.path or _IN_PYTHON
+        path = source.path or name
         return MapFile(path, digest or sha256(path), source.tactile_map, facts)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "map.nc"
         source.save(path)
-        return MapFile(_IN_PYTHON, sha256(path), source.tactile_map, facts)
+        return MapFile(name, sha256(path), source.tactile_map, facts)

@@ -186,7 +186,7 @@ def named_calibration(settings: Settings, normalise: str) -> tuple[Path | None, 
     choice = settings.size_calibration
     if choice is not None and not isinstance(choice, str):
         return None, choice
-    path = size_calibration_path(choice or default_for(normalise))
+    path = size_calibration_path(default_for(normalise) if choice is None else choice)
     return path, None if path is None else read_size_calibration(path)
 
 

@@ -10,9 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, dataframe, door, output_path, path_of, plain, required_path, takes
+from tactile_bayes.api.arguments import (
+    PathLike,
+    dataframe,
+    door,
+    list_of,
+    output_path,
+    path_of,
+    plain,
+    required_path,
+    takes,
+)
 from tactile_bayes.declarations import EXACT, Record, as_dict, replace, to_plain
-from tactile_bayes.errors import UsageError, check_number
+from tactile_bayes.errors import UsageError, check_choice, check_number
 from tactile_bayes.files import imports, scan_mcap
 from tactile_bayes.files.arrays_layout import ArrayMap, GridOptions, Stated
 from tactile_bayes.files.atomic import sha256
@@ -31,7 +41,7 @@ from tactile_bayes.mapping.build import build_map as build
 from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import MapOptions
-from tactile_bayes.presets import PRESSURE_WINDOW_KPA, RESEARCH_USE
+from tactile_bayes.presets import CORRECTIONS, PRESSURE_WINDOW_KPA, RESEARCH_USE
 from tactile_bayes.progress import Progress, no_progress
 from tactile_bayes.report.map import map_figure
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, Scan, TrackerPoses
@@ -200,7 +210,8 @@ def check(scan: Any, *, pressure_window_kpa: tuple[float, float] = PRESSURE_WIND
     ArrangementCheck
         `words` says what its frames agree with, `lines()` in full; `too_short` where they are too few.
     """
-    return check_scan(as_scan(scan), pressure_window_kpa=pressure_window_kpa)
+    window = MapOptions(pressure_window_kpa=pressure_window_kpa).pressure_window_kpa
+    return check_scan(as_scan(scan), pressure_window_kpa=window)
 
 
 def as_scan(source: Any) -> Scan:
@@ -282,10 +293,10 @@ def map_of(given: Any, **stated: Any) -> Map:
     UsageError
         When it is none of these, or an argument cannot be so.
     """
-    if isinstance(given, Map):
-        return given
-    if isinstance(given, TactileMap):
-        return Map(given)
+    if isinstance(given, Map | TactileMap):
+        if stated:
+            raise UsageError(f"{next(iter(stated))} is for values and files of values; a map has its own, leave it out")
+        return given if isinstance(given, Map) else Map(given)
     path = path_of(given) if isinstance(given, str | Path) else None
     if path is not None and not stated and path.suffix.lower() not in GRID_SUFFIXES:
         return read_map(path)
@@ -359,6 +370,9 @@ def scan(
     UsageError
         When an argument cannot be so.
     """
+    corrections = tuple(list_of("correct", correct, "corrections"))
+    for name in corrections:
+        check_choice("a correction", name, CORRECTIONS)
     columns = {} if columns is None else columns
     named = ArrayMap(**columns) if isinstance(columns, Mapping) else read_array_map(path_of(columns))
     layout = replace(named, **{name: plain(value) for name, value in stated.items() if value is not None})
@@ -366,12 +380,14 @@ def scan(
     if isinstance(frames, str | Path):
         imported, notes = imports.import_arrays(path_of(frames), layout, others)
     else:
-        times = {} if time is None else {"frame_time_s": _array(time)}
-        imported, notes = imports.combine_sources([Source({"frames": _array(frames), **times}), *others], layout)
+        arrays = {"frames": _array(frames)} | ({} if time is None else {"frame_time_s": _array(time)})
+        if not arrays["frames"].ndim:
+            raise UsageError(f"frames is {type(frames).__name__}; give (n, rows, columns) numbers, or a path")
+        imported, notes = imports.combine_sources([Source(arrays), *others], layout)
     for note in notes:
         if note.startswith("CAUTION"):
             warnings.warn(note, stacklevel=4)
-    return corrected(with_session(imported, path_of(session)), correct)
+    return corrected(with_session(imported, path_of(session)), corrections)
 
 
 def _array(values: Any) -> Any:
@@ -414,14 +430,18 @@ def _head(head: Any) -> Source:
     if isinstance(head, Mapping):
         document = {"schema": _HEAD_SCHEMA, **to_plain(dict(head), digits=EXACT)}
         return imports.head_source(head_geometry(document, path=Path("head")))
-    return _source_of(head, HeadGeometry, imports.head_source, lambda other: other.head)
+    return _source_of("head", head, HeadGeometry, imports.head_source, lambda other: other.head)
 
 
 def _calibration(calibration: Any) -> Source:
     if isinstance(calibration, tuple | list) and len(calibration) == 2:
         return Source({"gain_kpa_per_count": _array(calibration[0]), "offset_kpa": _array(calibration[1])})
     return _source_of(
-        calibration, ElementCalibration, imports.calibration_source, lambda other: other.element_calibration
+        "calibration",
+        calibration,
+        ElementCalibration,
+        imports.calibration_source,
+        lambda other: other.element_calibration,
     )
 
 
@@ -429,13 +449,19 @@ def _landmarks(landmarks: Any) -> Source:
     points = None if landmarks is None or isinstance(landmarks, str | Path | Landmarks | Scan) else _array(landmarks)
     if points is not None and points.shape in ((2, 3), (3, 3)):
         return Source({"landmarks_mm": points[:2], **({"nipple_mm": points[2]} if len(points) == 3 else {})})
-    return _source_of(landmarks, Landmarks, imports.landmark_source, lambda other: other.landmarks)
+    return _source_of("landmarks", landmarks, Landmarks, imports.landmark_source, lambda other: other.landmarks)
 
 
-def _source_of(source: Any, kind: type, make: Callable[[Any], Source], part: Callable[[Scan], Any]) -> Source:
+def _source_of(
+    name: str, source: Any, kind: type, make: Callable[[Any], Source], part: Callable[[Scan], Any]
+) -> Source:
     """Convert a path, a record, or the scan that holds such a record; None is an empty source."""
     if source is None:
         return Source({})
     if isinstance(source, str | Path):
         return make(path_of(source))
-    return make(source if isinstance(source, kind) else part(as_scan(source)))
+    if isinstance(source, kind):
+        return make(source)
+    if not isinstance(source, Scan | SimulatedScan):
+        raise UsageError(f"{name} is {type(source).__name__}; give a path, or that of another scan")
+    return make(part(as_scan(source)))

@@ -55,6 +55,12 @@ def pool_estimates(
     )
 
 
+def refuse_repeated_maps(estimates: Sequence[SizeEstimate], *, way_out: str = "give each map once") -> None:
+    """Refuse a map that is given twice: its readings would count twice, and the interval would be too narrow."""
+    if len({one.tactile_map.fingerprint for one in estimates}) < len(estimates):
+        raise UsageError(f"a map is given twice; {way_out}")
+
+
 def patient_place(report: EstimateReport) -> PatientPlace | None:
     """Place of a map's reported mass in the patient; None without a lump or landmarks."""
     centre = report.centre_patient_mm

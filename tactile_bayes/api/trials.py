@@ -313,6 +313,8 @@ def plan(
     values = {name: plain(value) for name, value in options.items() if value is not None}
     for name in {"patients", "maps"} & set(values):
         values[name] = tuple(map(plain, list_of(name, values[name], "whole numbers")))
+        if not values[name]:
+            raise UsageError(f"{name} is empty; give at least one whole number")
     readings = None if pilot is None else table_of(pilot, "pilot")
     sizes = None if excision is None else table_of(excision, "excision")
     return planned(values, read_pilot(readings, sizes, values.get("against")), progress)

@@ -84,6 +84,35 @@ CALLS: dict[str, tuple[Callable[..., Any], str]] = {
         lambda _: tb.build_map(tb.demo_scan(), pressure_window_kpa=5),
         "pressure_window_kpa is 5; give a list of 2",
     ),
+    "a window of one pressure": (
+        lambda _: tb.check(tb.demo_scan(), pressure_window_kpa=5),  # type: ignore[arg-type]
+        "pressure_window_kpa is 5; give a list of 2",
+    ),
+    "frames as a number": (lambda _: tb.scan(3), r"frames is int; give \(n, rows, columns\) numbers, or a path"),
+    "a head of no kind": (
+        lambda _: tb.scan(np.ones((2, 3, 3)), head=3),
+        "head is int; give a path, or that of another",
+    ),
+    "landmarks of no kind": (lambda _: tb.scan(np.ones((2, 3, 3)), landmarks=3), "landmarks is int; give a path, or"),
+    "a correction as text": (
+        lambda _: tb.scan(np.ones((2, 3, 3)), correct="transposed"),
+        "correct is 'transposed'; give",
+    ),  # type: ignore[arg-type]
+    "a correction of no kind": (
+        lambda _: tb.scan(np.ones((2, 3, 3)), correct=("mirror",)),
+        "a correction is 'mirror'; give one of rows-reversed",
+    ),
+    "a property with two values": (
+        lambda _: tb.estimate(tb.demo_map(), known={"seat": [1, 2]}),
+        r"known seat is \[1, 2\]; give a number",
+    ),
+    "a repeat that is the same map": (
+        lambda one: tb.exam_report([one, one], "x.html"),
+        "a map is given twice; give each map once",
+    ),
+    "a page without its path": (lambda one: one.report(None), "the path is None; give the path"),
+    "an exam's page without its path": (lambda one: tb.exam_report(one, None), "the path is None"),  # type: ignore[arg-type]
+    "no number of patients": (lambda _: tb.plan(patients=[]), "patients is empty; give at least one"),
     "an estimate to pool": (lambda one: tb.pool(one), "pool takes several maps; give a list"),
     "nothing to pool": (lambda _: tb.pool(None), "maps is None; give a list"),  # type: ignore[arg-type]
     "days as a number": (lambda one: tb.compare(one, one, days=3), "days is 3; give a list"),  # type: ignore[arg-type]
@@ -97,6 +126,14 @@ CALLS: dict[str, tuple[Callable[..., Any], str]] = {
     "a title of no text": (lambda one: one.report("x.html", title=3), "title is 3; give a text"),
     "a day of no text": (lambda one: one.report("x.html", day=3), "'3' is no date"),
     "nothing to report": (lambda _: tb.exam_report(None, "x.html"), "files is None; give a list"),
+    "a map as a table of sizes": (
+        lambda _: tb.export(tb.demo_map(), "x.csv", to="csv"),
+        "csv files hold sizes, and a map has none; give its estimate alone",
+    ),
+    "a map exported twice": (
+        lambda _: tb.export([tb.demo_map(), tb.demo_map()], "x.nrrd", to="nrrd"),
+        "item 2 holds what item 1 holds; give each once",
+    ),
     "nothing to export": (lambda _: tb.export(None, "x.json", to="fhir"), "files is None; give a list"),
     "an ID of no text": (lambda one: tb.export(one, "x.json", to="fhir", patient_id=3), "patient_id is 3"),  # type: ignore[arg-type]
     "an exam of no date": (lambda one: tb.export(one, "x", to="dicom"), "give study_date YYYY-MM-DD"),

@@ -96,3 +96,6 @@ def test_a_map_is_returned_as_it_is() -> None:
     made = tb.map_of(values(), spacing_mm=1, normalise="gain")
     assert tb.map_of(made) is made
     assert tb.map_of(made.tactile_map).tactile_map is made.tactile_map
+    for given in (made, made.tactile_map):
+        with pytest.raises(UsageError, match="spacing_mm is for values and files of values; a map has its own"):
+            tb.map_of(given, spacing_mm=2.0)
