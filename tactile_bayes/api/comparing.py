@@ -246,7 +246,7 @@ def _compared(
     visits: Sequence[Sequence[Answer]], calibration: BodyCalibration, settings: Settings, comparing: CompareOptions
 ) -> VisitComparison:
     """Compare the visits, unless codes, places or missing lumps forbid it."""
-    lump_answers = [[answer for answer in maps if answer.shape is not None] for maps in visits]
+    shown = [[answer for answer in maps if answer.shape is not None] for maps in visits]
     missing = [words for number, maps in enumerate(visits, start=1) if (words := _missing(maps, f"visit {number}"))]
     contradicted = contradictions([_scans(one) for one in visits])
     if contradicted:
@@ -256,10 +256,8 @@ def _compared(
         return VisitComparison("no_estimate", "; ".join(missing), "scan the mass again, or leave that visit out")
     if why := without_calibration([one.report for maps in visits for one in maps]):
         return VisitComparison("no_estimate", why, "compare maps that have a size each")
-    places_by_visit = [
-        [place for answer in maps if (place := patient_place(answer.report)) is not None] for maps in lump_answers
-    ]
-    places = [PatientPlace.mean_of(one) for one in places_by_visit]
+    map_places = [[place for answer in maps if (place := patient_place(answer.report)) is not None] for maps in shown]
+    places = [PatientPlace.mean_of(one) for one in map_places]
     shifts = tuple(
         None if first is None or later is None else place_shift(first, later, registration_mm=comparing.registration_mm)
         for first, later in ((places[0], later) for later in places[1:])
@@ -272,7 +270,7 @@ def _compared(
     ]
     doubts += [
         f"the masses on the maps of visit {number} lie too far apart for one"
-        for number, maps in enumerate(places_by_visit, start=1)
+        for number, maps in enumerate(map_places, start=1)
         if one_place_probability(maps, registration_mm=comparing.registration_mm) < LEAST_PROBABILITY
     ]
     unknown = [str(number) for number, place in enumerate(places, start=1) if place is None]
@@ -284,7 +282,7 @@ def _compared(
         return VisitComparison("not_one_mass", reason, "touch both landmarks, or say --same-mass", shifts)
     doubts += [f"no landmarks show where the mass of visit {number} lies" for number in unknown]
     findings = [finding("taken_as_one", f"{text}; taken as one mass because you say so") for text in doubts]
-    return _sized(lump_answers, calibration, settings, shifts=shifts, doubts=findings)
+    return _sized(shown, calibration, settings, shifts=shifts, doubts=findings)
 
 
 def _missing(maps: Sequence[Answer], visit: str) -> str:
@@ -381,17 +379,17 @@ def compare(
     first, second, *more
         A visit each, in order of time: a map, a path or an estimate, or a list of them.
     days
-        Days from the first visit to each later one; with them growth rates are told.
+        Days from the first visit to each later one; with them growth rates are reported.
     dates
         The visits' dates in place of days, such as ``["2026-01-15", "2026-04-20"]``.
     grown_by
-        Shares of the diameter (0.2 for 20 %) that the probability of a larger growth is told for.
+        Shares of the diameter (0.2 for 20 %) for which the probability of a larger growth is reported.
     same_mass
         Say that the visits are of one mass where landmarks are missing, or place it too far apart.
     registration_mm
-        SD each way of one mass's place between visits.
+        SD along each axis of one mass's place between visits.
     **settings
-        As of `estimate`; estimates that are given keep their own.
+        As of `estimate`; estimates keep their own.
 
     Raises
     ------

@@ -79,7 +79,7 @@ def estimate(tactile_map: Any, *, progress: Callable[[int, int], None] | None = 
     tactile_map
         A map, or the path of one.
     progress
-        Called with effective draws done and wanted.
+        Called with the numbers of effective draws done and required.
     **settings
         As of `tactile_bayes.api.settings.Settings`, by default as on the command line; `size_calibration` is a
         name, a path or a calibration from `calibrate_size`, `known` a mapping such as ``{"seat": 1.2}``,
@@ -93,17 +93,17 @@ def estimate(tactile_map: Any, *, progress: Callable[[int, int], None] | None = 
     Raises
     ------
     BadDataError
-        When a file is not what it must be, or the calibration does not fit the map.
+        When a file is damaged or of another kind, or the calibration does not fit the map.
     UsageError
-        When settings contradict each other, or a value cannot be one.
+        When settings contradict each other, or a value is out of range.
     NotConvergedError
         When the method asked for does not converge.
 
     Examples
     --------
     >>> import tactile_bayes as tb
-    >>> found = tb.estimate(tb.demo_map())
-    >>> low, high = found.max_size_mm.interval(0.9)
+    >>> estimate = tb.estimate(tb.demo_map())
+    >>> low, high = estimate.max_size_mm.interval(0.9)
     >>> bool(low < 15.0 < high)
     True
     """
@@ -122,7 +122,7 @@ def pool(maps: Iterable[Any], **settings: Any) -> PooledSize:
     maps
         Maps, paths or estimates; each map once, in any order.
     **settings
-        As of `estimate`; estimates that are given keep their own.
+        As of `estimate`; estimates keep their own.
 
     Raises
     ------
@@ -251,9 +251,9 @@ def exam_report(
     pdf
         Also print the page there, by an installed Chromium or WeasyPrint.
     title, name, day
-        To print on the page; nothing is where they are not given. The day as YEAR-MONTH-DAY.
+        To print on the page; empty ones are left out. The day as YEAR-MONTH-DAY.
     **settings
-        As of `estimate`; estimates that are given keep their own.
+        As of `estimate`; estimates keep their own.
 
     Returns
     -------
@@ -316,7 +316,7 @@ def export(
     ----------
     files
         Maps, estimates and pooled sizes, or the paths of their files; one, or a list. An estimate brings its map where
-        `to` is ``"dicom"``. None at all where only a dictionary is wanted.
+        `to` is ``"dicom"``. None where only a dictionary is to be written.
     path
         File to write; for ``"dicom"`` the folder of the files.
     to

@@ -63,10 +63,10 @@ def estimate_file(
     """Read a map and estimate it; see `estimate_one`."""
     tactile_map, scans = read_map_and_scans(path)
     with in_file(path):
-        estimate = estimate_one(
+        result = estimate_one(
             tactile_map, settings, inputs={"map": path}, scans=scans, progress=progress, notice=notice
         )
-    return replace(estimate, name=path.stem)
+    return replace(result, name=path.stem)
 
 
 def input_digests(
@@ -166,12 +166,8 @@ def _with_place(
     estimate: Estimate, tactile_map: TactileMap, scans: Sequence[Mapping[str, str]], *, probability: float
 ) -> Estimate:
     """Add the findings on the places of the masses: side, landmarks, and masses that may be one."""
-    patient_places = [
-        estimate_document.patient_mm(tactile_map, one.x_mm, one.y_mm) for one in estimate.masses if one.reported
-    ]
-    side = estimate_document.side_findings(
-        estimate_document.side_of(scans), patient_places[0] if patient_places else None
-    )
+    places = [estimate_document.patient_mm(tactile_map, one.x_mm, one.y_mm) for one in estimate.masses if one.reported]
+    side = estimate_document.side_findings(estimate_document.side_of(scans), places[0] if places else None)
     sized = [
         (number, (one.x_mm, one.y_mm), one.estimate.size.summarise("max_size_mm", probability=probability))
         for number, one in enumerate(estimate.masses, start=1)

@@ -180,7 +180,7 @@ def build_map(
     BadDataError
         When a file is no scan, or no frame is left.
     UsageError
-        When an option cannot be so, or a recording is given twice.
+        When an option is out of range, or a recording is given twice.
     """
     sources = [scans] if isinstance(scans, str | Path) or not isinstance(scans, Sequence) else list(scans)
     loaded = [as_scan(one) for one in sources]
@@ -289,9 +289,9 @@ def map_of(given: Any, **stated: Any) -> Map:
     Raises
     ------
     BadDataError
-        When values cannot be so: numbers that stand for no value, another level than stated, a damaged file.
+        When values are wrong: numbers that stand for no value, another level than stated, a damaged file.
     UsageError
-        When it is none of these, or an argument cannot be so.
+        When it is none of these, or an argument is wrong.
     """
     if isinstance(given, Map | TactileMap):
         if stated:
@@ -368,7 +368,7 @@ def scan(
     BadDataError
         Naming the array, its value and the way out.
     UsageError
-        When an argument cannot be so.
+        When an argument is wrong.
     """
     corrections = tuple(list_of("correct", correct, "corrections"))
     for name in corrections:

@@ -81,10 +81,10 @@ def learn_from_exams(
     that by which they were sized, where it is in no file that they name; `fewest`: masses with repeats that it takes.
     """
     groups, left_out = _repeats(exams)
-    one_by_one, masses = [repeat for group in groups for repeat in group], []
+    repeats, masses = [repeat for group in groups for repeat in group], []
     if not groups:
         learn_repeatability([], fewest=fewest or FEWEST_MASSES)  # refuses them
-    calibration, used = _calibration(one_by_one, size_calibration)
+    calibration, sizing = _calibration(repeats, size_calibration)
     for group in groups:
         alone = [log_size_alone(calibration, read_shape(one.exam.folder / SHAPE)) for one in group]
         first, values = group[0].exam, np.array(alone)
@@ -102,15 +102,15 @@ def learn_from_exams(
         for mass, group, chance in zip(masses, groups, learned.by_chance, strict=True)
     ]
     settings = {"prior": {"median": PRIOR_MEDIAN, "log_sd": PRIOR_LOG_SD}}
-    inputs = {f"draws_{i}": repeat.digest for i, repeat in enumerate(one_by_one, start=1)}
-    provenance = Provenance(COMMAND, settings, {"size_calibration": used.sha256, **inputs})
+    inputs = {f"draws_{i}": repeat.digest for i, repeat in enumerate(repeats, start=1)}
+    provenance = Provenance(COMMAND, settings, {"size_calibration": sizing.sha256, **inputs})
     return size_json.RepeatabilityFile(
         schema="tactile-bayes/repeatability/1",
         research_use=RESEARCH_USE,
         between_map_sd=spread.sd,
         probability=PROBABILITY,
-        calibration=used,
-        half_width=_half_widths(one_by_one, spread.sd),
+        calibration=sizing,
+        half_width=_half_widths(repeats, spread.sd),
         repeats=entries,
         left_out=left_out,
         provenance=provenance.as_dict(),

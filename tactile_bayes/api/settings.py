@@ -79,10 +79,8 @@ class Settings(FitSettings, kw_only=True):
 
     def recorded(self, **actual: Any) -> dict[str, Any]:
         """Plain data of all settings but the seed, for a provenance; `actual` values replace those asked for."""
-        leading = dict.fromkeys(("size_calibration", "method", "interval"))
-        plain: dict[str, Any] = leading | {
-            name: actual.get(name, getattr(self, name)) for name in self.__struct_fields__
-        }
+        first = dict.fromkeys(("size_calibration", "method", "interval"))
+        plain: dict[str, Any] = first | {name: actual.get(name, getattr(self, name)) for name in self.__struct_fields__}
         del plain["seed"], plain["settings_file"]
         plain["size_calibration"] = actual.get("size_calibration", self.calibration_name)
         plain["centre_mm"] = None if self.centre_mm is None else list(self.centre_mm)

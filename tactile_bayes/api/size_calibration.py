@@ -152,22 +152,20 @@ def _over_bodies(table: Path | Sheet, options: LearnOptions, against: Path | Non
         recipe = Recipe(
             way, fit.background, fit.fit_radius_mm, declared=False, noise=fit.noise, flat_field=False, head=head
         )
-        calibration = learning.learn_population(
-            population_table(columns), recipe=recipe, source=_SOURCE, residual=residual
-        )
-    if residual and calibration.residual is None:
+        learned = learning.learn_population(population_table(columns), recipe=recipe, source=_SOURCE, residual=residual)
+    if residual and learned.residual is None:
         raise BadDataError(
             f"fewer than {learning.LEAST_BODIES} bodies have a lump and a head profile: too few for a residual",
             way_out="give a larger population, or --form eq6",
             path=str(rows.path),
         )
-    calibration = replace(calibration, bodies=bodies)
+    learned = replace(learned, bodies=bodies)
     if other_rows is not None:
         other_table = population_table(rows_of_one_way(other_rows, way)[1])
         settings["other_masses"] = len(set(other_table.body.tolist()))
         source = f"{settings['other_masses']} lumps of {other_rows.path.name}"
-        calibration = learning.learn_other_sd(calibration, other_table, source=source)
-    return LearnedCalibration(calibration, settings, _files(table=table, against=against))
+        learned = learning.learn_other_sd(learned, other_table, source=source)
+    return LearnedCalibration(learned, settings, _files(table=table, against=against))
 
 
 def table_recipe(table: Table, options: LearnOptions) -> Recipe:
@@ -259,10 +257,8 @@ def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> eq6.SizeT
         raise BadDataError("no rows", way_out="give a row for each lump", path=str(table.path))
     if depth is None:
         return eq6.SizeTable(d_mm, amplitude, sigma_x, sigma_y)
-    lump_columns = [
-        columns[name] for name in ("seat", "d_mm", "stiffness_ratio", "thickness_mm", "head_radius_mm", "head")
-    ]
-    group = list(zip(*lump_columns, strict=True))
+    same = [columns[name] for name in ("seat", "d_mm", "stiffness_ratio", "thickness_mm", "head_radius_mm", "head")]
+    group = list(zip(*same, strict=True))
     change_x, change_y = (
         None if one is None else eq6.width_changes(one, depth_ratio=depth, group=group) for one in (sigma_x, sigma_y)
     )
@@ -430,7 +426,7 @@ def calibrate_size(
     TypeError
         When a keyword is none of these.
     UsageError
-        When a keyword's value cannot be one, or goes with another form.
+        When a keyword's value is out of range, or belongs to another form.
     """
     learn_options = LearnOptions(**{name: plain(value) for name, value in options.items()})
     target = None if path is None else output_path(path, "JSON")

@@ -289,20 +289,20 @@ def plan(
     Parameters
     ----------
     pilot, excision
-        Tables of an earlier trial, files or DataFrames: the errors that no keyword gives are taken from it.
+        Tables of an earlier trial, files or DataFrames: it gives the errors that no keyword states.
     progress
-        Called with designs done and wanted.
+        Called with the numbers of designs done and in all.
     **options
         As of `tactile_bayes.options.PlanOptions` and `PlanErrors`, by default as on the command line: patients, maps,
         power, precision, against, trials, map_sd... Every pair of patients and maps is a design; with a power or a
-        precision `report.needed` says how many patients do.
+        precision `report.needed` holds the numbers of patients that reach it.
 
     Raises
     ------
     BadDataError
-        When a table is not what it must be, or tells too little of the errors.
+        When a table is malformed, or too small to estimate the errors.
     UsageError
-        When a value cannot be one, or goes only with a pilot.
+        When a value is out of range, or needs a pilot.
 
     Examples
     --------

@@ -177,10 +177,10 @@ def pooled_size(
     their log size; the draws then get the quantiles of the mixture of all these normals.
     """
     calibration = calibration.at_fat([one.profile for one in maps])
-    used, replicates = matched_draws(maps, number, rng)
+    matched, replicates = matched_draws(maps, number, rng)
     log_size = log_sizes(calibration, maps)
     centre, noise = (np.array([moment(one) for one in log_size]) for moment in (np.nanmean, np.nanvar))
-    drawn = replace(MassMaps.of(used, calibration), centre=centre, noise=noise)
+    drawn = replace(MassMaps.of(matched, calibration), centre=centre, noise=noise)
     oval, shown = lump_shape(calibration, maps, log_size, priors.shape)
     points = paired_points(drawn.by_map.mean(axis=0), replicates, DIMENSIONS, rng)
     figures = {
@@ -189,11 +189,11 @@ def pooled_size(
         "shown_share": shown,
         "irregular_outline": float(2 * sum(one.irregular for one in maps) >= len(maps)),
     }
-    turned = np.concatenate([np.stack([one.q, one.r], axis=-1) @ log_ratio_rotation(-one.turn_rad) for one in used])
+    turned = np.concatenate([np.stack([one.q, one.r], axis=-1) @ log_ratio_rotation(-one.turn_rad) for one in matched])
     axis = first_axis(*turned.T)
     pool = _Pool(drawn, points, oval.at(points[:, 3:]), axis, replicates, calibration, priors.known, figures)
     size = pool.size(priors.between_maps or calibration.between_exams)
-    middle = [float(np.mean([np.nanmean(getattr(m, n)) for m in used])) for n in ("log_amplitude", "log_width")]
+    middle = [float(np.mean([np.nanmean(getattr(m, n)) for m in matched])) for n in ("log_amplitude", "log_width")]
     variance = float(np.nanvar(np.log(size.max_size_mm)))
     return replace(
         size,
@@ -311,19 +311,19 @@ def pool_maps(
     if 2 * found_on < len(shapes) - silent or not found_on:
         return PooledEstimate("no_estimate", few)
     # sorted, so that the draws do not depend on the caller's order
-    in_order = sorted(((shape, i) for i, shape in enumerate(shapes) if shape is not None), key=lambda one: one[0].order)
-    used, places = [shape for shape, _ in in_order], [i for _, i in in_order]
-    depth, at_depth = calibration.depth, calibration.for_maps(used)
-    fat_apart_mm = None if depth is None else depth.disagreement_mm([one.profile for one in used])
-    named = sorted(zip(places, [one.middle for one in used], strict=True))
+    pairs = sorted(((shape, i) for i, shape in enumerate(shapes) if shape is not None), key=lambda one: one[0].order)
+    in_order, places = [shape for shape, _ in pairs], [i for _, i in pairs]
+    depth, at_depth = calibration.depth, calibration.for_maps(in_order)
+    fat_apart_mm = None if depth is None else depth.disagreement_mm([one.profile for one in in_order])
+    named = sorted(zip(places, [one.middle for one in in_order], strict=True))
     far = [f"map {i + 1}: {text}" for i, middle in named for text in at_depth.outside(*middle, far=True)]
     if far:
         return PooledEstimate("no_estimate", extrapolated(far).reason)
-    sizes = log_sizes(at_depth, used)
+    sizes = log_sizes(at_depth, in_order)
     centres = {i: float(np.nanmean(one)) for i, one in zip(places, sizes, strict=True)}
     centre, noise = np.array(list(centres.values())), np.array([np.nanvar(one) for one in sizes])
     outlying = tuple(sorted(places[i] for i in outlying_maps(centre, noise, priors.spread_of_others)))
-    another = None if priors.between_maps is not None or len(used) < 2 else priors.another_exam
+    another = None if priors.between_maps is not None or len(in_order) < 2 else priors.another_exam
     pooled = PooledEstimate(
         DISAGREE,
         "the maps show different sizes",
@@ -331,12 +331,12 @@ def pool_maps(
         outlying=outlying,
         calibration=at_depth,
         fat_apart_mm=fat_apart_mm,
-        one_size=None if len(used) < 2 else one_size_probability(centre, noise, priors.between_maps),
+        one_size=None if len(in_order) < 2 else one_size_probability(centre, noise, priors.between_maps),
         one_size_apart=None if another is None else one_size_probability(centre, noise, another),
     )
     if pooled.one_size is not None and pooled.one_size < LEAST_PROBABILITY:
         return pooled
-    size = pooled_size(used, calibration=at_depth, priors=priors, rng=rng, number=POOLED_DRAWS)
+    size = pooled_size(in_order, calibration=at_depth, priors=priors, rng=rng, number=POOLED_DRAWS)
     if size.invalid > MOST_INVALID * size.d_x_mm.size:
         return PooledEstimate("no_estimate", f"no positive size in {size.invalid} of {size.d_x_mm.size} draws")
     outside = [f"map {i + 1}: {text}" for i, middle in named for text in at_depth.outside(*middle)]

@@ -269,8 +269,8 @@ def joint_sizes(
 ) -> JointSizes:
     """Joint posterior of a mass's sizes at several visits, from the maps of each on which the lump was found.
 
-    The calibration is used at the depth of fat that each visit's maps tell; properties that somebody knows take no
-    part. `between` is a spread between exams in place of the priors', `law` how far B is the same at the visits, by
+    The calibration is used at the depth of fat that each visit's maps tell; known properties of the body are
+    ignored. `between` is a spread between exams in place of the priors', `law` how far B is the same at the visits, by
     default `SHARED_BODY`, or `SHARED_WITHOUT_DEPTH` where maps tell no depth. None for
     `amplitudes` leaves them out. `UsageError` for fewer than two visits, more than `MOST_VISITS`, or one without a map.
     """
@@ -278,33 +278,32 @@ def joint_sizes(
         raise UsageError(f"{len(visits)} visits are given; compare 2 to {MOST_VISITS}")
     if not all(visits):
         raise UsageError("a visit has no map with a lump; leave it out")
-    fitted = visit_calibrations(visits, calibration)
+    fits = visit_calibrations(visits, calibration)
     between = between or priors.between_maps or calibration.between_exams
     flat = [one for maps in visits for one in maps]
-    used, replicates = matched_draws(flat, number, rng)
+    matched, replicates = matched_draws(flat, number, rng)
     ends = np.cumsum([len(maps) for maps in visits])
     parts = [
-        MassMaps.of(used[end - len(maps) : end], calibrated)
-        for maps, end, calibrated in zip(visits, ends, fitted, strict=True)
+        MassMaps.of(matched[end - len(maps) : end], fit) for maps, end, fit in zip(visits, ends, fits, strict=True)
     ]
     middle = np.mean([one.by_map.mean(axis=0) for one in parts], axis=0)
     points = draws.paired_points(middle, replicates, DIMENSIONS, rng)
     tau = between.at(points[:, 0], *[(one.centre, one.noise) for one in parts])  # one for all visits
-    sizes = [one for maps, calibrated in zip(visits, fitted, strict=True) for one in log_sizes(calibrated, maps)]
-    oval, _ = lump_shape(fitted[0], flat, sizes, priors.shape)
+    sizes = [one for maps, fit in zip(visits, fits, strict=True) for one in log_sizes(fit, maps)]
+    oval, _ = lump_shape(fits[0], flat, sizes, priors.shape)
     half = oval.at(points[:, 2:5])
     averaged = [one.averaged(tau) for one in parts]
     if law is None:
-        law = SHARED_WITHOUT_DEPTH if fitted[0].fat_mm is None else SHARED_BODY
+        law = SHARED_WITHOUT_DEPTH if fits[0].fat_mm is None else SHARED_BODY
     correlation = law.correlation(np.array([float(np.nanmean(one.mean)) for one in averaged]))
-    covariance = _covariance(averaged, fitted, correlation, ndtri(points[:, 1]))
+    covariance = _covariance(averaged, fits, correlation, ndtri(points[:, 1]))
     mean = np.stack([one.mean for one in averaged]) + np.hypot(half[:, 0], half[:, 1])
     if amplitudes is not None:
-        left, noise = amplitudes.at_common_depth(averaged, fitted)
+        left, noise = amplitudes.at_common_depth(averaged, fits)
         mean, covariance = _with_amplitudes(mean, covariance, left, noise, amplitudes, points[:, 5])
     drawn = _draw_sizes(mean, covariance, rng.standard_normal((len(replicates), len(visits))), replicates)
     spread = float(np.sqrt(np.mean(tau**2)))
-    return JointSizes(drawn, mean, covariance, replicates, spread, correlation, tuple(fitted))
+    return JointSizes(drawn, mean, covariance, replicates, spread, correlation, tuple(fits))
 
 
 def visit_calibrations(visits: Sequence[Sequence[ShapeDraws]], calibration: BodyCalibration) -> list[BodyCalibration]:

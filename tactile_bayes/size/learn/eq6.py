@@ -162,10 +162,8 @@ def _learn_axis(data: AxisRows, *, rng: np.random.Generator, progress: Progress 
     options, density = EnsembleOptions(keep=DRAWS_KEPT, max_steps=20_000, block=300), partial(_log_density, data=data)
     draws = ensemble(density, mode, covariance, rng=rng, options=options, progress=progress)
     axis = data.calibration(_coefficients(draws.flat, data))
-    diagnostics = {name: draws.diagnostics[name] for name in ("rhat", "ess_tail")}
-    return replace(
-        axis, fit={**agreement(axis, data), "e_identified": float(data.width_change is not None), **diagnostics}
-    )
+    mixing = {name: draws.diagnostics[name] for name in ("rhat", "ess_tail")}
+    return replace(axis, fit={**agreement(axis, data), "e_identified": float(data.width_change is not None), **mixing})
 
 
 def agreement(axis: AxisCalibration, data: AxisRows) -> dict[str, float]:
@@ -273,8 +271,8 @@ def _learn_in_two_stages(data: AxisRows, rng: np.random.Generator) -> AxisCalibr
     draws[:, shifted] += fitted.draws[0, shifted] - draws[:, shifted].mean(axis=0)
     axis = data.calibration(draws)
     level, known = _stage_rows(data)
-    counts = {"level_rows": float(level.sum()), "width_change_rows": float(known.sum())}
-    return replace(axis, fit={**agreement(axis, data), "e_identified": 1.0, "two_stage": 1.0, **counts})
+    rows = {"level_rows": float(level.sum()), "width_change_rows": float(known.sum())}
+    return replace(axis, fit={**agreement(axis, data), "e_identified": 1.0, "two_stage": 1.0, **rows})
 
 
 def _widen_for_few_clusters(draws: FloatArray, *, diameters: int) -> None:
