@@ -104,8 +104,14 @@ def list_of(name: str, value: Any, kind: str) -> Sequence[Any]:
 
 
 def plain(value: Any) -> Any:
-    """Convert a numpy scalar to a Python number, as files hold; return anything else as it is."""
-    return value.item() if isinstance(value, np.generic) else value
+    """Convert numbers of numpy, also in a tuple, list or array, to Python's; return anything else as it is."""
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return tuple(value.tolist()) if value.ndim else value.item()
+    if isinstance(value, tuple):
+        return tuple(map(plain, value))
+    return [plain(one) for one in value] if isinstance(value, list) else value
 
 
 class TextResult(Record, eq=False):

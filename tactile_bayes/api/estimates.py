@@ -7,8 +7,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
-
 from tactile_bayes.api.arguments import PathLike, list_of, path_of, plain, required_path, takes
 from tactile_bayes.api.estimating import Notice, estimate_file, estimate_one
 from tactile_bayes.api.maps import Map, map_of
@@ -51,8 +49,8 @@ def settings_of(options: Mapping[str, Any]) -> Settings:
         values["repeatability"] = read_repeatability(path_of(repeatability))
     if "checkpoint" in values:
         values["checkpoint"] = path_of(values["checkpoint"])
-    if isinstance(values.get("centre_mm"), Sequence | np.ndarray) and not isinstance(values["centre_mm"], str):
-        values["centre_mm"] = tuple(plain(one) for one in values["centre_mm"])
+    if isinstance(values.get("centre_mm"), list):
+        values["centre_mm"] = tuple(values["centre_mm"])
     return Settings(**values)
 
 

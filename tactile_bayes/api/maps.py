@@ -210,7 +210,7 @@ def check(scan: Any, *, pressure_window_kpa: tuple[float, float] = PRESSURE_WIND
     ArrangementCheck
         `words` says what its frames agree with, `lines()` in full; `too_short` where they are too few.
     """
-    window = MapOptions(pressure_window_kpa=pressure_window_kpa).pressure_window_kpa
+    window = MapOptions(pressure_window_kpa=plain(pressure_window_kpa)).pressure_window_kpa
     return check_scan(as_scan(scan), pressure_window_kpa=window)
 
 

@@ -203,6 +203,11 @@ def test_numbers_of_numpy_are_taken_as_numbers(made: tb.Map) -> None:
     of_numpy = tb.estimate(made, seed=np.int64(3), interval=np.float64(0.9), known={"seat": np.float32(1.0)}, **FAST)
     plain = tb.estimate(made, seed=3, interval=0.9, known={"seat": 1.0}, **FAST)
     assert of_numpy.answer.document == plain.answer.document
+    scan, window = tb.demo_scan(), (np.float32(5.0), np.float64(14.0))
+    by_window = [tb.build_map(scan, pressure_window_kpa=one).tactile_map for one in (window, np.array(window))]  # type: ignore[arg-type]
+    assert {one.fingerprint for one in by_window} == {made.tactile_map.fingerprint}
+    assert tb.check(scan, pressure_window_kpa=window).words == tb.check(scan).words  # type: ignore[arg-type]
+    assert tb.estimate(made, centre_mm=np.zeros(2), **FAST).settings.centre_mm == (0.0, 0.0)
 
 
 def _public(value: Any, depth: int = 5) -> Iterator[Any]:
