@@ -34,7 +34,7 @@ from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import PageLabels, ShownExam, exam_map, headline
 from tactile_bayes.report.pages import PageFiles
 
-# --- One map estimate_each, and several of one mass pooled.
+# --- One map estimated, and several of one mass pooled.
 
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
@@ -197,7 +197,7 @@ def exam_from_files(
 def exam_from_estimates(
     estimates: Sequence[SizeEstimate], settings: Settings, *, files: Sequence[Path] = ()
 ) -> ShownExam:
-    """Exam of maps that were estimated; several are pooled."""
+    """Make the exam of a page from the estimates of its maps; several are pooled."""
     if len(estimates) == 1:
         return estimates[0].exam()
     refuse_repeated_maps(estimates)
