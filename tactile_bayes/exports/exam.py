@@ -321,11 +321,12 @@ class Moment(Record):
     zone: str = ""  #: ``+HHMM`` or ``-HHMM``; empty where unknown.
 
     @classmethod
-    def parse(cls, text: str, *, name: str) -> Moment:
+    def parse(cls, text: str, *, name: str, date_only: bool = False) -> Moment:
         """Read ``YYYY-MM-DD``, or ``YYYY-MM-DDTHH:MM[:SS]`` with an optional ``Z`` or ``+HH:MM``; errors say `name`."""
         match = _MOMENT.fullmatch(text)
-        way_out = "give YYYY-MM-DD or YYYY-MM-DDTHH:MM, with +HH:MM for the time zone if you know it"
-        if match is None:
+        with_time = " or YYYY-MM-DDTHH:MM, with +HH:MM for the time zone if you know it"
+        way_out = "give YYYY-MM-DD" + ("" if date_only else with_time)
+        if match is None or (date_only and match[4]):
             raise UsageError(f"{name} is {quoted(text)}; {way_out}")
         year, month, day, hour, minute, second, zone = match.groups()
         try:
@@ -377,9 +378,7 @@ class Identity(IdentityOptions):
             )
         for name in ("birth_date", "study_date", "content_date"):
             if text := getattr(self, name):
-                moment = Moment.parse(text, name=name)
-                if name == "birth_date" and moment.time:
-                    raise UsageError(f"birth_date is {quoted(text)}; give YYYY-MM-DD")
+                Moment.parse(text, name=name, date_only=name == "birth_date")
 
     @property
     def given(self) -> dict[str, str]:

@@ -185,18 +185,12 @@ class HeadParser(PacketParser):
         return [reading for packet in self.packets(data) if (reading := self._read(packet)) is not None]
 
     def _read(self, packet: Packet) -> readings.Reading | None:
-        match packet.kind:
-            case 2:
-                return self._frame(packet)
-            case 4:
-                return self._pose(packet)
-            case 1:
-                return self._hello(packet)
-            case 3 if len(packet.payload) >= _END.size:
-                return readings.EndReading(*_END.unpack_from(packet.payload))
-            case _:
-                self.fault = f"it sent a packet of kind {packet.kind} with {len(packet.payload)} bytes"
-                return None
+        if packet.kind in (FRAME, POSE, HELLO):
+            return {FRAME: self._frame, POSE: self._pose, HELLO: self._hello}[packet.kind](packet)
+        if packet.kind == END and len(packet.payload) >= _END.size:
+            return readings.EndReading(*_END.unpack_from(packet.payload))
+        self.fault = f"it sent a packet of kind {packet.kind} with {len(packet.payload)} bytes"
+        return None
 
     def _frame(self, packet: Packet) -> readings.FrameReading | None:
         shape = (self.hello.rows, self.hello.columns) if self.hello else None

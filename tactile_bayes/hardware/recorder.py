@@ -29,7 +29,7 @@ _CAUTION_SHARE: Final = 0.01  #: Of missing or flagged poses: any exam has fewer
 
 @dataclass(slots=True)
 class RecordingReport:
-    """What came in a recording and what was lost; numbers count records unless the name says bytes."""
+    """Counts of a recording, its losses and its cautions; numbers count records unless the name says bytes."""
 
     frames: int = 0
     frames_lost: int = 0
@@ -212,7 +212,7 @@ class Recorder:
     duration_s: float | None = None
     """By the head's clock made continuous, and at most `OVERTIME_S` longer by the host's; None goes on until it is
     stopped."""
-    rate_hz: float = 0.0  #: What the head promised; 0 for nothing.
+    rate_hz: float = 0.0  #: Frame rate that the head promised; 0 for none.
     observer: Observer = field(default_factory=Observer)
     clock_ns: Callable[[], int] = time.monotonic_ns  #: The host time that the reading processes stamp with.
     speed: float = 1.0  #: Seconds of the devices' clocks in one of the host's: other than 1 where a scan is replayed.

@@ -288,7 +288,7 @@ class TrackerDriver(Record):
         return answer
 
     def _fault_words(self, parser: Parser, unasked: bytes, received: bytes, *, rate: bool) -> str:
-        """What came instead of a record, in words."""
+        """Words on the bytes that came instead of a record."""
         expected = f"a record of {self.title} was expected"
         if parser.fault:
             return f"{expected}; {parser.fault}"
@@ -413,7 +413,7 @@ def check_head(port: Port, *, every: int = 1) -> HelloReading:
 
 
 def _no_hello(parser: head.HeadParser, received: bytes, port: Port) -> str:
-    """What came instead of a HELLO, in words."""
+    """Words on the bytes that came instead of a HELLO."""
     if parser.fault:
         return f"but {parser.fault}; the layout is in docs/scan-head-protocol.md"
     if not received:

@@ -277,11 +277,11 @@ def run_tradeoff(
     seconds, answer = run(default, 0)
     choices = choices if relevant is None else relevant(answer)
     work.announce(sum(seconds.values()) * (4.0 + work.runs * sum(one.weight for one in choices)))
-    made, rows = reference(), []
+    compared_with, rows = reference(), []
     for number, one in enumerate(choices, start=1):
-        rows.append(measure_setting(one, run, made, runs=work.runs))
+        rows.append(measure_setting(one, run, compared_with, runs=work.runs))
         work.progress(number, len(choices))
-    ladder = Tradeoff(tuple(rows), made, work.tolerance_mm)
+    ladder = Tradeoff(tuple(rows), compared_with, work.tolerance_mm)
     best = set(map(id, ladder.frontier()))
     return replace(ladder, rows=tuple(replace(one, frontier=id(one) in best) for one in rows))
 

@@ -36,6 +36,16 @@ def test_an_impossible_date_is_refused(text: str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("name", "value", "way_out"), [("birth_date", "1970-13-01", "give YYYY-MM-DD"), ("sex", "X", "give one of F, M, O")]
+)
+def test_the_way_out_is_one_that_the_field_takes(name: str, value: str, way_out: str) -> None:
+    """A date of birth was to be given with a time, which it may not have; the list of sexes ended in nothing."""
+    with pytest.raises(UsageError) as caught:
+        Identity(**{name: value})
+    assert str(caught.value).endswith(way_out)
+
+
+@pytest.mark.parametrize(
     ("name", "value"),
     [
         ("patient_id", "A\\B"),
