@@ -398,7 +398,7 @@ def _kind_words(kind: Any) -> str:
     bare, rules = _bare(kind), _rules(kind)
     origin, args = get_origin(bare) or bare, get_args(bare)
     if origin is Literal:
-        return repr(args[0]) if len(args) == 1 else f"one of {', '.join(map(str, args))}"
+        return repr(args[0]) if len(args) == 1 else f"one of {', '.join(filter(None, map(str, args)))}"
     if origin in (int, float):
         return number_words(*range_of(kind), whole=origin is int)
     if origin is str:

@@ -45,7 +45,7 @@ class UsageError(TactileBayesError):
 def check_choice(name: str, value: object, choices: Collection[str]) -> None:
     """Refuse a value that is none of the choices, with a `UsageError` that lists them."""
     if value not in choices:
-        raise UsageError(f"{name} is {value!r}; give one of {', '.join(filter(None, choices))}")
+        raise UsageError(f"{name} is {value!r}; give one of {', '.join(choices)}")
 
 
 def require(holds: bool, name: str, value: float, rule: str) -> None:
