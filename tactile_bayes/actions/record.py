@@ -262,7 +262,7 @@ def make_recording(request: Request) -> tuple[RecordingReport, bool]:
             raise UsageError(f"--tracker-rom {rom} is {fault}; {way_out}")
     if not request.tracker_url and (request.tool or request.reference):
         raise UsageError("--tool and --reference are of a tracker; give its port with --tracker")
-    if request.tracker_url == request.head_url:
+    if request.tracker_url == request.head_url != "loop://":  # each loop is a line of its own
         raise UsageError(f"--head and --tracker are both {request.head_url}; give two ports")
     refuse_existing(request.output, force=request.force)
     head, calibration, landmarks = instrument_of(request)
