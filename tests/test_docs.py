@@ -190,7 +190,8 @@ def test_the_files_that_a_newcomer_is_told_to_read_exist():
 def table_under(heading: str, page: Path) -> list[list[str]]:
     """The cells of the first table under a heading of a page, without its head."""
     section = re.split(r"^#+ ", page.read_text(encoding="utf-8").split(f"## {heading}\n")[1], flags=re.MULTILINE)[0]
-    rows = [line.strip().removeprefix("|").removesuffix("|") for line in section.splitlines() if line[:1] == "|"]
+    table = next(block for block in section.split("\n\n") if block.lstrip()[:1] == "|")
+    rows = [line.strip().removeprefix("|").removesuffix("|") for line in table.strip().splitlines()]
     return [[cell.strip() for cell in row.split("|")] for row in rows[2:]]
 
 

@@ -226,10 +226,10 @@ class Wireless(EmulatedNdi):
 
     _port, described = "none", b""
 
-    def _do(self, name: str, rest: str) -> str | None:
+    def _carry_out(self, name: str, rest: str) -> str | None:
         if name == "PVWR":
             self.described += bytes.fromhex(rest[6:])
-        return super()._do(name, rest)
+        return super()._carry_out(name, rest)
 
 
 def expected(poses) -> set[tuple]:
