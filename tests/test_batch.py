@@ -125,6 +125,7 @@ def test_two_items_of_one_name_are_refused():
 # --- failures
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_failed_item_is_named_and_the_rest_kept(workers):
     with open_executor(workers=workers) as executor:
@@ -151,6 +152,7 @@ def die_once(work: tuple[int, Path]) -> int:
     return item
 
 
+@pytest.mark.long
 def test_a_killed_worker_costs_no_result(tmp_path):
     with open_executor(workers=2) as executor:
         outcomes = run_batch(die_once, [(i, tmp_path) for i in range(8)], key=repr, executor=executor)
@@ -213,6 +215,7 @@ def test_an_item_whose_worker_dies_twice_is_at_fault_and_no_other():
     assert outcomes[3].error == batch.DIED_TWICE
 
 
+@pytest.mark.long
 def test_ctrl_c_carries_what_is_done_and_does_not_wait_for_workers(tmp_path):
     """The second of two workers never ends by itself; it is gone when the batch has been left."""
 

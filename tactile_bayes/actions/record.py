@@ -414,7 +414,7 @@ def record(
 
     Returns
     -------
-    Report
+    RecordingReport
         Frames, poses, what was lost, and cautions.
 
     Raises

@@ -703,6 +703,7 @@ main()
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("limit", "workers"),
     [(300, 1), *(pytest.param(*one, marks=pytest.mark.slow) for one in ((100_000, 1), (400_000, 2)))],

@@ -223,6 +223,7 @@ def test_the_second_table_is_printed_when_asked_for() -> None:
         assert words not in plain.stdout
 
 
+@pytest.mark.long
 def test_the_page_needs_nothing_else_and_is_the_same_every_time(tmp_path: Path) -> None:
     for name in ("a.html", "b.html"):
         assert validate(TRIAL, "--excision", EXCISION, "--html", tmp_path / name).exit_code == 0

@@ -68,6 +68,7 @@ def check(name: str, kind: str, size: int) -> None:
 KINDS = ("bytes", "one byte", "words")
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", NAMES)
 def test_a_tracker_is_read_again_after_noise(name, kind):
@@ -102,6 +103,7 @@ def test_a_head_is_read_again_after_ten_megabytes_of_noise(kind):
     check_head(kind, 10 * MEGABYTE)
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", ["head", "ndi", *PROTOCOLS])
 def test_an_emulated_device_outlives_noise(name, kind):

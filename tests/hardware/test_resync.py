@@ -95,6 +95,7 @@ def check(name: str, case: tuple[int, str, int, int, bytes, int]) -> None:
     assert found[-surely:] == poses[-surely:]
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("name", NAMES)
 @settings(max_examples=200)
 @given(SPOILT)

@@ -117,6 +117,7 @@ def test_every_kind_of_message_with_a_pose_is_read(wire):
     assert whole.garbage_bytes == parser.garbage_bytes == 0
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("wire", MESSAGES.values(), ids=MESSAGES)
 def test_every_byte_lost_or_turned_costs_that_message_and_the_next_at_most(wire):
     for at in range(len(wire)):

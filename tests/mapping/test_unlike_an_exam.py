@@ -140,6 +140,7 @@ def test_a_rig_that_presses_evenly_is_no_noise() -> None:
     assert not any("as noise does" in one.text for one in build_map(steady, as_stated=True).findings)
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize(("made", "told"), UNLIKE.values(), ids=UNLIKE)
 def test_an_accident_is_told_and_is_no_map_without_a_lump(made: Callable[[Scan], Scan], told: str) -> None:
     tactile_map = build_map(made(scan()), as_stated=True, max_pose_gap_ms=1e6)
@@ -235,6 +236,7 @@ FROZEN: dict[str, tuple[Callable[[Scan], Scan], str]] = {
 }
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize(("made", "told"), FROZEN.values(), ids=FROZEN)
 def test_a_tracker_that_stands_still_is_told_and_its_frames_are_left_out(
     made: Callable[[Scan], Scan], told: str

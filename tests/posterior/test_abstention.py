@@ -59,6 +59,7 @@ def test_the_reason_has_a_code_and_a_way_out(values: np.ndarray, code: str, advi
     assert "What would help" in text or found.advice in text  # a caution may tell it already
 
 
+@pytest.mark.long
 def test_cells_too_large_to_show_a_lump_are_no_verdict_on_the_breast() -> None:
     """A lump of sigma 3 mm on cells of 10 mm once read "no lump found"; the control is the same map on fine cells."""
     coarse = grid_map(1.0 + WHITE[:9, :9], cell_mm=10.0)

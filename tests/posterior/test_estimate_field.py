@@ -56,6 +56,7 @@ def test_every_method_recovers_the_bump(method: str) -> None:
     assert found.diagnostics["method"] == method
 
 
+@pytest.mark.long
 def test_a_lifted_level_beside_the_lump_does_not_narrow_it() -> None:
     """A neighbour that lowers the level by a tenth: least squares on a fixed level loses a third of the width."""
     values = bump_values() - 0.1 + 0.3 * errors(2)

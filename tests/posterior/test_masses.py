@@ -138,6 +138,7 @@ def test_a_second_lump_in_the_window_is_listed_and_sized() -> None:
     assert masses[1].largest_mm == pytest.approx(alone.largest_mm, rel=0.25)
 
 
+@pytest.mark.long
 def test_a_rise_that_the_map_hardly_shows_is_listed_last_and_without_a_size() -> None:
     rng = np.random.default_rng(1)
     values = bump_values(half_mm=35.0, x=-18.0, y=2.0, sigma_x=4.5, sigma_y=4.5, amplitude=0.5)
@@ -189,6 +190,7 @@ def test_a_mass_has_the_size_that_its_place_alone_gives() -> None:
     assert found_on(two).estimate.masses[0].largest_mm != pytest.approx(listed.largest_mm, rel=0.1)
 
 
+@pytest.mark.long
 def test_what_is_known_of_a_lump_is_used_for_the_first_alone() -> None:
     two = scene(narrow=0.6)
     known = found_on(two, known=(("seat", 1.2),)).estimate

@@ -32,6 +32,7 @@ def tail_shape(density: SamplingTarget, gaussians: Gaussians) -> float:
     return sampler.shape
 
 
+@pytest.mark.long
 def test_a_plain_map_with_nearly_independent_errors_needs_no_chains(nearly_independent: SamplingTarget) -> None:
     density = nearly_independent
     assert density.parts is not None

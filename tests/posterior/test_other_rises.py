@@ -136,6 +136,7 @@ def test_a_lump_that_goes_on_into_a_rim_that_was_read_seldom_is_hardly_shown() -
     assert listed(0.0) == []
 
 
+@pytest.mark.long
 def test_at_a_place_that_was_given_the_rest_of_the_map_is_named() -> None:
     found, rises = looked(values(second=0.1), SMALL)
     assert found.status == "estimate"

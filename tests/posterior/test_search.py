@@ -109,6 +109,7 @@ def on_a_dome(normalise: str, quality: dict[str, float]) -> TactileMap:
     return replace(grid_map(dome + lump + 0.3 * noise(5), normalise=normalise), quality=quality)
 
 
+@pytest.mark.long
 def test_a_small_lump_on_a_wide_rise_is_found_on_the_levelled_map() -> None:
     found = look(on_a_dome("gain", SIDES))
     assert found.status == "estimate", found.reason

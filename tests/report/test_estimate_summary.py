@@ -188,6 +188,7 @@ def test_a_broken_assumption_stands_first_and_one_to_check_after_the_size() -> N
         assert not line.startswith(("CAUTION: the", "To check: the skin"))
 
 
+@pytest.mark.long
 def test_a_pool_names_the_map_whose_strokes_see_the_lump_apart(folder: Path) -> None:
     lagging = tuple(broken_assumptions({"stroke_lag_mm": 3.0, "stroke_lag_sd_mm": 0.1}))
     lagging = replace(MAPS["again.nc"], findings=lagging)

@@ -179,6 +179,7 @@ def test_an_ellipse_turns_with_a_plane_that_is_shown_by_a_quarter_turn(axes):
     np.testing.assert_array_equal(np.asarray(image.get_array().filled(np.nan)), bump_map().mean.T)
 
 
+@pytest.mark.long
 def test_a_rib_beside_the_lump_does_not_take_all_colours(axes):
     ribbed = bump_map()
     mean = ribbed.mean.copy()
@@ -249,6 +250,7 @@ def hatching(axes) -> list:
     return [one for one in axes.collections if one.get_clip_path() is not None]
 
 
+@pytest.mark.long
 def test_cells_with_few_readings_are_hatched_and_no_others(tmp_path, axes):
     map_figure(few_map(), tmp_path / "few.png")
     left, right, *_ = axes[0].figure.axes
@@ -268,6 +270,7 @@ def test_a_map_read_well_everywhere_has_no_hatching(axes):
     assert right.get_legend() is None
 
 
+@pytest.mark.long
 def test_hatching_shows_without_colour(tmp_path, axes):
     """In grey the hatched cells hold both nearly black and nearly white; cells beside them do not."""
     from PIL import Image

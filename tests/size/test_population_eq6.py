@@ -124,6 +124,7 @@ def test_without_a_profile_sizes_are_averaged_over_the_depths_that_go_with_the_m
     assert np.mean(np.abs(silent.error) < 1.96 * np.sqrt(silent.variance)) == pytest.approx(0.95, abs=0.04)
 
 
+@pytest.mark.long
 def test_the_depth_of_other_bodies_is_worth_nothing() -> None:
     """The control: shuffled profiles must not seem to help."""
     full = table(200)

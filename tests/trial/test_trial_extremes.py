@@ -66,6 +66,7 @@ def sections(name: str) -> dict:
     return whole["modalities"]["tactile"]
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("name", TRIALS)
 def test_every_report_is_valid_and_can_be_shown(name: str) -> None:
     of = TRIALS[name]()

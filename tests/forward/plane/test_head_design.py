@@ -132,6 +132,7 @@ def test_where_no_head_meets_the_limit_the_command_says_so_and_fails(monkeypatch
     assert "0 of 3 heads" in done.stdout  # shoulders of 15 mm do not fit inside
 
 
+@pytest.mark.long
 def test_the_picture_and_the_json_hold_the_search(tmp_path, monkeypatch) -> None:
     from functools import partial
 

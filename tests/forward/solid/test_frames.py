@@ -122,6 +122,7 @@ def test_two_lumps_are_the_sum_of_their_changes() -> None:
     np.testing.assert_allclose(frame(*pair), frame(replace(ball, x_mm=2.0, y_mm=1.0)), rtol=1e-5)
 
 
+@pytest.mark.long
 def test_overlapping_lumps_that_leave_no_compliance_are_refused() -> None:
     close = sphere(15.0, 8.0, 17.0)
     with pytest.raises(BadDataError, match="too close together for this model"):

@@ -72,6 +72,7 @@ def test_a_flatter_and_a_sharper_bump_are_told_and_modelled(exponent: float, wor
     assert said == pytest.approx(2 * exponent, abs=0.25)
 
 
+@pytest.mark.long
 def test_gaussians_are_left_alone() -> None:
     """The negative control of the test above; at odds of 3 one false alarm in six has a chance below 1 %."""
     answers = [answer(estimated(1.0, seed)) for seed in range(6)]

@@ -107,6 +107,7 @@ def test_an_empty_scan_gets_no_size_by_a_solid_study(scan: str, request: pytest.
     assert found.status == "no_estimate"
 
 
+@pytest.mark.long
 def test_a_lump_on_each_of_those_maps_is_seen() -> None:
     """The negative control: the same maps with a lump of 0.2 do not come back empty."""
     rng = np.random.default_rng(22)
