@@ -171,7 +171,9 @@ def export(
     inputs: list[MapFile | EstimateFile] = [*maps, *estimates]
     for one in inputs:
         if one.digest in path_of:
-            raise UsageError(f"{one.path} holds what {path_of[one.digest]} holds; give each once")
+            other = path_of[one.digest]
+            fault = "is given twice" if other == one.path else f"holds what {other} holds"
+            raise UsageError(f"{one.path} {fault}; give each once")
         path_of[one.digest] = one.path
     check_pairs(maps, estimates)
     dropped = {name: "" for name in identity.given if name not in IDENTITY_FIELDS[to]}
