@@ -25,7 +25,7 @@ lint: $(VENV)/.installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# Six minutes more. `PART="--begin-at N --budget S"` takes S seconds of it, from a place that N decides; so with `slow`.
+# Ten minutes more. `PART="--begin-at N --budget S"` takes S seconds of it, from a place that N decides; so with `slow`.
 long: $(VENV)/.installed
 	$(BIN)/python -m pytest -m 'long and not slow' -n auto --dist worksteal $(PART)
 
