@@ -200,7 +200,6 @@ def exam_from_estimates(
     """Make the exam of a page from the estimates of its maps; several are pooled."""
     if len(estimates) == 1:
         return estimates[0].exam()
-    refuse_repeated_maps(estimates)
     names = [f"map {number}" for number in range(1, len(estimates) + 1)]
     return pool_estimates(estimates, settings, names=names, files=files).exam()
 
@@ -280,7 +279,9 @@ def exam_report(
         own_settings = settings_of(settings)
         if len(sources) > 1:
             refuse_checkpoint(own_settings)
-        exam = exam_from_estimates(estimate_each(sources, settings), own_settings)
+        estimates = estimate_each(sources, settings)
+        refuse_repeated_maps(estimates)
+        exam = exam_from_estimates(estimates, own_settings)
     exam = replace(exam, labels=labels)
     page.write(exam_page(exam))
     return headline(exam)
