@@ -136,3 +136,9 @@ def test_a_trial_without_posteriors_is_analysed_without_hdf5_and_the_estimates(r
     modules = imported_by(run_python("-c", RUN, "validate", DEMO / "trial.csv", "--excision", DEMO / "excision.csv"))
     without = ("h5py", "tactile_bayes.posterior", "tactile_bayes.size", "tactile_bayes.mapping")
     assert not {name for name in modules if name.startswith(without)}
+
+
+def test_a_scan_is_repaired_and_replayed_without_scipy_hdf5_and_sizes(run_python):
+    modules = imported_by(run_python("-c", RUN, "repair", DEMO / "scan.mcap"))
+    assert "tactile_bayes.actions.devices" in modules
+    assert not {name for name in modules if name.startswith(("scipy", "h5py", "tactile_bayes.size"))}

@@ -9,7 +9,6 @@ from typing import Any, Final
 import click
 import numpy as np
 
-from tactile_bayes.actions.show import describe_scan
 from tactile_bayes.declarations import Record, as_dict, names_of, replace
 from tactile_bayes.errors import EXIT_DONE, BadDataError, TactileBayesError, UsageError, one_line
 from tactile_bayes.files.arrays_layout import ArrayMap, GridOptions, Stated
@@ -24,6 +23,7 @@ from tactile_bayes.files.scan_mcap import read_scan_report, write_scan
 from tactile_bayes.findings import LEADS, finding_lines
 from tactile_bayes.mapping.arrangement import check_scan, corrected
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.scan import describe_scan
 from tactile_bayes.scans import Scan
 from tactile_bayes.shell import progress_bar
 

@@ -17,7 +17,6 @@ import click
 import numpy as np
 
 from tactile_bayes.actions.record import record_action
-from tactile_bayes.actions.show import describe_scan
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, refuse_recording, write_scan
@@ -39,6 +38,7 @@ from tactile_bayes.hardware.reading import ask_for_priority
 from tactile_bayes.hardware.readings import Follower, PoseReading, ToolReading
 from tactile_bayes.hardware.serial_trackers import TRACKERS, open_tracker, probe
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.scan import describe_scan
 from tactile_bayes.scans import Scan
 
 

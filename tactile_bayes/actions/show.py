@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 
 from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import BadDataError, in_file
@@ -19,10 +18,9 @@ from tactile_bayes.files.reading import HDF5_MAGIC, MCAP_MAGIC, first_bytes, is_
 from tactile_bayes.files.size_json import SHIPPED, read_repeatability, read_size_calibration, size_calibration_path
 from tactile_bayes.files.tables import header_of, read_table
 from tactile_bayes.findings import finding_lines, findings_in
-from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.select import Span, intervals, missing_records, with_times
+from tactile_bayes.mapping.select import Span, missing_records, with_times
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.scans import HeadGeometry, Scan
+from tactile_bayes.scans import HeadGeometry
 from tactile_bayes.shell import padded, text_width
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.pooling import Calibration
@@ -67,27 +65,6 @@ def _value_text(value: Any) -> str:
 def _leaves(value: list[Any]) -> Iterator[Any]:
     for item in value:
         yield from _leaves(item) if isinstance(item, list) else [item]
-
-
-def describe_scan(scan: Scan) -> list[str]:
-    """Summary of a scan in a few lines."""
-    times, poses = scan.frames.time_s, scan.poses
-    span = float(times[-1] - times[0]) if len(times) else 0.0
-    saturated = int((scan.frames.counts >= scan.element_calibration.saturation_count).sum())
-    duplicates = int((np.diff(poses.time_s) == 0).sum())
-    marks = [] if scan.landmarks is None else [name.replace("_", " ") for name in scan.landmarks.points()]
-    return [
-        f"{len(times)} frames of {scan.head.shape[0]} x {scan.head.shape[1]} taxels in {span:.3f} s, {_rate(times)}",
-        f"{len(poses)} poses, {_rate(poses.time_s)}",
-        f"dropped frames {missing_records(times)}, dropped poses {missing_records(poses.time_s)}, "
-        f"duplicate pose stamps {duplicates}, saturated readings {saturated}",
-        f"landmarks: {' and '.join(', '.join(marks).rsplit(', ', 1)) or 'not touched'}",
-    ]
-
-
-def _rate(times: FloatArray) -> str:
-    steps, usual = intervals([times])
-    return f"{1 / usual:.1f} Hz" if len(steps) else "no rate"
 
 
 # --- Kind of a file, by its first bytes, and its facts.

@@ -9,7 +9,6 @@ from typing import Any
 import click
 import numpy as np
 
-from tactile_bayes.actions.show import describe_scan
 from tactile_bayes.batch import fault_lines, open_executor, open_store_beside, run_batch, store_path
 from tactile_bayes.declarations import as_dict, names_of
 from tactile_bayes.errors import TactileBayesError
@@ -24,6 +23,7 @@ from tactile_bayes.forward.scene import Head, Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.options import PopulationOptions
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.scan import describe_scan
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.studies.population import BodiesFile, ExamRow, Population
 
