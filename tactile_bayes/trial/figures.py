@@ -138,7 +138,10 @@ class SumStatistic(Record):
 
 def columns(*values: FloatArray | float) -> FloatArray:
     """(n, k) array of k columns, each of length n or one number for all rows."""
-    return np.stack(np.broadcast_arrays(*values), axis=-1).astype(np.float64)
+    table = np.empty((*np.broadcast(*values).shape, len(values)))
+    for i, value in enumerate(values):
+        table[..., i] = value
+    return table
 
 
 def ratio(above: FloatArray, below: FloatArray) -> FloatArray:
@@ -153,7 +156,7 @@ def squares(sums: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
     The last six terms are 1, x', y', x'x', x'y', y'y', where ' is about the means of all masses.
     """
-    n, a, b, aa, ab, bb = np.moveaxis(sums[..., -6:], -1, 0)
+    n, a, b, aa, ab, bb = sums[..., -6:].T
     return aa - a * a / n, bb - b * b / n, ab - a * b / n
 
 

@@ -73,10 +73,7 @@ class PairAngles:
 
 def kendall_sign(x: FloatArray, y: FloatArray) -> int:
     """Sign of Kendall's tau: concordant less discordant pairs."""
-    discordant = _count_inversions(x, y, ties=False)
-    tied = _pairs_of_equals(x[:, None]) + _pairs_of_equals(y[:, None])
-    both = _pairs_of_equals(np.stack([x, y], axis=1))
-    concordant = len(x) * (len(x) - 1) // 2 - tied + both - discordant
+    concordant, discordant = (_count_inversions(x, z, ties=False) for z in (-y, y))
     return (concordant > discordant) - (concordant < discordant)
 
 
@@ -297,7 +294,8 @@ def deming_slope(u: float, q: float, p: float, error_ratio: float) -> float:
 
 def all_equal(values: FloatArray) -> bool:
     """True if (n,) values, n > 0, differ by rounding only."""
-    return bool(np.ptp(values) <= EQUAL * np.abs(values).max())
+    low, high = values.min(), values.max()
+    return bool(high - low <= EQUAL * max(abs(low), abs(high)))
 
 
 def centred(values: FloatArray, mean: float) -> FloatArray:

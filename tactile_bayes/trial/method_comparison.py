@@ -242,7 +242,10 @@ def limit_figures(detected: ModalitySizes, *, intervals: Intervals) -> dict[str,
     """Lower and upper limit in mm and as the logarithm of the ratio, for single readings of detected masses."""
     return {
         f"limit_{side}_{unit}": _limit(terms, sign, detected, intervals=intervals)
-        for unit, terms in (("mm", partial(_limit_terms, np.asarray)), ("log_ratio", partial(_limit_terms, np.log)))
+        for unit, terms in (
+            ("mm", cache(partial(_limit_terms, np.asarray))),
+            ("log_ratio", cache(partial(_limit_terms, np.log))),
+        )
         for side, sign in (("low", -1), ("high", 1))
     }
 
@@ -306,7 +309,7 @@ def _limit_mean(sums: FloatArray) -> FloatArray:
 
 def _limit_sd(sums: FloatArray) -> FloatArray:
     """SD of the difference of single readings: between masses, plus what averaging over replicates removed."""
-    n, _, first, second, inverse, squares, freedom = np.moveaxis(sums, -1, 0)
+    n, _, first, second, inverse, squares, freedom = sums.T
     between = ratio(second - first**2 / n, n - 1)
     within = np.where(freedom > 0.5, ratio(squares, freedom), 0.0)
     return np.asarray(np.sqrt(np.maximum(between + (1 - inverse / n) * within, 0.0)))
@@ -320,7 +323,7 @@ MOST_REFITTED = 300
 _SMALLEST, _LARGEST = 1e-100, 1e100
 
 _Result = TypeVar("_Result")
-_Fit = Callable[[ModalitySizes], lines.Line]
+_Fit = Callable[[FloatArray, FloatArray], lines.Line]
 Unit = Literal["mm", "log_ratio"]
 Against = Literal["on_ex_vivo", "on_mean"]
 _Refitted = Ends | None | UnsetType
@@ -380,15 +383,18 @@ def compare_methods(sizes: ModalitySizes, *, intervals: Intervals, error_ratio: 
     """Compare one modality's detected sizes with excision."""
     detected = sizes.only_detected()
     x, y = detected.ex_vivo_mm, detected.size_mm
-    robust = _fitted(partial(lines.passing_bablok, confidence=intervals.probability))
+    robust = _kept(partial(lines.passing_bablok, confidence=intervals.probability))
+    weighted = _kept(partial(lines.weighted_deming, error_ratio=error_ratio))
     slope: Scale = "slope" if intervals.method == "corrected" else "linear"
     figures: dict[str, Figure] = {}
-    for name, statistic, scale in _statistics(error_ratio, robust, slope):
+    for name, statistic, scale in _statistics(error_ratio, weighted, robust, slope):
         on = scale if isinstance(statistic, SumStatistic) or len(x) <= MOST_REFITTED else None
         figures[name] = figure(statistic, detected, scale=on, intervals=intervals, leverage=_squared_distance)
     figures |= limit_figures(detected, intervals=intervals)
     measurable, level = len(x) >= 2 and _can_be_squared(x, y), intervals.probability
-    analytic = _analytic_intervals(detected, robust, confidence=level, error_ratio=error_ratio) if measurable else {}
+    analytic = (
+        _analytic_intervals(x, y, weighted, robust, confidence=level, error_ratio=error_ratio) if measurable else {}
+    )
     return MethodComparison(
         masses=len(x),
         error_ratio=error_ratio,
@@ -407,18 +413,20 @@ def _squared_distance(sizes: ModalitySizes) -> FloatArray:
     return np.asarray((share - share.mean()) ** 2)
 
 
-def _statistics(error_ratio: float, robust: _Fit, slope: Scale) -> list[tuple[str, Statistic, Scale]]:
+def _statistics(error_ratio: float, weighted: _Fit, robust: _Fit, slope: Scale) -> list[tuple[str, Statistic, Scale]]:
     """All figures with their names and the scales of their intervals."""
-    fits = (
-        ("weighted_deming", _fitted(partial(lines.weighted_deming, error_ratio=error_ratio))),
-        ("passing_bablok", robust),
-    )
+    fits = (("weighted_deming", weighted), ("passing_bablok", robust))
 
     def demings(sums: FloatArray) -> FloatArray:
         return lines.deming_slopes(*squares(sums), error_ratio=error_ratio)
 
     def part(fit: _Fit, name: str) -> Statistic:
-        return lambda sizes: float(getattr(fit(sizes), name))
+        def statistic(sizes: ModalitySizes) -> float:
+            x, y = sizes.ex_vivo_mm, sizes.size_mm
+            _require_squarable(x, y)
+            return float(getattr(fit(x, y), name))
+
+        return statistic
 
     return [
         ("ols_intercept_mm", SumStatistic(_terms, _intercept_with(_ols_slope), _NO_LINE), "linear"),
@@ -474,15 +482,14 @@ def _difference_sd(sums: FloatArray) -> FloatArray:
     return np.sqrt(np.maximum(ratio(u + q - 2 * p, sums[..., 2] - 1), 0.0))
 
 
-def _fitted(fit: Callable[[FloatArray, FloatArray], lines.Line]) -> _Fit:
-    """Function that fits a line to the masses of a modality, and keeps the last line for several figures."""
+def _kept(fit: _Fit) -> _Fit:
+    """The fit, which keeps its lines: intercept and slope, and both jackknifes, ask for the same ones."""
 
-    @lru_cache(maxsize=1)
-    def fitted(sizes: ModalitySizes) -> lines.Line:
-        _require_squarable(sizes.ex_vivo_mm, sizes.size_mm)
-        return fit(sizes.ex_vivo_mm, sizes.size_mm)
+    @lru_cache(maxsize=4096)
+    def line(x: bytes, y: bytes) -> lines.Line:
+        return fit(np.frombuffer(x), np.frombuffer(y))
 
-    return fitted
+    return lambda x, y: line(x.tobytes(), y.tobytes())
 
 
 def _require_squarable(x: FloatArray, y: FloatArray) -> None:
@@ -497,14 +504,12 @@ def _can_be_squared(x: FloatArray, y: FloatArray) -> bool:
 
 
 def _analytic_intervals(
-    detected: ModalitySizes, robust: _Fit, *, confidence: float, error_ratio: float
+    x: FloatArray, y: FloatArray, weighted: _Fit, robust: _Fit, *, confidence: float, error_ratio: float
 ) -> dict[str, Ends | None]:
     """Intervals of the lines and of concordance that take the masses as independent, by name; None where undefined."""
-    x, y = detected.ex_vivo_mm, detected.size_mm
 
     def by_jackknife() -> lines.Line:
         """Weighted Deming line with standard errors from leaving out one mass at a time: there is no formula."""
-        weighted = partial(lines.weighted_deming, error_ratio=error_ratio)
         line = weighted(x, y)
         if not 3 < len(x) <= MOST_REFITTED:
             return line
@@ -514,7 +519,7 @@ def _analytic_intervals(
         "ols": lambda: lines.least_squares(x, y),
         "deming": lambda: lines.deming(x, y, error_ratio=error_ratio),
         "weighted_deming": by_jackknife,
-        "passing_bablok": lambda: robust(detected),
+        "passing_bablok": lambda: robust(x, y),
     }
     intervals: dict[str, Ends | None] = {}
     for name, fit in fits.items():

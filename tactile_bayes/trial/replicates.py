@@ -100,15 +100,16 @@ def _criterion_terms(y: FloatArray, mass: Index, reader: Index) -> Callable[[Flo
     cross = np.zeros((int(mass.max()) + 1, terms.shape[1]))  # of each mass, the sum of its terms
     np.add.at(cross, mass, terms)
     count, total = cross[:, 0], np.bincount(mass, weights=y)
+    products, projected, about_mean = terms.T @ terms, terms.T @ y, float(y @ y)
 
     def terms_at(ratios: FloatArray) -> tuple[float, float]:
         scale = np.full(terms.shape[1], ratios[1] if len(ratios) > 1 else 0.0)
         scale[0] = 1.0
         shrink = ratios[0] ** 2 / (1 + ratios[0] ** 2 * count)
-        right = scale * (terms.T @ y - cross.T @ (shrink * total))
-        system = (terms.T @ terms - (cross * shrink[:, None]).T @ cross) * np.outer(scale, scale)
+        right = scale * (projected - cross.T @ (shrink * total))
+        system = (products - (cross * shrink[:, None]).T @ cross) * np.outer(scale, scale)
         system[1:, 1:] += np.eye(len(scale) - 1)
-        squares = float(y @ y) - float(shrink @ total**2) - float(np.linalg.solve(system, right) @ right)
+        squares = about_mean - float(shrink @ total**2) - float(np.linalg.solve(system, right) @ right)
         log_det = np.linalg.slogdet(system)[1] + np.sum(np.log1p(ratios[0] ** 2 * count))
         return float(log_det), squares
 
@@ -215,7 +216,7 @@ def _log_terms(sizes: ModalitySizes) -> FloatArray:
 
 def _icc(sums: FloatArray) -> FloatArray:
     """Intraclass correlation of a one-way analysis of variance with unequal numbers of replicates."""
-    masses, number, number2, first, second, within = np.moveaxis(sums, -1, 0)
+    masses, number, number2, first, second, within = sums.T
     mean_within = ratio(within, number - masses)
     mean_between = ratio(second - ratio(first**2, number), masses - 1)
     mean_number = ratio(number - ratio(number2, number), masses - 1)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tactile_bayes.trial import lines
 from tactile_bayes.trial.accuracy import mape_figure, mape_ratios, share_interval
 from tactile_bayes.trial.figures import JACKKNIFE, Intervals, effective_number, interval_from_values, kurtosis_freedom
 from tactile_bayes.trial.method_comparison import compare_methods, limit_figures, limits, limits_unlinked
@@ -139,6 +140,14 @@ def test_slopes_hold_more_often_than_by_the_plain_jackknife() -> None:
     plain, corrected = slope_held("jackknife", 400), slope_held("corrected", 400)
     assert corrected > plain + 0.02
     assert corrected >= 0.92
+
+
+def test_each_line_is_fitted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Intercept, slope and both jackknifes, over patients and over masses, share the lines without one patient."""
+    fitted, fit = [], lines.weighted_deming
+    monkeypatch.setattr(lines, "weighted_deming", lambda x, y, **options: fitted.append(len(x)) or fit(x, y, **options))
+    compare_methods(trial(np.random.default_rng(1), np.arange(12)), intervals=JACKKNIFE)
+    assert fitted == [12, *[11] * 12]
 
 
 def test_ratios_are_over_common_masses_only() -> None:
