@@ -109,7 +109,10 @@ class LazyGroup(click.Group):
             import difflib
 
             near = difflib.get_close_matches(name, COMMANDS, n=1)
-            ctx.fail(f"No such command {name!r}." + (f" Did you mean {near[0]!r}?" if near else ""))
+            advice = f"; did you mean {near[0]}?" if near else ""
+            if not near and (os.path.exists(name) or "." in name):  # noqa: PTH110 (no pathlib is loaded here)
+                advice = "; the command stands first: `tactile-bayes show FILE` says what a file is"
+            ctx.fail(f"No such command {name!r}{advice}")
         return super().resolve_command(ctx, args)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
@@ -196,7 +199,8 @@ def _print_error(error: click.ClickException) -> None:
     path = "" if context is None else context.command_path
     if not path and isinstance(error, click.UsageError) and sys.argv[1:2] and sys.argv[1] in COMMANDS:
         path = f"tactile-bayes {sys.argv[1]}"  # the parser's own errors have no context
-    advice = f"; see `{path} --help`" if path else ""
+    joint = " See" if message.endswith("?") else "; see"
+    advice = f"{joint} `{path} --help`" if path else ""
     click.echo(f"error: {message}{advice}", err=True)
 
 

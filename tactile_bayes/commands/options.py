@@ -49,6 +49,8 @@ class FilePath(click.Path):
         """Record and return the path; refuse an output that another argument of the command reads or writes."""
         if self._addresses and "://" in str(value):
             return str(value)
+        if not value:
+            self.fail("the path is empty; give the name of a file or folder", param, ctx)
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
         if ctx is not None and param is not None:
             written = param.name in WRITTEN

@@ -79,7 +79,17 @@ def test_what_nohup_ignores_stays_ignored() -> None:
             "Invalid value for '--trials': '7' is not a whole number from 50 to 1000000; "
             "see `tactile-bayes plan --help`",
         ),
-        (("mapp",), "No such command 'mapp'. Did you mean 'map'?; see `tactile-bayes --help`"),
+        (
+            ("estimate", ""),
+            "Invalid value for 'MAP.nc...': the path is empty; give the name of a file or folder; "
+            "see `tactile-bayes estimate --help`",
+        ),
+        (("mapp",), "No such command 'mapp'; did you mean map? See `tactile-bayes --help`"),
+        (
+            ("exam.mcap",),
+            "No such command 'exam.mcap'; the command stands first: `tactile-bayes show FILE` says what a file is; "
+            "see `tactile-bayes --help`",
+        ),
     ],
 )
 def test_a_usage_error_is_one_line_without_the_usage(words: tuple[str, ...], said: str, tmp_path: Path) -> None:
