@@ -81,8 +81,8 @@ class Diagnosis(TextResult, eq=False):
 
     def __repr__(self) -> str:
         worst = max((one.get("rhat", np.nan) for one in self.quantities.values()), default=np.nan)
-        agree = f", R-hat up to {worst:.3f}" if self.chains > 1 else ""
-        return f"<Diagnosis of {self.path.name}: method {self.posterior.method}, {self.chains} chains{agree}>"
+        chains = f"{self.chains} chains, R-hat up to {worst:.3f}" if self.chains > 1 else "independent draws"
+        return f"<Diagnosis of {self.path.name}: method {self.posterior.method}, {chains}>"
 
 
 @door

@@ -281,6 +281,10 @@ class ArrangementCheck(Record, eq=False):
             lines += [f"not excluded: {CORRECTIONS[name]}" for name in self.not_shown]
         return lines
 
+    def __repr__(self) -> str:
+        against = finding_lines((*self.doubts, *self.findings), paper=True)
+        return f"<ArrangementCheck {' '.join([*against, self.words])}>"
+
 
 def odds_words(log_odds: float) -> str:
     """Odds as a number or a power of ten; above a million the figure has no meaning of its own."""
