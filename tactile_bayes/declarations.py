@@ -404,7 +404,8 @@ def _kind_words(kind: Any) -> str:
     if origin is str:
         return _text_words(rules)
     if origin is tuple and args[-1] is not Ellipsis:
-        return f"a list of {len(args)}"
+        items = " numbers" if {_bare(one) for one in args} <= {int, float} else ""
+        return f"a list of {len(args)}{items}"
     if origin in (list, tuple):
         least, most = rules.get("min_length"), rules.get("max_length")
         length = "" if least is None else f" of {least} or more" if most is None else f" of {least} to {most}"

@@ -24,8 +24,11 @@ if TYPE_CHECKING:
 _Given = ParamSpec("_Given")
 _Returned = TypeVar("_Returned")
 _SETTINGS_FILE: Final = re.compile(r" in --settings FILE\.toml|--settings FILE\.toml ")
-_OPTION: Final = re.compile(r"(?<![\w-])--([a-z]+(?:-[a-z]+)*)(?: (-?[\d.]+|[a-z]+\d*(?:-[a-z]+)*))?")
-_CHOICES: Final = ("method", "normalise", "fidelity", "noise", "background", "scene", "form", "fit", "to")
+_OPTION: Final = re.compile(r"(?<![\w-])--([a-z]+(?:-[a-z]+)*)(?: (-?[\d.]+|[a-z]+[A-Z]?[a-z]*\d*(?:-[a-z]+)*))?")
+_CHOICES: Final = (
+    *("method", "normalise", "fidelity", "noise", "background", "scene", "form", "fit", "to", "size_calibration"),
+    *("level", "unit", "units", "length_unit", "time_unit", "pose_layout"),
+)
 _FLAGS: Final = ("force", "same-mass", "register-strokes", "flat-field", "patient-id-from-scan", "invert-rotation")
 
 
@@ -45,12 +48,21 @@ def _keyword_for(match: re.Match[str]) -> str:
         return name
     if value.lstrip("-")[0] in "0123456789.":
         return f"{name}={value}"
-    chosen = name in (*_CHOICES, "size_calibration") and value not in ("or", "is")
+    chosen = name in _CHOICES and value not in ("or", "is", "out")
     return f'{name}="{value}"' if chosen else f"{name} {value}"
 
 
-def door(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
-    """Decorate a public function: its errors name keywords, or options where the command line calls it."""
+def door(function: Callable[_Given, _Returned], renamed: Sequence[tuple[str, str]] = ()) -> Callable[_Given, _Returned]:
+    """Decorate a public function: its errors name keywords, or options where the command line calls it.
+
+    `renamed`: options written as keywords, and the function's own words for them.
+    """
+
+    def in_keywords(text: str) -> str:
+        text = options_as_keywords(text)
+        for words, own in renamed:
+            text = text.replace(words, own)
+        return text
 
     @wraps(function)
     def called(*args: _Given.args, **keywords: _Given.kwargs) -> _Returned:
@@ -60,16 +72,16 @@ def door(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
             if BY_OPTIONS.get():
                 raise
             if isinstance(error, BadDataError):
-                error.what, error.way_out = options_as_keywords(error.what), options_as_keywords(error.way_out)
+                error.what, error.way_out = in_keywords(error.what), in_keywords(error.way_out)
             else:
-                error.args = (options_as_keywords(str(error)),)
+                error.args = (in_keywords(str(error)),)
             raise
 
     return called
 
 
 def takes(
-    *records: type[Record], without: Collection[str] = ()
+    *records: type[Record], without: Collection[str] = (), renamed: Sequence[tuple[str, str]] = ()
 ) -> Callable[[Callable[_Given, _Returned]], Callable[_Given, _Returned]]:
     """Decorate a public function as `door` does; its further keywords are the fields of these records.
 
@@ -80,7 +92,7 @@ def takes(
 
     def decorate(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
         parameters = [one for one in inspect.signature(function).parameters.values() if one.kind is not one.VAR_KEYWORD]
-        names, call = [*(one.name for one in parameters), *fields], door(function)
+        names, call = [*(one.name for one in parameters), *fields], door(function, renamed)
 
         @wraps(function)
         def called(*args: _Given.args, **keywords: _Given.kwargs) -> _Returned:
@@ -145,13 +157,15 @@ def path_of(path: PathLike | None) -> Path | None:
         return None
     if not isinstance(path, str | os.PathLike):
         raise UsageError(f"a path is wanted, not {type(path).__name__}; give it as text or pathlib.Path")
+    if not os.fspath(path):
+        raise UsageError("the path is empty; give the name of a file or folder")
     return Path(path).expanduser()
 
 
 def required_path(path: PathLike, name: str) -> Path:
     """Convert to the path of an input, which may not be None."""
     if path is None:
-        raise UsageError(f"{name} is None; give the path of a file")
+        raise UsageError(f"{name} is None; give a path")
     return path_of(path)
 
 

@@ -21,7 +21,7 @@ from tactile_bayes.api.arguments import (
     required_path,
     takes,
 )
-from tactile_bayes.declarations import EXACT, Record, as_dict, replace, to_plain
+from tactile_bayes.declarations import EXACT, Record, as_dict, from_plain, replace, to_plain
 from tactile_bayes.errors import UsageError, check_choice, check_number
 from tactile_bayes.files import imports, scan_mcap
 from tactile_bayes.files.arrays_layout import ArrayMap, GridOptions, Stated
@@ -312,14 +312,36 @@ def map_of(given: Any, **stated: Any) -> Map:
     options = GridOptions(**keywords)
     if path is not None:
         return Map(import_grid(path, options)[0])
+    _refuse_turned(given)
     values = given.filled(np.nan) if isinstance(given, np.ma.MaskedArray) else np.asarray(given)
     return Map(grid_map(Grid({"mean": values}), options)[0])
+
+
+def _refuse_turned(given: Any) -> None:
+    """Refuse values of pandas or xarray whose own places say that they are turned or mirrored."""
+    names = tuple(map(str, getattr(given, "dims", ())))
+    if names == ("x", "y"):
+        raise UsageError("the values are (x, y) by their dims; give (y, x): values.transpose('y', 'x')")
+    axes = [given.index, given.columns] if hasattr(given, "iloc") else [given[name] for name in names]
+    for axis, places in zip(("rows", "columns"), map(np.asarray, axes), strict=False):
+        if places.dtype.kind in "iuf" and (np.diff(places) < 0).any():
+            first, last = places[0], places[-1]
+            raise UsageError(f"the {axis}' own places go from {first:g} to {last:g}; give the lowest first")
 
 
 # --- A scan of arrays that Python holds, as `import` makes one of a file.
 
 
-@takes(Stated)
+_OWN_WORDS = (
+    ("head_geometry HEAD.json", "head"),
+    ("array_calibration CAL.json", "calibration"),
+    ("poses FILE", "poses"),
+    ("landmarks FILE", "landmarks"),
+    ("frame_shape ROWS COLUMNS", "frame_shape=(rows, columns)"),
+)
+
+
+@takes(Stated, renamed=_OWN_WORDS)
 def scan(
     frames: Any,
     time: Any = None,
@@ -374,7 +396,10 @@ def scan(
     for name in corrections:
         check_choice("a correction", name, CORRECTIONS)
     columns = {} if columns is None else columns
-    named = ArrayMap(**columns) if isinstance(columns, Mapping) else read_array_map(path_of(columns))
+    if isinstance(columns, Mapping):
+        named = from_plain(ArrayMap, dict(columns), where="columns")
+    else:
+        named = read_array_map(path_of(columns))
     layout = replace(named, **{name: plain(value) for name, value in stated.items() if value is not None})
     others = [_poses(poses, layout), _head(head), _calibration(calibration), _landmarks(landmarks)]
     if isinstance(frames, str | Path):

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, replace
+from tactile_bayes.declarations import Record, replace, set_fields
 from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, UsageError
 from tactile_bayes.files.reports import EstimateReport, MassReport, Place, Point, PooledReport, centre_of
 from tactile_bayes.findings import capitalised
@@ -68,11 +68,12 @@ class PageLabels(Record):
             if not value.isprintable() or len(value) > longest:
                 fault = f"{option} is of {len(value)} letters or not printable"
                 raise UsageError(f"{fault}; give up to {longest} letters")
-        day, is_date = str(self.day), False
+        day, is_date = str(self.day or ""), False
         with suppress(ValueError):
             is_date = bool(_DATE.fullmatch(day) and date.fromisoformat(day))
-        if self.day and not is_date:
+        if day and not is_date:
             raise UsageError(f"date {day[:40]!r} is no date; give it as YEAR-MONTH-DAY, such as 2026-03-01")
+        set_fields(self, day=day)
 
 
 class ShownExam(Record, eq=False):

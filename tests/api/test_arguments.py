@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -110,7 +111,8 @@ CALLS: dict[str, tuple[Callable[..., Any], str]] = {
         lambda one: tb.exam_report([one, one], "x.html"),
         "a map is given twice; give each map once",
     ),
-    "a page without its path": (lambda one: one.report(None), "the path is None; give the path"),
+    "a path of no letters": (lambda one: one.save(""), "the path is empty; give the name of a file"),
+    "a page without its path": (lambda one: one.report(None), "the path is None; give a path"),
     "an exam's page without its path": (lambda one: tb.exam_report(one, None), "the path is None"),  # type: ignore[arg-type]
     "no number of patients": (lambda _: tb.plan(patients=[]), "patients is empty; give at least one"),
     "an estimate to pool": (lambda one: tb.pool(one), "pool takes several maps; give a list"),
@@ -137,7 +139,7 @@ CALLS: dict[str, tuple[Callable[..., Any], str]] = {
     "nothing to export": (lambda _: tb.export(None, "x.json", to="fhir"), "files is None; give a list"),
     "an ID of no text": (lambda one: tb.export(one, "x.json", to="fhir", patient_id=3), "patient_id is 3"),  # type: ignore[arg-type]
     "an exam of no date": (lambda one: tb.export(one, "x", to="dicom"), "give study_date YYYY-MM-DD"),
-    "no trial": (lambda _: tb.validate(None, None), "trial is None; give the path"),  # type: ignore[arg-type]
+    "no trial": (lambda _: tb.validate(None, None), "trial is None; give a path"),  # type: ignore[arg-type]
     "resamples as text": (lambda _: tb.validate(TRIAL, EXCISION, resamples="500"), "resamples is '500'"),
     "an interval of no kind": (lambda _: tb.validate(TRIAL, EXCISION, intervals="exact"), "give one of corrected"),
     "an error ratio below 0": (lambda _: tb.validate(TRIAL, EXCISION, error_ratio=-1), "error_ratio is -1"),
@@ -191,12 +193,29 @@ def test_a_keyword_that_is_none_is_answered_with_the_one_meant(call: Callable[[]
         ("x exists; choose another name or give --force", "x exists; choose another name or give force=True"),
         ("leave --head out, or choose another --fidelity", "leave head out, or choose another fidelity"),
         ("try --method ensemble", 'try method="ensemble"'),
+        ("give their unit: --unit kPa", 'give their unit: unit="kPa"'),
+        ("leave it or --unit out", "leave it or unit out"),
         ("a larger max_steps in --settings FILE.toml", "a larger max_steps"),
         ("make it again: `tactile-bayes estimate m.nc --json`", "make it again: `tactile-bayes estimate m.nc --json`"),
     ],
 )
 def test_options_become_keywords_and_commands_stay(told: str, wanted: str) -> None:
     assert options_as_keywords(told) == wanted
+
+
+def test_a_scan_that_lacks_something_is_told_its_own_keywords() -> None:
+    frames = np.ones((2, 3, 3))
+    lacking = tb.errors.BadDataError
+    with pytest.raises(lacking, match="or give poses, head, unit or calibration, rate_hz; "):
+        tb.scan(frames)
+    with pytest.raises(lacking, match=r"columns\.raet_hz is not known; did you mean rate_hz"):
+        tb.scan(frames, columns={"raet_hz": 9})
+
+
+def test_a_day_may_be_a_date(found: tb.SizeEstimate, tmp_path: Path) -> None:
+    found.report(tmp_path / "day.html", day=date(2026, 3, 1))  # type: ignore[arg-type]
+    found.report(tmp_path / "text.html", day="2026-03-01")
+    assert (tmp_path / "day.html").read_bytes() == (tmp_path / "text.html").read_bytes()
 
 
 def test_numbers_of_numpy_are_taken_as_numbers(made: tb.Map) -> None:
@@ -206,7 +225,8 @@ def test_numbers_of_numpy_are_taken_as_numbers(made: tb.Map) -> None:
     scan, window = tb.demo_scan(), (np.float32(5.0), np.float64(14.0))
     by_window = [tb.build_map(scan, pressure_window_kpa=one).tactile_map for one in (window, np.array(window))]  # type: ignore[arg-type]
     assert {one.fingerprint for one in by_window} == {made.tactile_map.fingerprint}
-    assert tb.check(scan, pressure_window_kpa=window).words == tb.check(scan).words  # type: ignore[arg-type]
+    checks = tb.check(scan, pressure_window_kpa=window), tb.check(scan)  # type: ignore[arg-type]
+    assert {repr(one) for one in checks} == {f"<ArrangementCheck {checks[0].words}>"}
     assert tb.estimate(made, centre_mm=np.zeros(2), **FAST).settings.centre_mm == (0.0, 0.0)
 
 

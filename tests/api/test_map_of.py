@@ -84,6 +84,23 @@ def test_impossible_values_are_refused_in_the_words_of_python(
         tb.map_of(given, **stated)
 
 
+def test_values_that_say_that_they_are_mirrored_or_turned_are_refused() -> None:
+    """Left and right would be exchanged without a word."""
+    with warnings.catch_warnings(action="ignore"):
+        import pandas as pd
+        import xarray as xr
+    held, x, y = values(), np.arange(45.0), np.arange(41.0)
+    placed = xr.DataArray(held, {"y": y, "x": x}, ("y", "x"))
+    for given, words in (
+        (placed.isel(x=slice(None, None, -1)), "the columns' own places go from 44 to 0; give the lowest first"),
+        (pd.DataFrame(held, index=y[::-1]), "the rows' own places go from 40 to 0"),
+        (placed.transpose("x", "y"), r"the values are \(x, y\) by their dims; give \(y, x\)"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            tb.map_of(given, spacing_mm=1, normalise="gain")
+    assert tb.map_of(placed, spacing_mm=1, normalise="gain").x_mm.size == 45
+
+
 def test_the_path_of_a_grid_says_what_it_lacks(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "a.csv", values(), delimiter=",")
     with pytest.raises(UsageError, match="a grid needs spacing_mm"):
