@@ -81,7 +81,7 @@ class Diagnosis(TextResult, eq=False):
 
     def __repr__(self) -> str:
         worst = max((one.get("rhat", np.nan) for one in self.quantities.values()), default=np.nan)
-        chains = f"{self.chains} chains, R-hat up to {worst:.3f}" if self.chains > 1 else "independent draws"
+        chains = f"{self.chains} chains, R-hat up to {worst:.3f}" if self.chains > 1 else "1 chain"
         return f"<Diagnosis of {self.path.name}: method {self.posterior.method}, {chains}>"
 
 
