@@ -10,6 +10,8 @@ from typing import Any
 
 import click
 
+from tactile_bayes.errors import number_words
+
 ROOT = Path(__file__).resolve().parent.parent
 COMMANDS_PAGE = ROOT / "docs" / "commands.md"
 SCHEMAS_PAGE = ROOT / "docs" / "columns-and-keys.md"
@@ -69,8 +71,14 @@ def _row(option: click.Option) -> str:
 def _value(option: click.Option, facts: dict[str, Any]) -> str:
     if facts["is_flag"] or facts["count"]:
         return ""
-    choices = facts["type"].get("choices")
-    text = option.metavar or (" or ".join(map(str, choices)) if choices else facts["type"]["name"].upper())
+    kind = option.type
+    text = option.metavar
+    if not text and isinstance(kind, click.Choice):
+        text = " or ".join(map(str, kind.choices))
+    elif not text and isinstance(kind, click.FloatRange | click.IntRange):
+        open_ends = [end for end in ("min", "max") if getattr(kind, f"{end}_open")]
+        text = number_words(kind.min, kind.max, open_ends, whole=isinstance(kind, click.IntRange)).removeprefix("a ")
+    text = text or facts["type"]["name"].upper()
     return f"{text}, repeatable" if facts["multiple"] else text
 
 

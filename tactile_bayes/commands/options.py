@@ -129,7 +129,7 @@ def head_option(default: str) -> Callable[[Callable[..., Any]], Callable[..., An
     return click.option(
         "--head",
         type=click.Choice(HEADS),
-        help="Where the head's rounded shoulders lie: cut into the sensing width, or around it, where they press and "
+        help="Place of the head's rounded shoulders: cut into the sensing width, or around it, where they press and "
         f"sense nothing. {default}",
     )
 
@@ -165,6 +165,8 @@ Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 class FiniteRange(click.FloatRange):
     """A finite number in a range; nan and infinity are refused."""
 
+    name = "number"
+
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         with contextlib.suppress(click.BadParameter):
             number = super().convert(value, param, ctx)
@@ -185,6 +187,8 @@ class FiniteRange(click.FloatRange):
 
 class WholeRange(click.IntRange):
     """A whole number in a range."""
+
+    name = "number"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         with contextlib.suppress(click.BadParameter):
