@@ -313,7 +313,7 @@ class IdentityOptions(Options):
     patient_name: Annotated[PersonName, "Patient's name: FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX."] = ""
     birth_date: Annotated[str, cli_meta("YYYY-MM-DD", max_length=10), "Patient's date of birth: YYYY-MM-DD."] = ""
     sex: Annotated[Literal["F", "M", "O", ""], cli_meta("F|M|O"), "Patient's sex: F, M or O."] = ""
-    issuer: Annotated[str, cli_meta("NAME", max_length=64), "Who issued the patient ID."] = ""
+    issuer: Annotated[str, cli_meta("NAME", max_length=64), "Issuer of the patient ID."] = ""
     accession: Annotated[str, cli_meta("NUMBER", max_length=16), "Accession number."] = ""
     referring_physician: Annotated[PersonName, "Referring physician's name, likewise."] = ""
     study_id: Annotated[str, cli_meta("ID", max_length=16), "Study ID."] = ""
@@ -374,8 +374,8 @@ class RecordOptions(Options, kw_only=True):
     side: Annotated[Literal["left", "right", "phantom"] | None, "Breast that is scanned."] = None
     posture: Annotated[Literal["supine", "oblique", "sitting", "phantom"] | None, "Posture during the scan."] = None
     lubricant: Annotated[str | None, cli_meta("TEXT"), "Lubricant on the skin."] = None
-    examiner: Annotated[str | None, cli_meta("CODE"), "A code, not a name."] = None
-    subject: Annotated[str | None, cli_meta("CODE"), "A code, not a name."] = None
+    examiner: Annotated[str | None, cli_meta("CODE"), "Code of the examiner, not a name."] = None
+    subject: Annotated[str | None, cli_meta("CODE"), "Code of the patient, not a name."] = None
     session_file: Annotated[
         Path | None,
         cli_meta("SESSION.toml", option="session"),
@@ -445,7 +445,9 @@ class StudyOptions(CaseOptions, kw_only=True):
     ] = "plane-strain"
     grid: Annotated[str, cli_meta("paper|FILE"), "The paper's 150 cases, or a table of cases."] = "paper"
     seat: Annotated[
-        str, cli_meta("centred|resting|0..2"), "How far the lump stands out of the gland, if a grid does not state it."
+        str,
+        cli_meta("centred|resting|0..2"),
+        "Seat of the lump, if a grid does not state it: 0 centred on the gland's surface, 1 resting on it.",
     ] = "centred"
     head: Literal["shoulders-inside", "shoulders-outside"] | None = None
     background: Annotated[

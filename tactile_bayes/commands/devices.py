@@ -92,7 +92,7 @@ def emulate_command() -> None:
     help=f"Protocol of the tracker to rotate: {', '.join(PROTOCOLS)}.",
 )
 @record_options(RecordOptions, "tool")
-@number_option("--duration", FiniteRange(min=0.2), 10.0, "How long to rotate it, s.", metavar="S")
+@number_option("--duration", FiniteRange(min=0.2), 10.0, "Time to rotate it, s.", metavar="S")
 def devices_command() -> None:
     """List the serial ports and the devices that are probably on them.
 

@@ -48,7 +48,7 @@ def demo_command() -> None:
     "--as",
     "kind",
     type=click.Choice(["scan", "map"]),
-    help="What SRC holds. Default: as the output's suffix says; a table or image without a scan's options is a map.",
+    help="Kind of SRC. Default: as the output's suffix says; a table or image without a scan's options is a map.",
 )
 @record_options(GridOptions)
 @click.option(

@@ -247,7 +247,11 @@ def study_command() -> None:
 
 
 @options.command("tables", "study.tables_action")
-@options.record_options(declared.StudyOptions, "seat", help="How far the lump stands out of the gland.")
+@options.record_options(
+    declared.StudyOptions,
+    "seat",
+    help="Seat of the lump: 0 centred on the gland's surface, 1 resting on it.",
+)
 @options.record_options(declared.SectionOptions)
 @options.head_option("Default: shoulders-inside.")
 @click.option("--heads", "search", is_flag=True, help="Compute the tables for many heads, and name the nearest one.")

@@ -80,7 +80,7 @@ class Stated(Options, kw_only=True):
     ] = None
     frame_order: Annotated[
         Literal["rows", "columns"] | None,
-        "Scan: whether such a row runs along the array's rows or columns. Default: rows.",
+        "Scan: order of the numbers in such a row: along the array's rows, or its columns. Default: rows.",
     ] = None
     skip_columns: Annotated[
         Annotated[int, Meta(ge=0)] | None,
@@ -112,7 +112,9 @@ class Stated(Options, kw_only=True):
     pose_good: Annotated[
         str | None, "Scan: value of the poses' status where the tool is seen. Default: OK, Enabled and the like."
     ] = None
-    tool: Annotated[str | None, cli_meta("NAME"), "Scan: which tool or station of the poses' file."] = None
+    tool: Annotated[
+        str | None, cli_meta("NAME"), "Scan: tool or station of the poses' file to take, where it has several."
+    ] = None
 
     @property
     def given(self) -> dict[str, Any]:
@@ -143,7 +145,7 @@ class GridOptions(Options, kw_only=True):
         cli_meta("H"),
         "Map: average finer cells into cells of up to this side. Default: 1 where they are finer than 0.5.",
     ] = None
-    normalise: Annotated[Normalise, "Map: how the values are already normalised."] = "none"
+    normalise: Annotated[Normalise, "Map: normalisation of the values in SRC."] = "none"
     level: Annotated[
         Positive | Literal["fit"] | None,
         cli_meta("L|fit"),
@@ -157,7 +159,7 @@ class GridOptions(Options, kw_only=True):
         cli_meta("V"),
         "Map: a number or text that stands for no value, such as -9999; none: every number is a value.",
     ] = ()
-    array: Annotated[str | None, cli_meta("NAME"), "Map: which array of SRC, where it holds several."] = None
+    array: Annotated[str | None, cli_meta("NAME"), "Map: array of SRC to take, where it holds several."] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -59,7 +59,7 @@ class ColumnMap(Record):
     unit: Unit = "mm"  #: Of all sizes, unless a reading says otherwise.
     not_detected: tuple[str, ...] = ()  #: Words that the table writes for a mass looked for and not found.
     not_done: tuple[str, ...] = ()  #: Words for a mass not looked for; a blank is one already.
-    synthetic: bool | None = None  #: Whether all readings were made by a generator.
+    synthetic: bool | None = None  #: True where all readings were made by a generator.
     reading: Annotated[tuple[ReadingColumns, ...], Meta(min_length=1)] | None = None
     """One for each modality and replicate of a wide table of readings."""
     excision: ExcisionColumns | None = None

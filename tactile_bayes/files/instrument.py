@@ -69,7 +69,7 @@ class HeadFile(Record, kw_only=True):
     rim_mm: Rounding | None = None
     """Radius of the rounded edge around the taxels, which presses but senses nothing, mm; for `population`. Default: 3,
     or 0 with shoulder_mm."""
-    checked_on: date | None = None  #: When `check` found it right on a scan.
+    checked_on: date | None = None  #: Day on which `check` found it right on a scan.
     scanhead_from_tracker: tuple[Row, Row, Row, Row] | None = None
     """(4, 4) transform from the tracker's sensor to the head; `record` needs it."""
 

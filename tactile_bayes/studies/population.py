@@ -68,7 +68,7 @@ class BodyPrior(_Ranges):
     depth_ratio: tuple[DepthRatio, DepthRatio] = (0.56, 1.8)  #: Depth of its centre over its diameter.
     stiffness_ratio: tuple[Ratio, Ratio] = (6.0, 100.0)  #: Its modulus over that of fat.
     seat: tuple[Seat, Seat] = (0.0, 1.2)
-    """How far it stands out of the gland: 0 centred on the gland's surface, 1 touching it from above."""
+    """Range of its seat: 0 centred on the gland's surface, 1 touching it from above."""
     fat_kpa: tuple[Modulus, Modulus] = (3.5, 7.5)  #: Young's modulus of fat, kPa.
     gland_ratio: tuple[Ratio, Ratio] = (5.0, 16.0)  #: Modulus of gland over that of fat.
     thickness_mm: tuple[Thickness, Thickness] = (40.0, 90.0)
