@@ -72,7 +72,13 @@ class Diagnosis(TextResult, eq=False):
 
     @door
     def plot(self, kind: str = "trace", path: PathLike | None = None, *, force: bool = False) -> Figure:
-        """Draw the ``"trace"`` of the draws, their ``"rank"`` among all chains or the ``"corner"`` of all pairs."""
+        """Draw the ``"trace"`` of the draws, their ``"rank"`` among all chains or the ``"corner"`` of all pairs.
+
+        Raises
+        ------
+        UsageError
+            When the kind is none of these, ranks are of one chain, or the file exists and `force` is false.
+        """
         check_choice("kind", kind, tuple(_FIGURES))
         if kind == "rank" and self.chains < 2:
             raise UsageError(f"--rank compares chains and {self.path} has one; estimate with --method ensemble")

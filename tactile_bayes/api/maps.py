@@ -209,6 +209,13 @@ def check(scan: Any, *, pressure_window_kpa: tuple[float, float] = PRESSURE_WIND
     -------
     ArrangementCheck
         `words` says what its frames agree with, `lines()` in full; `too_short` where they are too few.
+
+    Raises
+    ------
+    BadDataError
+        When the file is no scan, or no frame is left.
+    UsageError
+        When it is no scan, or the window is wrong.
     """
     window = MapOptions(pressure_window_kpa=plain(pressure_window_kpa)).pressure_window_kpa
     return check_scan(as_scan(scan), pressure_window_kpa=window)
@@ -246,6 +253,13 @@ def simulate(
     -------
     SimulatedScan
         `scan`, and `truth` as plain data.
+
+    Raises
+    ------
+    BadDataError
+        Naming the key of the scene, its value and the way out.
+    UsageError
+        When the scene is neither, or the seed is wrong.
     """
     from tactile_bayes.forward.simulate import simulate as run
 
@@ -276,8 +290,9 @@ def map_of(given: Any, **stated: Any) -> Map:
     Parameters
     ----------
     given
-        (ny, nx) values, the lowest y and x first, NaN where there is none; or the path of a file that `tactile-bayes
-        import` takes as a map. Without `stated` also a map as it is: a `Map`, a `TactileMap`, or the path of a map.
+        (ny, nx) values, the lowest y and x first, NaN where there is none, also of pandas or xarray; or the path of a
+        file that `tactile-bayes import` takes as a map. Without `stated` also a map as it is: a `Map`, a `TactileMap`,
+        or the path of a map.
     **stated
         As of `tactile_bayes.files.arrays_layout.GridOptions`: spacing_mm, normalise, level, units, no_value, array.
 
@@ -291,7 +306,7 @@ def map_of(given: Any, **stated: Any) -> Map:
     BadDataError
         When values are wrong: numbers that stand for no value, another level than stated, a damaged file.
     UsageError
-        When it is none of these, or an argument is wrong.
+        When it is none of these, its own places are mirrored or turned, or an argument is wrong.
     """
     if isinstance(given, Map | TactileMap):
         if stated:
