@@ -28,6 +28,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import date
 from functools import cache
 from pathlib import Path
+from threading import RLock
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar, get_args, get_origin
 
 import msgspec
@@ -39,6 +40,7 @@ from msgspec import field as field
 from tactile_bayes.errors import BadDataError, UsageError, number_words, suggestion
 
 T = TypeVar("T")
+_CONVERSION: Final = RLock()
 EXACT: Final = 17  #: Significant digits that give a float back as it was.
 MOST_SHOWN: Final = 100  #: A record's repr shows values of up to so many characters, and the type of longer ones.
 
@@ -184,9 +186,15 @@ def from_plain(kind: type[T], document: object, *, where: str = "") -> T:
 def _converted(kind: type[T], document: object) -> T:
     """A record of plain data, in which 200.0 is a whole number, as it is to a schema."""
     try:
-        return msgspec.convert(document, kind, dec_hook=_decode_value)
+        return _convert(kind, document)
     except msgspec.ValidationError:
-        return msgspec.convert(_map_values(document, _whole), kind, dec_hook=_decode_value)
+        return _convert(kind, _map_values(document, _whole))
+
+
+def _convert(kind: type[T], document: object) -> T:
+    """A record of plain data, in one thread at a time: two that use a record type first at once end the process."""
+    with _CONVERSION:
+        return msgspec.convert(document, kind, dec_hook=_decode_value)
 
 
 def _whole(value: object) -> object:
@@ -290,7 +298,7 @@ def _rule_text(where: str, what: str, record: Any) -> str:
 def _refusal(kind: Any, value: Any, *, exact: bool = False) -> Exception | None:
     """The error that a kind raises on a value, or None; with `exact` 3.0 is no whole number."""
     try:
-        msgspec.convert(value, kind, dec_hook=_decode_value) if exact else _converted(kind, value)
+        _convert(kind, value) if exact else _converted(kind, value)
     except msgspec.ValidationError as error:
         return error.__cause__ if isinstance(error.__cause__, BadDataError) else error
     return None if _finite(value) else ValueError("no finite number")

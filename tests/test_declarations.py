@@ -278,3 +278,39 @@ def test_a_toml_file_is_read_as_one_of_json(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text('schema = "tactile-bayes/test-scene/1"\nname = "one"\nside = "left"\nweights = [1, 2.5]\n')
     assert to_plain(read_toml_record(path, Scene, way_out="see the schema")) == to_plain(from_plain(Scene, GOOD))
+
+
+FIRST_USE = """
+import sys, threading, types
+from tactile_bayes.declarations import from_plain
+SOURCE = '''
+from __future__ import annotations
+from typing import Annotated, Literal
+from tactile_bayes.declarations import Meta, Record
+class Part(Record):
+    size: Annotated[float, Meta(ge=0)] | None = None
+    word: Literal["x", "y"] | None = None
+class Whole(Record):
+    part: Part
+    parts: tuple[Part, ...] = ()
+    named: Annotated[dict[str, Part], Meta(description="x")] | None = None
+'''
+sys.setswitchinterval(1e-6)
+made = []
+for number in range(20):
+    module = sys.modules[f"m{number}"] = types.ModuleType(f"m{number}")
+    exec(SOURCE, module.__dict__)
+    start = threading.Barrier(6)
+    def use():
+        start.wait()
+        made.append(from_plain(module.Whole, {"part": {"size": 1.0}, "named": {"a": {"word": "x"}}}))
+    threads = [threading.Thread(target=use) for _ in range(6)]
+    [one.start() for one in threads], [one.join() for one in threads]
+print(len(made))
+"""
+
+
+def test_threads_may_use_a_record_type_first_at_once(run_python: Any) -> None:
+    """The process ended with a segmentation fault: four threads that estimated at once, in a fresh notebook."""
+    done = run_python("-c", FIRST_USE)
+    assert (done.returncode, done.stdout) == (0, "120\n"), done.stderr[-300:]
