@@ -8,6 +8,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
+from threading import get_ident
 from typing import Any, Final
 
 import h5py
@@ -80,7 +81,8 @@ def grouped_netcdf_bytes(groups: Mapping[str, Contents]) -> bytes:
     """A netCDF-4 file of several groups by name, each with its own dimensions; ``/`` is the root.
 
     Equal contents give equal bytes under one version of HDF5 and zlib."""
-    with h5py.File("memory", "w", driver="core", backing_store=False, track_order=True) as file:
+    name = f"memory {get_ident()}"  # HDF5 knows its open files by name, and another thread may be writing
+    with h5py.File(name, "w", driver="core", backing_store=False, track_order=True) as file:
         written = 0
         for group, contents in groups.items():
             place = file if group == "/" else file.create_group(group, track_order=True)

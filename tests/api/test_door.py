@@ -6,7 +6,9 @@ import copy
 import inspect
 import json
 import pickle
+import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -155,6 +157,20 @@ def test_a_result_can_be_copied_pickled_and_made_in_a_thread(found: tb.SizeEstim
     thread.join()
     for one in (made[0], copy.deepcopy(found), pickle.loads(pickle.dumps(found))):
         assert repr(one) == repr(found)
+
+
+def test_threads_may_save_at_once(tmp_path: Path) -> None:
+    """The second was told that the file it named, another's, is open."""
+    made = tb.map_of(np.random.default_rng(1).normal(1, 0.1, (60, 60)), spacing_mm=1, normalise="gain")
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as threads:
+            list(threads.map(lambda number: made.save(tmp_path / f"{number}.nc"), range(4)))
+    finally:
+        sys.setswitchinterval(before)
+    assert len({path.read_bytes() for path in tmp_path.iterdir()}) == 1
+    assert len(list(tmp_path.iterdir())) == 4
 
 
 def test_maps_are_pooled_as_on_the_command_line(folder: Path) -> None:
