@@ -154,7 +154,8 @@ def _coloured(values: FloatArray, limits: tuple[float, float]) -> NDArray[np.uin
     """(n, m, 3) colours of values; cells without data are grey."""
     low, high = limits
     covered, colours = np.isfinite(values), np.array(VIRIDIS, dtype=float)
-    position = np.clip((np.where(covered, values, low) - low) / (high - low), 0.0, 1.0) * (len(colours) - 1)
+    share = np.clip((np.where(covered, values, low) - low) / (high - low), 0.0, 1.0)
+    position = np.rint(share * _COLOUR_STEPS) / _COLOUR_STEPS * (len(colours) - 1)
     mixed = np.stack([np.interp(position, np.arange(len(colours)), colours[:, i]) for i in range(3)], axis=-1)
     return np.where(covered[..., None], np.rint(mixed), np.array(_NO_DATA)).astype(np.uint8)
 
@@ -189,6 +190,7 @@ _POINTS: Final = 73
 _SCALE_BARS_MM: Final = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0)
 _BAR_MM: Final = 40.0
 _BAR_STEPS: Final = 40
+_COLOUR_STEPS: Final = 3 * (_BAR_STEPS - 1)  #: With grey and white few enough that a PNG's palette has each as it is.
 _BARBS: Final = ((0.87, 0.5), (0.87, -0.5))
 
 

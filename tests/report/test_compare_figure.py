@@ -24,6 +24,7 @@ from tactile_bayes.mapping.map import MapRecipe
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import Visit
 from tactile_bayes.report.growth_page import Course, DrawnMap, draw_comparison, growth_page
+from tactile_bayes.report.svg import picture_of
 from tactile_bayes.size.visits import VisitComparison
 
 PLACE = np.array([60.0, 90.0])
@@ -211,7 +212,17 @@ def test_one_value_has_one_colour_at_all_visits_of_the_page() -> None:
         for data in re.findall(r'<image [^>]*base64,([^"]*)"', page)
     ]
     first, second = (one[20, 20] for one in pixels)
-    assert first == pytest.approx(second, abs=3)
+    assert first.tolist() == second.tolist()
+
+
+def test_one_cell_without_readings_is_grey_whatever_the_others_are() -> None:
+    """A palette of the most frequent colours gave it that of the highest value."""
+    values = np.random.default_rng(1).normal(1.0, 0.1, (60, 60))
+    values[7, 50] = np.nan
+    data = re.findall(r'base64,([^"]*)"', picture_of(values, (0.9, 1.3), (60.0, 60.0)))[0]
+    pixels = np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"))[::4, ::4]
+    grey = (pixels == 222).all(axis=-1)
+    assert np.argwhere(grey).tolist() == [[7, 50]]
 
 
 def test_grids_lie_as_their_files_read_and_scans_without_landmarks_as_every_picture_of_them() -> None:
