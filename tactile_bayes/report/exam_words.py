@@ -23,6 +23,7 @@ from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.report.estimate_document import from_xiphoid, other_masses, patient_mm, share_words, size_words
 from tactile_bayes.report.estimate_text import shape_text, smallest_text
 from tactile_bayes.report.map import ellipse_of
+from tactile_bayes.report.pages import cut
 from tactile_bayes.size.pooling import DISAGREE
 
 _LONGEST: Final = {"title": 60, "name": 50}
@@ -382,6 +383,6 @@ def facts(exam: ShownExam) -> Iterator[tuple[str, str]]:
         values = list(dict.fromkeys(scan[key] for scan in exam.scans if scan.get(key)))
         if values:
             more = f" and {len(values) - 2} more" if len(values) > 2 else ""
-            yield key.capitalize(), ", ".join(value[:24] for value in values[:2]) + more
+            yield key.capitalize(), ", ".join(cut(value, 32) for value in values[:2]) + more
     if exam.labels.day:
         yield "Date", exam.labels.day

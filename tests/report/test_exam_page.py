@@ -384,6 +384,13 @@ def test_a_nipple_off_the_map_is_pointed_to() -> None:
     assert page.named("path", **{"class": "nipple"}) == []
 
 
+def test_codes_stand_on_the_page_to_their_last_letter() -> None:
+    subject, mass = (f"{name}{'0' * 29}7" for name in ("P1", "M1"))
+    page = Page(exam_page(exam(({"subject": subject, "mass": mass}, {"subject": subject, "mass": f"{mass[:-1]}8"}))))
+    for text in (subject, f"{mass}, {mass[:-1]}8"):
+        assert text in page.words
+
+
 def test_the_age_of_the_array_calibration_is_reported() -> None:
     aged = ({**SCANS[0], "array_calibration_days": "12"},)
     assert "12 days old at the exam" in Page(exam_page(exam(aged))).words
