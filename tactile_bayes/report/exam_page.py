@@ -40,7 +40,7 @@ def exam_page(exam: ShownExam) -> str:
     masses = sorted(exam.main.masses, key=lambda one: one.number)
     made = f"method {report.origin.settings.get('method', 'unknown')}"
     shown = exam.maps[:MOST_REPEATS] if several else ()
-    alone = ["no size" if (q := one.report.max_size_mm) is None else size_words(q) for one in shown]
+    alone = ["no size" if (q := one.report.leading.max_size_mm) is None else size_words(q) for one in shown]
     return page(
         "exam",
         title=cut(exam.labels.title, 60) or TITLE,

@@ -234,8 +234,8 @@ def nothing_sentences(exam: ShownExam) -> Iterator[str]:
     """Reason for no size, lumps that the map could have missed, and the remedy."""
     if exam.disagrees:
         yield "No common size is given: look at each map."
-        for number, one in enumerate(() if exam.pooled is None else exam.pooled.maps, start=1):
-            size = one.max_size_mm
+        for number, one in enumerate(exam.maps, start=1):
+            size = one.report.leading.max_size_mm
             if size is not None:
                 ends = f"{share_words(size)}: {size.low:.1f} to {size.high:.1f} mm"
                 yield f"By map {number} alone the largest diameter is about {size.median:.1f} mm ({ends})."

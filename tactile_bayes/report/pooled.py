@@ -198,7 +198,8 @@ def pooled_summary(report: PooledReport) -> str:
     if sizes:
         words = ", ".join(_size_words(one, with_ends=report.status == DISAGREE) for one in sizes[:MOST_NAMED])
         more = f" and {len(sizes) - MOST_NAMED} more" if len(sizes) > MOST_NAMED else ""
-        lines.append(f"A lump was found on {len(sizes)} of {len(report.maps)} maps, alone sized at {words}{more} mm.")
+        found = f"A lump was found on {len(sizes)} of {len(report.maps)} maps"
+        lines.append(f"{found}, alone sized at {words}{more} mm{_alike(report) if report.status == DISAGREE else ''}.")
     lines += finding_summary(findings, "check", most=2)
     if largest is None:
         lines.append(_no_size_line(report))
@@ -222,6 +223,12 @@ def _size_words(size: Interval, *, with_ends: bool) -> str:
     return f"{size.median:.1f}" + (f" ({size.low:.1f} to {size.high:.1f})" if with_ends else "")
 
 
+def _alike(report: PooledReport) -> str:
+    """What the intervals of single maps suppose, where no spread between exams was stated."""
+    stated = report.site_words or report.provenance["settings"].get("between_map_sd") is not None
+    return "" if stated else ", if exams repeat as simulated ones do"
+
+
 def _no_size_line(report: PooledReport) -> str:
     head = "No common size" if report.status == DISAGREE else "No estimate"
     return f"{head}: {report.reason}."
@@ -234,7 +241,7 @@ def pooled_text(report: PooledReport) -> str:
         outcome = f"no estimate ({one.reason})"
         if one.max_size_mm is not None:
             mass = "  (mass {} of {} on this map)".format(*one.mass) if one.mass else ""
-            outcome = f"{_size_words(one.max_size_mm, with_ends=True)} mm alone{mass}"
+            outcome = f"{_size_words(one.max_size_mm, with_ends=True)} mm alone{_alike(report)}{mass}"
         lines.append(f"{number}. {one.map}: {outcome}")
     lines += finding_lines(report.findings, "check")
     if report.max_size_mm is None:

@@ -353,6 +353,19 @@ def test_of_several_maps_the_first_that_shows_a_lump_is_drawn() -> None:
     assert "by this map: 0.9" in alone
 
 
+def test_the_interval_of_each_map_is_the_one_that_leads_on_a_page_of_its_own() -> None:
+    one = exam().maps[0]
+    assert one.report.another_exam is not None
+    size = one.report.another_exam.max_size_mm
+    ends = f"{size.low:.1f} to {size.high:.1f}"
+    pooled = pooled_as(one.report, 2)
+    page = Page(exam_page(ShownExam((one, one), pooled, SCANS)))
+    assert f"1: {size.median:.1f} mm ({ends})" in page.words
+    apart = replace(pooled, status="maps_disagree", max_size_mm=None, another_exam=None, reason="apart")
+    page = Page(exam_page(ShownExam((one, one), apart, SCANS)))
+    assert f"By map 2 alone the largest diameter is about {size.median:.1f} mm (95 %: {ends} mm)" in page.words
+
+
 def test_what_was_reached_is_told_by_the_patients_left_and_right() -> None:
     """The demo's map about the xiphoid, moved so that it lies on one side, on the other, and across the middle."""
     tactile_map, _ = demo()
