@@ -276,10 +276,12 @@ def _compared(
     unknown = [str(number) for number, place in enumerate(places, start=1) if place is None]
     if not comparing.same_mass and doubts:
         advice = "compare exams of one mass; if it is one, --same-mass says so (a wider posture: --registration-mm)"
-        return VisitComparison("not_one_mass", "; ".join(doubts), advice, shifts)
+        on_paper = "look whether they are of one mass"
+        return VisitComparison("not_one_mass", "; ".join(doubts), advice, shifts, on_paper=on_paper)
     if not comparing.same_mass and unknown:
         reason = f"no landmarks show where the mass of visit {' and '.join(unknown)} lies in the patient"
-        return VisitComparison("not_one_mass", reason, "touch both landmarks, or say --same-mass", shifts)
+        touch = "touch both landmarks"
+        return VisitComparison("not_one_mass", reason, f"{touch}, or say --same-mass", shifts, on_paper=touch)
     doubts += [f"no landmarks show where the mass of visit {number} lies" for number in unknown]
     findings = [finding("taken_as_one", f"{text}; taken as one mass because you say so") for text in doubts]
     return _sized(shown, calibration, settings, shifts=shifts, doubts=findings)

@@ -407,7 +407,9 @@ def _verdict_line(change: ChangeReport) -> str:
         return f"The mass has {change.verdict}{f', {_IF_EXAMS_REPEAT}' if change.for_alike_exams_only else ''}."
     least = change.smallest_detectable_percent
     growth, shrinkage = f"{least.growth:.0f} %", f"{least.shrinkage:.0f} %"
-    return f"No change shown; a growth of less than {growth} or a shrinkage of less than {shrinkage} can stay unseen."
+    larger = "" if change.another_exam is None else "; larger ones too, if exams differ as those of patients did"
+    smaller = f"a growth of less than {growth} or a shrinkage of less than {shrinkage} can stay unseen"
+    return f"No change shown; {smaller}{larger}."
 
 
 def _rate_lines(change: ChangeReport) -> list[str]:

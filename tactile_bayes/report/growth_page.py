@@ -174,7 +174,7 @@ def growth_page(
         title=cut(course.title, 60) or TITLE,
         facts=[(name, text) for name, text in facts if text],
         research_use=RESEARCH_USE,
-        headline=verdict_sentence(report),
+        headline=verdict_sentence(replace(report, advice=compared.on_paper or report.advice)),
         findings=finding_lines(report.findings, paper=True),
         maps=[_picture(laid[i], view, limits, course, report.visits[i]) for i in shown],
         left_out=len(laid) - len(shown),

@@ -426,3 +426,4 @@ class VisitComparison(Record, eq=False):
     joint: JointSizes | None = None
     another: JointSizes | None = None
     """Sizes with the calibration's or the site's spread between exams, and with the paper's."""
+    on_paper: str = ""  #: `advice` without options of the command line; empty where it names none.

@@ -260,5 +260,9 @@ def test_visits_that_are_not_compared_have_a_page_that_says_so(tmp_path: Path) -
     refused.page(tmp_path / "growth.html")
     page = (tmp_path / "growth.html").read_text()
     assert "Not compared: not shown to be one mass" in page
+    assert "Look whether they are of one mass." in page
+    body = page.partition("</style>")[2]
+    assert "--" not in body  # no option of the program
+    assert "moved so that" not in body
     assert len(re.findall("<image ", page)) == 2
     assert 'class="trend"' not in page
