@@ -100,6 +100,7 @@ def test_a_page_is_read_from_its_elements(kind: str, pages: dict[str, str]) -> N
     scrolled = [attrs for tag, attrs in outline.tags if attrs.get("class") == "wide"]
     assert all(attrs.get("tabindex") == "0" for attrs in scrolled)
     assert "user-scalable" not in pages[kind]
+    assert "Research use only" in pages[kind].partition("</h1>")[2][:700]  # before any result
 
 
 def contrast(first: str, second: str) -> float:
