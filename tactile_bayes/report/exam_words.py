@@ -331,9 +331,9 @@ def covered_text(tactile_map: TactileMap) -> str:
     """Area with enough readings, holes in it, and the typical number of readings."""
     cell2 = tactile_map.recipe.cell_mm**2 / 100.0
     if not tactile_map.counts_known:
-        return f"{tactile_map.covered.sum() * cell2:.0f} cm² (how often each place was read is not known)"
+        return f"{_area_text(tactile_map.covered.sum() * cell2)} (how often each place was read is not known)"
     well = tactile_map.covered & (tactile_map.count >= FEW_READINGS)
-    text = f"{well.sum() * cell2:.0f} cm² read {FEW_READINGS} times or more"
+    text = f"{_area_text(well.sum() * cell2)} read {FEW_READINGS} times or more"
     # cells not covered that have covered ones on all four sides
     sides = [np.logical_or.accumulate(well, axis=axis) for axis in (0, 1)]
     sides += [np.flip(np.logical_or.accumulate(np.flip(well, axis), axis=axis), axis) for axis in (0, 1)]
@@ -341,6 +341,10 @@ def covered_text(tactile_map: TactileMap) -> str:
     text += f"; {holes * cell2:.1f} cm² of gaps inside" if holes * cell2 >= 0.05 else "; no gaps inside"
     median = float(np.median(tactile_map.count[well])) if well.any() else 0.0
     return f"{text}; typically {median:.0f} times"
+
+
+def _area_text(cm2: float) -> str:
+    return f"{cm2:.0f} cm²" if cm2 >= 10 else f"{cm2:.2g} cm²"
 
 
 def reach_text(tactile_map: TactileMap) -> str:

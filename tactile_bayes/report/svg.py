@@ -381,7 +381,8 @@ def edge_names(view: Orientation, size_mm: tuple[float, float], *, small: bool) 
         if small:
             yield outlined_text(x, y + 0.9, name, size=2.5)
         else:
-            yield text(x, y + 1.5, name, size=4.2, more=f' font-weight="600" class="edge" data-side="{side}"')
+            size = 4.2 if len(name) == 1 else 3.2  # as wide as the margin
+            yield text(x, y + 1.5, name, size=size, more=f' font-weight="600" class="edge" data-side="{side}"')
 
 
 def scale_bar(height: float, scale: float, *, least_mm: float, inset: float, size: float) -> Iterator[str]:
@@ -440,7 +441,8 @@ def _nipple(centre_mm: tuple[float, float], frame: Frame) -> Iterator[str]:
     (x, y), (width, height) = frame.at(centre_mm), frame.size_mm
     if 0 <= x <= width and 0 <= y <= height:
         yield stroked(_ring(x, y, 2.6) + _ring(x, y, 0.7), 0.45, kind="nipple")
-        yield outlined_text(x, y + 6.2, "nipple", size=3.0)
+        below = 6.2 if y < height - 16.0 else -3.6  # not over the scale bar
+        yield outlined_text(x, y + below, "nipple", size=3.0)
         return
     edge = (min(max(x, 2.5), width - 2.5), min(max(y, 2.5), height - 2.5))
     away = float(np.hypot(x - edge[0], y - edge[1]))

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from mapping_scans import gaussian, make_scan, strokes
 from plain_reports import estimate_report, pooled_report
+from posterior_maps import grid_map
 
 import tactile_bayes as tb
 from tactile_bayes.declarations import replace
@@ -36,6 +37,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import PageLabels, ShownExam, exam_map, headline, reach_text
 from tactile_bayes.report.pages import BROWSERS, find_printer
+from tactile_bayes.report.svg import MARGIN_MM, Frame, exam_picture
 from tactile_bayes.scans import Landmarks
 
 HOSTILE = "\"><img src=x onerror=alert(1)><script>alert(2)</script>'&lt; </p></svg></body>"
@@ -395,6 +397,25 @@ def test_a_nipple_off_the_map_is_pointed_to() -> None:
     page = Page(exam_page(ShownExam((exam_map(far, report, side="left"),), None, SCANS)))
     assert len(page.named("path", **{"class": "nipple-off"})) == 1
     assert page.named("path", **{"class": "nipple"}) == []
+
+
+def test_the_nipples_name_keeps_off_the_scale_bar_at_the_foot() -> None:
+    tactile_map, report = demo()
+    frame = Frame(tactile_map, 1.0)
+    y_mm = max(tactile_map.y_mm[[3, -4]], key=lambda y: frame.at((0.0, y))[1])
+    low = replace(tactile_map, nipple_mm=np.array([0.0, y_mm, 0.0]))
+    drawn = exam_picture(exam_map(low, report, side="left"), replace(frame, tactile_map=low), label="")
+    name_y = float(re.findall(r'y="([0-9.]+)"[^>]*>nipple<', drawn)[0])
+    assert name_y < frame.at((0.0, y_mm))[1]
+
+
+def test_a_grid_of_half_a_square_centimetre_is_told_and_its_axes_fit_into_the_margin() -> None:
+    small = replace(without_lump().maps[0], tactile_map=grid_map(np.ones((6, 8)), count=1))
+    page = Page(exam_page(ShownExam((small,), None, ())))
+    assert "covered 0.48 cm² (how often each place was read is not known)" in page.words
+    sizes = [float(one["font-size"]) for one in page.named("text", **{"class": "edge"})]
+    assert len(sizes) == 4
+    assert 1.5 * max(sizes) <= MARGIN_MM  # two bold letters
 
 
 def test_codes_stand_on_the_page_to_their_last_letter() -> None:
