@@ -48,7 +48,10 @@ _NAMES: Final[Mapping[str, str]] = {
     **dict.fromkeys(("az", "azimuth", "azi"), "azimuth"),
     **dict.fromkeys(("el", "elevation", "elev"), "elevation"),
     **dict.fromkeys(("roll", "ro", "rl"), "roll"),
-    **dict.fromkeys(("time", "t", "timestamp", "times", "timems", "timestampms", "timeus", "secs", "seconds"), "time"),
+    **dict.fromkeys(
+        ("time", "t", "timestamp", "epoch", "datetime", "times", "timems", "timestampms", "timeus", "secs", "seconds"),
+        "time",
+    ),
     **dict.fromkeys(("timespecs",), "seconds"),
     **dict.fromkeys(("timespecns",), "nanoseconds"),
     **dict.fromkeys(("frame", "framenumber", "frameno"), "frame"),
@@ -342,7 +345,9 @@ _TIME_LINE: Final = re.compile(r"\btime\b[^\d\n]*(\d+(?:[:.,]\d+)*)\s*(ms|s|secs
 _SATURATION_LINE: Final = re.compile(rf"^\W*saturation[_ ]pressure\b\D*{_NUMBER}", re.IGNORECASE)
 _FIELD_NAME: Final = re.compile(r"b[xyz]_?\d*", re.IGNORECASE)
 """A component of a magnetometer's field, as ReSkin's library calls it."""
-_TIME_NAME: Final = re.compile(r"(time|t|timestamp|elapsed|elapsed time|secs?|seconds|clock|zeit)", re.IGNORECASE)
+_TIME_NAME: Final = re.compile(
+    r"(time|t|timestamp|epoch|datetime|elapsed|elapsed time|secs?|seconds|clock|zeit)", re.IGNORECASE
+)
 _OTHER_NAME: Final = re.compile(
     r"^(no|nr|#|n|i|id)\W*$|\b(frame|index|idx|sample|number|counter|date|sum|total|mean|average|avg|max|min|peak|force|"
     r"load|area|cof|cop)(?![a-z])",

@@ -109,7 +109,7 @@ def test_frames_and_poses_in_one_table(tmp_path: Path) -> None:
     lines = [f"{row.partition(',')[0]},OK,{told},{row.partition(',')[2]}" for row in timed(1)]
     lines[7] = lines[7].replace("OK", "Missing")
     path = tmp_path / "log.csv"
-    path.write_text("\n".join(["time,status,x,y,z,qw,qx,qy,qz," + NAMES, *lines]))
+    path.write_text("\n".join(["epoch_s,status,x,y,z,qw,qx,qy,qz," + NAMES, *lines]))
     found = tb.scan(path, None, path, head=SCAN.head, unit="kPa")
     same(found)
     assert len(found.poses) == len(found.frames) - 1
