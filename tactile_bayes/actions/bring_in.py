@@ -9,6 +9,7 @@ from typing import Any, Final
 import click
 import numpy as np
 
+from tactile_bayes.commands.options import is_folder
 from tactile_bayes.declarations import Record, as_dict, names_of, replace
 from tactile_bayes.errors import EXIT_DONE, BadDataError, TactileBayesError, UsageError, one_line
 from tactile_bayes.files.arrays_layout import ArrayMap, GridOptions, Stated
@@ -22,6 +23,7 @@ from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan_report, write_scan
 from tactile_bayes.findings import LEADS, finding_lines
 from tactile_bayes.mapping.arrangement import check_scan, corrected
+from tactile_bayes.mapping.plausibility import MOST_SPAN_MM
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.scan import describe_scan
 from tactile_bayes.scans import Scan
@@ -76,7 +78,7 @@ def import_action(
     scan_files = {name: path for name in ("poses", *_SCAN_FILES) if (path := options.pop(name)) is not None}
     grid = GridOptions(**{name: options.pop(name) for name in names_of(GridOptions)})
     request = ImportRequest(**options, grid=grid, arrays=arrays, scan_files=scan_files)
-    if len(sources) == 1 and not output.is_dir():
+    if len(sources) == 1 and not is_folder(output):
         lines, exit_code = _import(sources[0], output, request), EXIT_DONE
     else:
         lines, exit_code = _import_each(sources, output, request)
@@ -92,7 +94,8 @@ def _import_each(sources: tuple[Path, ...], folder: Path, request: ImportRequest
         raise UsageError(f"two of the files would become one in {folder}; import them into different folders")
     refuse_same(targets.values(), sources)
     if folder.suffix.lower() in (".mcap", ".nc") and not folder.exists():
-        raise UsageError(f"{len(sources)} files go into a folder, and {folder} names a file; give a folder")
+        files = "1 file goes" if len(sources) == 1 else f"{len(sources)} files go"
+        raise UsageError(f"{files} into a folder, and {folder} names a file; give a folder")
     is_new = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -150,11 +153,22 @@ def _import_scan(source: Path, output: Path, request: ImportRequest) -> list[str
             pose_source(path, request.arrays) if name == "poses" else _SCAN_FILES[name](path) for name, path in files
         ]
         scan, notes = import_arrays(source, request.arrays, parts)
+        notes.insert(0, _lengths(scan))
     settings = {"as": "scan", "lost": list(lost), "correct": list(request.corrections), **request.arrays.given}
     scan = corrected(with_session(scan, request.session_file), request.corrections)
     inputs = hash_inputs(source=source, session=request.session_file, **request.scan_files)
     write_scan(output, scan, provenance=Provenance("import", settings, inputs), truth=truth, force=request.force)
     return [*describe_scan(scan), *notes, *(f"lost: {line}" for line in lost), *_arrangement_lines(scan)]
+
+
+def _lengths(scan: Scan) -> str:
+    """Lengths of a scan in a line, by which a wrong unit shows."""
+    lever = float(np.linalg.norm(scan.head.scanhead_from_tracker[:3, 3]))
+    sides = np.ptp(scan.poses.position_mm, axis=0)
+    line = (
+        f"the sensor lies {lever:.3g} mm from the head, and moved by {' x '.join(f'{side:.0f}' for side in sides)} mm"
+    )
+    return f"{LEADS['check']}{line}: no breast is so large; check their unit" if sides.max() > MOST_SPAN_MM else line
 
 
 def _arrangement_lines(scan: Scan) -> list[str]:

@@ -28,6 +28,7 @@ WRITTEN: Final = frozenset(
 )
 """Options that name a command's outputs; every other path is an input."""
 _SEEN: Final = "tactile_bayes.paths"
+_FOLDERS: Final = "tactile_bayes.folders"
 
 
 class FilePath(click.Path):
@@ -61,6 +62,8 @@ class FilePath(click.Path):
                 elif written or other_written:
                     refuse_same([path], [other])
             seen.append((path, written))
+            if str(value).endswith(os.sep):
+                ctx.meta.setdefault(_FOLDERS, []).append(path)
         if self.writes is not None and str(value).endswith(os.sep) and not path.is_dir():
             raise UsageError(f"{value} is the name of a folder; name a file, in a folder that exists")
         if self.writes == "figure":
@@ -68,6 +71,12 @@ class FilePath(click.Path):
         elif self.writes is not None:
             check_suffix(path, self.writes)
         return path
+
+
+def is_folder(path: Path) -> bool:
+    """True for a folder, and for a path that the call wrote with a slash at its end."""
+    context = click.get_current_context(silent=True)
+    return path.is_dir() or (context is not None and path in context.meta.get(_FOLDERS, ()))
 
 
 def protect_inputs(*paths: Path | None) -> None:

@@ -5,6 +5,7 @@ Arrays are in mm, kPa and s and read without pickle; `arrays_layout.LAYOUT` desc
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
@@ -36,6 +37,11 @@ _SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
 _MOST_NAMES: Final = 12  # of a file's arrays in an error
 _TURN: Final = 2 * np.pi
 _NOT_RIGID: Final = 1e-3  # of matrices that were written with few digits
+_LEVER_MM: Final = (1.0, 1000.0)  #: From the tracker's sensor to the head, where they are two things.
+_OTHER_ORDER: Final = (
+    0.8  #: Squared difference of neighbours in another order over that as stated: right scans have 1.0.
+)
+_LOOKED_AT: Final = 500  # frames
 _TIME_OPTIONS: Final = {"frame_time_s": "time-unit", "pose_time_s": "pose-time-unit"}
 _BESIDE: Final = {
     "--poses FILE": ("position_mm", "quaternion_wxyz", "pose_time_s"),
@@ -91,7 +97,10 @@ def _read_source(path: Path, options: ArrayMap, others: Sequence[Source]) -> Sou
         names_in_file.update({name: name for name in KNOWN if name in names and name not in names_in_file})
         names_in_file.update(plain_names(names, names_in_file, options.values))
         if not names_in_file:
-            needed = _described(name for name in LAYOUT if name not in OPTIONAL)
+            beside = {name for source in others for name in source.arrays}
+            if options.unit not in (None, "counts"):
+                beside |= {"gain_kpa_per_count", "offset_kpa"}
+            needed = _described(name for name in LAYOUT if name not in OPTIONAL and name not in beside)
             more = " (for a grid of values give --as map)" if "mean" in names else ""
             raise BadDataError(f"lacks {needed} (it has {contents})", way_out=f"{_TEMPLATE}{more}; {_HELP}")
         unknown.update(set(names) - set(names_in_file.values()))
@@ -321,6 +330,43 @@ def _arrange_frames(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
         )
         raise BadDataError(what, way_out=way_out)
     arrays["counts"] = counts
+    if counts.ndim == 3 and min(counts.shape[1:]) > 3:
+        _check_order(counts, stated, notes)
+
+
+def _check_order(counts: np.ndarray, stated: Stated, notes: list[str]) -> None:
+    """Refuse readings of which neighbours agree better in another order, unless their order is stated."""
+    means = counts.mean(axis=(1, 2), dtype=np.float64)
+    if means.max() <= 0:
+        return
+    pressed = np.flatnonzero(2 * means > means.max())
+    frames = counts[pressed[:: max(1, len(pressed) // _LOOKED_AT)]].astype(np.float64)
+    frames /= frames.mean(axis=(1, 2), keepdims=True)
+    frames -= frames.mean(axis=0)
+    as_stated = _roughness(frames)
+    rough = {}
+    for name, lines in (("row", frames), ("column", frames.swapaxes(1, 2))):
+        backwards, apart = lines.copy(), np.empty_like(lines)
+        backwards[:, 1::2] = lines[:, 1::2, ::-1]
+        apart[:, np.r_[0 : lines.shape[1] : 2, 1 : lines.shape[1] : 2]] = lines
+        rough[f"every second {name} runs backwards"] = _roughness(backwards)
+        rough[f"every second {name} stands behind all the others"] = _roughness(apart)
+    other, roughness = min(rough.items(), key=operator.itemgetter(1))
+    transposed = _roughness(
+        frames.reshape(-1, *frames.shape[:0:-1]).swapaxes(1, 2)
+    )  # the check of arrangements says so
+    if not roughness < min(_OTHER_ORDER * as_stated, transposed):
+        return
+    what = f"frames have neighbours that differ by {100 * (1 - np.sqrt(roughness / as_stated)):.0f} % less if {other}"
+    if stated.frame_order is None:
+        way_out = "put the readings in the order of the array; --frame-order rows takes them as they are"
+        raise BadDataError(what, way_out=way_out)
+    notes.append(f"CAUTION: {what}: the size may be wrong")
+
+
+def _roughness(frames: FloatArray) -> float:
+    """Mean squared difference of neighbouring readings."""
+    return float(np.square(np.diff(frames, axis=1)).mean() + np.square(np.diff(frames, axis=2)).mean())
 
 
 def _sides(shape: Sequence[int]) -> str:
@@ -444,6 +490,10 @@ def _check_units(arrays: Arrays, *, calibrated: bool) -> None:
     if travel < 1.0 and reach < 5.0 and len(position) > 1:
         what = f"position_mm spans only {travel:.4g}, none beyond {reach:.4g}"
         raise BadDataError(what, way_out=f"{metres} or their unit, --length-unit m or inch")
+    lever = float(np.linalg.norm(arrays["array_from_tracker"][..., :3, 3]))
+    if 1e-3 < lever < _LEVER_MM[0] or lever > _LEVER_MM[1]:
+        what = f"array_from_tracker puts the tracker's sensor {lever:.4g} mm from the head"
+        raise BadDataError(what, way_out=f"looks like {'metres' if lever < 1 else 'micrometres'}, give mm")
     if "landmarks_mm" in arrays:
         apart = float(np.linalg.norm(arrays["landmarks_mm"][0] - arrays["landmarks_mm"][1]))
         if apart < 10.0:

@@ -330,6 +330,14 @@ def nan(name: str) -> Callable[[Arrays], None]:
     return lambda a: a[name].__setitem__((3, 4), np.nan)
 
 
+def meander(frames: np.ndarray, lump: float = 2.0) -> np.ndarray:
+    """The frames, over a lump, with every second row backwards."""
+    y, moved = np.arange(26), np.arange(len(frames))[:, None, None] / 3
+    frames = frames + lump * np.exp(-((y - 4 - moved) ** 2) / 8)
+    frames[:, 1::2] = frames[:, 1::2, ::-1]
+    return frames
+
+
 FAULTS: list[tuple[str, Callable[[Arrays], Any], dict[str, Any], str]] = [
     ("NaN", nan("frames"), {"unit": "kPa"}, r"frames holds 26 values that are not finite \(first at \(3, 4, 0\)\)"),
     ("no unit", dict.copy, {}, "lacks gain_kpa_per_count .*--unit or --array-calibration"),
@@ -341,6 +349,8 @@ FAULTS: list[tuple[str, Callable[[Arrays], Any], dict[str, Any], str]] = [
     ("shape", dict.copy, {"unit": "kPa", "frame_shape": (26, 16)}, "16 x 26 taxels, not 26 x 16"),
     ("unknown", dict.copy, {"unit": "kPa", "arrays": {"count": "frames"}}, "'count' is no array.*mean counts"),
     ("not there", dict.copy, {"unit": "kPa", "arrays": {"counts": "P"}}, "has no array 'P' for counts; it has "),
+    ("meander", lambda a: a.update(frames=meander(a["frames"])), {"unit": "kPa"}, "less if every second row runs back"),
+    ("lever in m", lambda a: a["array_from_tracker"].__setitem__((slice(3), 3), 0.03), {"unit": "kPa"}, "like metres"),
 ]  # fmt: skip
 
 
@@ -356,6 +366,12 @@ def test_what_is_missing_or_wrong_is_one_line_with_its_way_out(
         import_arrays(path, ArrayMap(**stated))
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
+
+
+def test_an_order_that_is_stated_is_taken_with_a_caution(pressed: Arrays, tmp_path: Path) -> None:
+    as_npz(tmp_path / "exam.npz", pressed | {"frames": meander(pressed["frames"])})
+    notes = import_arrays(tmp_path / "exam.npz", ArrayMap(unit="kPa", frame_order="rows"))[1]
+    assert notes[0].startswith("CAUTION: frames have neighbours that differ by ")
 
 
 def test_objects_of_every_container_are_refused_and_never_unpickled(tmp_path: Path) -> None:
@@ -468,7 +484,7 @@ def test_poses_apart_in_arrays_are_named_for_what_they_are(
         pose_source(tmp_path / name, ArrayMap())
 
 
-def test_what_is_called_otherwise_is_listed_beside_what_is_missing(pressed: Arrays, tmp_path: Path) -> None:
+def test_what_is_called_otherwise_is_listed_beside_what_is_missing(pressed: Arrays, scan: Scan, tmp_path: Path) -> None:
     """As `frames`, `t`, `T` (matrices) and `t_pose` of a notebook are."""
     pressed["t"], pressed["t_pose"] = pressed.pop("frame_time_s"), pressed.pop("pose_time_s")
     pressed["T"] = np.tile(np.eye(4), (len(pressed.pop("quaternion_wxyz")), 1, 1))
@@ -476,6 +492,9 @@ def test_what_is_called_otherwise_is_listed_beside_what_is_missing(pressed: Arra
     as_npz(tmp_path / "exam.npz", pressed)
     with pytest.raises(BadDataError, match=r"lacks position_mm .* not known: T, t_pose; .*--template"):
         import_arrays(tmp_path / "exam.npz", ArrayMap(unit="kPa"))
+    as_npz(tmp_path / "other.npz", {"P": pressed["frames"]})
+    with pytest.raises(BadDataError, match=r"pose_time_s \(m\) \(it has P\)"):  # the head and the unit are there
+        import_arrays(tmp_path / "other.npz", ArrayMap(unit="kPa"), [head_source(scan.head)])
     found = parse_toml(array_template(tmp_path / "exam.npz"), way_out="")["arrays"]
     assert found == {"frame_time_s": "t", "pose_time_s": "t_pose", "pose_matrix": "T"}
 
@@ -555,6 +574,8 @@ def test_many_files_fail_one_by_one(pressed: Arrays, head: Path, tmp_path: Path)
     assert mended.returncode == 2
     assert "--unit: for arrays and tables; scans/a.mcap is a scan already" in mended.stderr
     assert sorted(path.name for path in tmp_path.glob("*") if path.is_dir()) == ["scans"]
+    one = run_here("import", "c.h5", "-o", "one/", "--unit", "kPa", "--head-geometry", head, cwd=tmp_path)
+    assert one.stdout.startswith("one/c.mcap: scan\n")
     (tmp_path / "a.npz").write_bytes(b"")
     clash = run_here("import", "a.mat", "a.npz", "-o", "more", cwd=tmp_path)
     assert clash.returncode == 2
