@@ -246,6 +246,10 @@ def read_scene(path: Path) -> scenes.Scene:
 
 def scene_of(document: Mapping[str, Any]) -> scenes.Scene:
     """A scene from plain data as its TOML holds; for the errors see `read_scene`."""
+    by_table = as_dict(SceneFile(body=SceneBody()))
+    for key in document:
+        if owners := [f"[{name}]" for name, table in by_table.items() if isinstance(table, dict) and key in table]:
+            raise BadDataError(f"{key} stands in no table", way_out=f"write it below {' or '.join(owners)}")
     file = from_plain(SceneFile, document)
     tables = {name: getattr(file, name) for name in names_of(file)}
     bumps, tissue = _lumps(tables.pop("lump"), document.get("lump", ()))

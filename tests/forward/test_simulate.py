@@ -172,6 +172,7 @@ BAD_SCENES = [
     ("[noise]\nelement_kPa = 1", "noise.element_kPa is not known; did you mean element_kpa"),
     ("[[lump]]\nx_cm = 1", r"lump\[0\].x_cm is not known; give x_mm, in the unit it names"),
     ("[[lump]]\namplitud = 1", "did you mean amplitude"),
+    ("duration_s = 7.0\n[body]", r"duration_s stands in no table; write it below \[scene\]"),
     ("[strks]\nlines = 1", "strks is not known; did you mean strokes"),
     ("[zebra]", "known are scene, background"),
     ("[scene]\nduration_s = 0", "scene.duration_s is 0; give a number above 0 up to 600"),
