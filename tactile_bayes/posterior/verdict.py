@@ -172,6 +172,8 @@ def no_bump_reason(
         return _reason_for_fault(tactile_map, candidate, reason)
     first = candidates[0]
     if likeliest is None and "covered cells" in first.fault:
+        if tactile_map.recipe.cell_mm > COARSEST_MM and (why := no_verdict(tactile_map)) is not None:
+            return why
         shortfall = coverage_shortfall(tactile_map, first.centre_mm, reach_mm=10.0)
         advice = stroke_advice(shortfall) or "cover the place with more strokes"
         return Abstention("window", f"no lump found {where}: {first.fault}", advice, advice, first.centre_mm)

@@ -70,6 +70,9 @@ def test_cells_too_large_to_show_a_lump_are_no_verdict_on_the_breast() -> None:
     assert "smaller cells" in found.advice
     assert found.detection is None  # no probability beside it
     assert run(1 + WHITE).code == "undetected"
+    few = replace(coarse, count=coarse.count * (np.arange(81).reshape(9, 9) % 16 == 0))
+    found = estimate_map(few, calibration=None, options=settings, rng=np.random.default_rng(1))
+    assert found.code == "cannot_show"  # it once read "no lump found: 6 covered cells for 5 parameters"
 
 
 @pytest.mark.parametrize(
