@@ -107,6 +107,7 @@ class _GainSystem:
         top, left = np.min([first for first, _ in blocks], axis=0).tolist()
         bottom, right = np.max([np.add(*block) for block in blocks], axis=0).tolist()
         self._first, self._shape = (top, left), (bottom - top, right - left)
+        cells.refuse_vast(*self._shape, sources[0].projection.cell_mm)
         self._readings = sum(len(source.projection) * len(source.selection.readout.taxels) for source in sources)
         self._cache: dict[tuple[int, int], _Chunk] = {}
         self._count = self._total(None)
