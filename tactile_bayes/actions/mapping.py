@@ -11,7 +11,7 @@ import click
 
 from tactile_bayes.declarations import EXACT, to_plain
 from tactile_bayes.errors import UsageError
-from tactile_bayes.files.atomic import first_duplicate, refuse_existing, sha256
+from tactile_bayes.files.atomic import first_duplicate, refuse_existing, refuse_same, sha256
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
 from tactile_bayes.files.scan_mcap import read_scan
@@ -32,7 +32,7 @@ def map_action(
         output = default_map_path(scans[0])
         if first_duplicate([*scans, output]) is not None:
             read_scan(output)  # a map given in place of a scan is named as such
-            raise UsageError(f"{output} is an input of this command; name another with -o")
+        refuse_same([output], scans)
         if output.exists() and not force:
             raise UsageError(f"{output} exists; name another with -o, or give --force")
         refuse_existing(output, force=force)

@@ -115,7 +115,7 @@ def test_a_map_without_a_name_never_replaces_its_scan(folder, run_cli):
     (folder / "one.nc").symlink_to("one.mcap")
     for name, output in (("exam.nc", "exam.nc"), ("one.mcap", "one.nc")):
         done = run_cli("map", name, "--force", cwd=folder)
-        said = f"error: {output} is an input of this command; name another with -o\n"
+        said = f"error: {output} is an input of this command; choose another name for the output\n"
         assert (done.returncode, done.stderr) == (2, said)
         assert (folder / name).read_bytes() == scan
     assert run_cli("map", "two.mcap", cwd=folder).returncode == 0
