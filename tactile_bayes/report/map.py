@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 _LISTED_TAXELS = 8
 # Leaving out more frames than this share for their pressure is worth a word about the window.
 _MUCH_GATED = 0.2
+_MOSTLY = 0.8  #: Share of these above which they were pressed too hard, or too lightly.
 _UNITS = {
     "mean": "times the mean of their frames (normalise mean)",
     "gain": "times the level beside a lump (normalise gain)",
@@ -188,7 +189,10 @@ def _advice(quality: Mapping[str, float]) -> Iterator[str]:
     gated = quality.get("dropped_low", 0.0) + quality.get("dropped_high", 0.0)
     if gated > _MUCH_GATED * quality.get("frames_total", np.inf):
         ends = f"{quality['level_p05_kpa']:.1f} to {quality['level_p95_kpa']:.1f} kPa"
-        yield f"a window of {ends} would keep nine frames in ten; it lets in pressures the head was not shaped for"
+        high = quality.get("dropped_high", 0.0) / gated
+        press = "less hard" if high > _MOSTLY else "harder" if high < 1 - _MOSTLY else "more evenly"
+        window = f"a window of {ends} (--pressure-window-kpa) would keep nine frames in ten"
+        yield f"press {press} next time; {window}, but lets in pressures the head was not shaped for"
     if text := skewed(quality):
         yield text
 

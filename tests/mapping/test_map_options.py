@@ -146,4 +146,7 @@ def test_a_window_that_leaves_much_out_is_told_a_wider_one():
     levels = np.linspace(3, 9, 540)
     centres = scans.strokes(reach_mm=40.0, lines=9, spacing_mm=5.0, per_line=60)
     report = map_text(build_map(scans.make_scan(centres, levels_kpa=levels)))
-    assert "a window of 3.3 to 8.7 kPa would keep nine frames in ten" in report
+    assert (
+        "press harder next time; a window of 3.3 to 8.7 kPa (--pressure-window-kpa) would keep nine frames in ten"
+        in report
+    )
