@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding, finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, principal_axes
-from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
+from tactile_bayes.mapping.map import FEW_READINGS, TactileMap, block_sums
 from tactile_bayes.mapping.select import (
     LEAST_FRAMES,
     SelectedFrames,
     chunks,
     frame_figures,
+    rate_doubt,
     refuse_without_frames,
     timing_figures,
 )
 from tactile_bayes.scans import HeadShape, Landmarks
 
-RATE_HZ: Final = (5.0, 2000.0)  #: Rate of frames.
 LEAST_USED_SHARE: Final = 0.05  #: Least share of the frames that are used; and `LEAST_FRAMES` in all.
 LEAST_AREA: Final = 1.5  #: Area of a map in areas of the array: a head that stood still covers its own and its noise.
 MOST_SPAN_MM: Final = 600.0  #: Range of the places along one axis: a chest is narrower.
@@ -217,9 +217,12 @@ def _unlike(quality: Mapping[str, float], head: HeadShape | None) -> Iterator[tu
     if total and (used < LEAST_FRAMES or used < LEAST_USED_SHARE * total):
         why = [f"{quality[name]:.0f} {words}" for name, words in WHY_NOT.items() if quality.get(name)]
         left_out = f" ({', '.join(why)})" if why else ""
-        yield f"only {used:.0f} of {total:.0f} frames are used{left_out}", "press evenly, over the whole place"
-    if "frame_rate_hz" in quality and not RATE_HZ[0] <= quality["frame_rate_hz"] <= RATE_HZ[1]:
-        yield _rate(quality["frame_rate_hz"])
+        most = max(WHY_NOT, key=lambda name: quality.get(name, 0.0))
+        longer = "use more frames" if "frames_every" in quality else "scan for longer"
+        remedy = _REMEDIES[most] if 2 * quality.get(most, 0.0) > total else longer
+        yield f"only {used:.0f} of {total:.0f} frames are used{left_out}", remedy
+    if "frame_rate_hz" in quality and (doubt := rate_doubt(quality["frame_rate_hz"] * quality.get("frames_every", 1))):
+        yield doubt
     elif total > 1 and "frames_missing" in quality and "frame_rate_hz" not in quality:  # a live map tells no times
         yield "all frames have one time: the array's clock stands still", "record the frames' times"
     if total and quality.get("dropped_elements", 0.0) > MOST_DROPPED * total:
@@ -265,14 +268,13 @@ WHY_NOT: Final = {
     "dropped_elements": "with too few valid taxels",
 }
 """Why frames are left out of a map, by the figure that counts them."""
-_CLOCKS: Final = ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds"), (1 / 60, "minutes"))
-
-
-def _rate(rate_hz: float) -> tuple[str, str]:
-    low, high = RATE_HZ
-    units = [name for factor, name in _CLOCKS if low <= rate_hz * factor <= high]
-    remedy = f"are the times in {units[0]}? they must be in s" if units else "check the frames' times, which are in s"
-    return f"frames come at {rate_hz:.3g} Hz, and arrays give {low:g} to {high:g}", remedy
+_REMEDIES: Final = {
+    "dropped_low": "press harder",
+    "dropped_high": "press less hard",
+    "dropped_no_pose": "check the tracker and its times",
+    "dropped_elements": "press less hard, or repair the array",
+}
+"""What to do about frames that are left out, by the same figure."""
 
 
 def _unusual(quality: Mapping[str, float]) -> Iterator[tuple[str, str]]:
@@ -295,11 +297,11 @@ def _unusual(quality: Mapping[str, float]) -> Iterator[tuple[str, str]]:
 
 def _cell_doubts(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
     """Sentence and remedy for a map's area and for cells that no tissue explains."""
-    covered, cell = tactile_map.covered, tactile_map.recipe.cell_mm
+    covered = tactile_map.covered
     if not covered.any():
         return
-    area, head = float(covered.sum()) * cell**2, tactile_map.head
-    if head is not None:
+    area, head = _area_mm2(tactile_map), tactile_map.head
+    if head is not None and tactile_map.frame_count >= LEAST_FRAMES:
         yield from _at_rest(area, head, "the map covers")
     saturated, frames = tactile_map.quality.get("saturated_readings", 0.0), tactile_map.frame_count
     readings = frames * (1 if head is None else head.rows * head.columns)
@@ -319,6 +321,13 @@ def _cell_doubts(tactile_map: TactileMap) -> Iterator[tuple[str, str]]:
         yield text, "check whether the readings fall where pressure rises, and leave out what lies off the tissue"
     count = tactile_map.count[covered]
     yield from _value_doubts(tactile_map.mean[covered][count >= FEW_READINGS * float(tactile_map.counts_known)])
+
+
+def _area_mm2(tactile_map: TactileMap) -> float:
+    """Area that a map covers; cells much finer than the taxels' pitch are covered sparsely, and count by the mm."""
+    cell = tactile_map.recipe.cell_mm
+    side = max(1, round(1.0 / cell))
+    return float(np.count_nonzero(block_sums(tactile_map.covered.astype(np.float64), side))) * (side * cell) ** 2
 
 
 def _extremes(tactile_map: TactileMap) -> tuple[float, float]:
@@ -398,7 +407,7 @@ def against_no_lump(tactile_map: TactileMap) -> list[Finding]:
 
 def with_cause(error: BadDataError, findings: Iterable[Finding]) -> BadDataError:
     """Error of a map that cannot be made, with the first finding unlike an exam in its scans as the likely cause."""
-    causes = [one for one in findings if one.kind in ("poses_jump", "unlike_an_exam")]
+    causes = [one for one in findings if one.kind in ("poses_jump", "unlike_an_exam", "late_poses")]
     if not causes:
         return error
     return BadDataError(f"{error.what}, where {causes[0].text}", way_out=causes[0].remedy or _ONE_TOOL)

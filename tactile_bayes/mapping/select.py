@@ -153,6 +153,20 @@ def _regularity(name: str, times: list[FloatArray]) -> dict[str, float]:
     return {f"{name}_rate_hz": 1.0 / usual, f"{name}_jitter_ms": 1000.0 * float(regular.std())}
 
 
+RATE_HZ: Final = (5.0, 2000.0)  #: Rate of frames.
+_CLOCKS: Final = ((1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds"), (1 / 60, "minutes"))
+
+
+def rate_doubt(rate_hz: float) -> tuple[str, str] | None:
+    """Sentence and remedy for frames at a rate that no array gives; None for another."""
+    low, high = RATE_HZ
+    if low <= round(rate_hz, 6) <= high:
+        return None
+    units = [name for factor, name in _CLOCKS if low <= rate_hz * factor <= high]
+    remedy = f"are the times in {units[0]}? they must be in s" if units else "check the frames' times, which are in s"
+    return f"frames come at {rate_hz:.3g} Hz, and arrays give {low:g} to {high:g}", remedy
+
+
 def missing_records(time_s: FloatArray) -> int:
     """Number of frames, or poses, that are missing in the gaps."""
     steps, usual = intervals([time_s])
@@ -431,13 +445,31 @@ def refuse_without_frames(selections: list[SelectedFrames], *, pressure_window_k
 
 
 def _without_poses(selections: list[SelectedFrames]) -> BadDataError:
-    frames, poses = selections[0].scan.frames.time_s, selections[0].scan.poses.time_s
+    first = selections[0]
+    frames, poses, fresh = first.scan.frames.time_s, first.scan.poses.time_s, first.fresh.time_s
     if not len(poses):
         return BadDataError("the scan holds no tracker pose", way_out="import it with poses, or check the tracker")
-    return BadDataError(
+    if len(poses) > 1 and len(fresh) == 1:
+        what = f"the tracker's {len(poses)} poses are of one place: it froze"
+        return BadDataError(what, way_out="check the tracker, and scan again")
+    what = (
         f"no frame has a tracker pose (frames {frames[0]:.3f} to {frames[-1]:.3f} s, {len(poses)} poses "
-        f"{poses[0]:.3f} to {poses[-1]:.3f} s)",
-        way_out="check that both run on one clock and that the tracker did not freeze",
+        f"{poses[0]:.3f} to {poses[-1]:.3f} s"
+    )
+    apart_ms = 1000 * intervals([fresh])[1]
+    if apart_ms > cells.MAX_POSE_GAP_MS:
+        what += f", {apart_ms:.0f} ms apart: between them the head's place is not known)"
+        return BadDataError(what, way_out="set the tracker to 50 poses a second or more")
+    doubt = rate_doubt(1 / intervals([frames])[1]) if len(frames) > 1 else None
+    way_out = doubt[1] if doubt else f"{_short([first])}check that both run on one clock"
+    return BadDataError(f"{what})", way_out=way_out)
+
+
+def _short(selections: Sequence[SelectedFrames]) -> str:
+    """Beginning of a way out, where scans have too few frames."""
+    frames = sum(len(part.scan.frames) for part in selections)
+    return f"the scan has {frames} frame{'' if frames == 1 else 's'} only: record for longer; " * (
+        frames < LEAST_FRAMES
     )
 
 
@@ -448,14 +480,13 @@ def _outside_window(selections: list[SelectedFrames], window: tuple[float, float
     imported = session.get("source") == "imported"  # a recorder knows its unit
     question = unit_question(float(middle), session.get("frames_unit", "kPa"), window) if imported else ""
     more = "" if question else _counts_question([part.scan for part in selections])
-    frames = sum(len(part.scan.frames) for part in selections)
-    short = f"the scan has {frames} frames only: record for longer; " if frames < LEAST_FRAMES else ""
+    press = f"press {'harder' if middle < window[0] else 'less hard'}, or "
     return BadDataError(
         f"no frame's mean lies within {window[0]:g} to {window[1]:g} kPa ({len(levels)} frames, means "
         f"{levels.min():.2f} to {levels.max():.2f} kPa, median {middle:.2f}{f': {question}' if question else ''})",
-        way_out=("import it again with the right --unit; " if question else short)
-        + f"a window of {np.floor(low * 10) / 10:g} to {np.ceil(high * 10) / 10:g} kPa would keep nine in ten"
-        + (f", but {more}" if more else ""),
+        way_out=("import it again with the right --unit; " if question else _short(selections) + press)
+        + f"a window of {np.floor(low * 10) / 10:g} to {np.ceil(high * 10) / 10:g} kPa (--pressure-window-kpa) would "
+        "keep nine in ten" + (f", but {more}" if more else ""),
     )
 
 

@@ -208,6 +208,32 @@ def test_a_clock_that_stands_still_is_told_and_a_map_without_times_is_not_doubte
     assert "clock stands still" in exam_findings({**counted, "frames_missing": 0.0})[0].text
 
 
+@pytest.mark.parametrize(
+    ("figures", "told"),
+    [
+        ({"frames_used": 10.0, "dropped_high": 480.0}, "press less hard"),
+        ({"frames_used": 10.0, "dropped_low": 480.0}, "press harder"),
+        ({"frames_used": 10.0, "dropped_no_pose": 480.0}, "check the tracker and its times"),
+        ({"frames_used": 10.0, "frames_total": 10.0}, "scan for longer"),
+        ({"frames_used": 10.0, "frames_total": 10.0, "frames_every": 50.0, "frame_rate_hz": 2.0}, "use more frames"),
+        ({"frames_used": 480.0, "frame_rate_hz": 4.9999999999}, None),
+        ({"frames_used": 480.0, "frame_rate_hz": 2.0, "frames_every": 50.0}, None),
+    ],
+)
+def test_what_is_to_be_done_about_few_frames_follows_from_why_they_are_few(
+    figures: dict[str, float], told: str | None
+) -> None:
+    findings = exam_findings({"frames_total": 500.0, **figures})
+    assert [one.remedy.startswith(str(told)) for one in findings] == ([] if told is None else [True])
+
+
+def test_a_map_of_few_frames_or_of_fine_cells_is_not_of_a_head_that_stood_still() -> None:
+    few = scan()
+    few = replace(few, frames=PressureFrames(few.frames.time_s[:10], few.frames.counts[:10]))
+    for one, cell_mm in ((few, 1.0), (scan(), 0.1)):
+        assert not [each for each in build_map(one, cell_mm=cell_mm).findings if "stood still" in each.text]
+
+
 # --- trackers that stand still
 
 
