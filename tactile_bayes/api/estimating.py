@@ -17,7 +17,7 @@ from tactile_bayes.files.npz import CheckpointFile
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.size_json import SHIPPED, default_for, read_size_calibration, size_calibration_path
 from tactile_bayes.findings import by_severity
-from tactile_bayes.mapping.map import TactileMap, many_cells
+from tactile_bayes.mapping.map import TactileMap, many_cells, side_findings
 from tactile_bayes.options import PRIORS, FitSettings
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import OTHER_HEAD, calibration_for, estimate_map, recipe_differences
@@ -167,14 +167,15 @@ def _with_place(
 ) -> Estimate:
     """Add the findings on the places of the masses: side, landmarks, and masses that may be one."""
     places = [estimate_document.patient_mm(tactile_map, one.x_mm, one.y_mm) for one in estimate.masses if one.reported]
-    side = estimate_document.side_findings(estimate_document.side_of(scans), places[0] if places else None)
+    side = side_findings(estimate_document.side_of(scans), places[0] if places else None)
+    others = [one for one in estimate.findings if not side or one.kind != "side"]  # the map's is of the scanned place
     sized = [
         (number, (one.x_mm, one.y_mm), one.estimate.size.summarise("max_size_mm", probability=probability))
         for number, one in enumerate(estimate.masses, start=1)
         if one.estimate.size is not None
     ]
     touching = estimate_document.touching_findings(estimate_document.touching_masses(sized))
-    return replace(estimate, findings=by_severity((*side, *estimate.findings, *touching)))
+    return replace(estimate, findings=by_severity((*side, *others, *touching)))
 
 
 def named_calibration(settings: Settings, normalise: str) -> tuple[Path | None, Calibration | None]:

@@ -15,7 +15,16 @@ from tactile_bayes.mapping import accumulate, latency, select
 from tactile_bayes.mapping.arrangement import check_arrangement
 from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, CellSums, HeadMoments, head_moments
 from tactile_bayes.mapping.convention import check_convention, convention_findings, convention_way_out
-from tactile_bayes.mapping.map import FEW_READINGS, MapRecipe, TactileMap, broken_assumptions, handling_findings, smooth
+from tactile_bayes.mapping.map import (
+    FEW_READINGS,
+    LEAST_STROKES,
+    MapRecipe,
+    TactileMap,
+    broken_assumptions,
+    handling_findings,
+    side_findings,
+    smooth,
+)
 from tactile_bayes.mapping.plausibility import exam_figures, exam_findings, map_findings, with_cause
 from tactile_bayes.mapping.profile import evenness_figures, head_profile_figures, motion, pose_noise_figures
 from tactile_bayes.mapping.select import SelectedFrames
@@ -158,6 +167,7 @@ def build_map(
     figures |= exam_figures(selections)
     findings = _numbered([select.scan_findings(scan) for scan in every_frame])
     try:
+        findings += _arrangement_findings(selections, late_ms, figures, refuse=not settings.as_stated)
         return _build(
             findings, selections, settings, figures, late_ms=late_ms, gap_ms=max_pose_gap_ms, progress=progress
         )
@@ -166,7 +176,7 @@ def build_map(
 
 
 def _build(
-    scan_findings: tuple[Finding, ...],
+    findings: tuple[Finding, ...],
     selections: list[SelectedFrames],
     settings: MapOptions,
     figures: dict[str, float],
@@ -176,7 +186,6 @@ def _build(
     progress: Progress,
 ) -> TactileMap:
     """Map of the selected frames; adds its figures to `figures`."""
-    findings = scan_findings + _arrangement_findings(selections, late_ms, figures, refuse=not settings.as_stated)
     figures |= head_profile_figures(selections)
     if settings.flat_field:
         selections = _select(_flattened(selections, figures), settings, late_ms, gap_ms)
@@ -200,7 +209,8 @@ def _build(
     cells = accumulate.accumulate(sources, cell_mm=settings.cell_mm, normalise=settings.normalise, progress=progress)
     figures |= accumulate.shared_frame_figures(sources, cells.levels, cells.sums)
     figures |= evenness_figures(selections, plane) | latency.stroke_lag_figures(sources)
-    figures["stroke_count"] = float(latency.stroke_count(sources))
+    figures["stroke_count"] = float(strokes_across := latency.stroke_count(sources))
+    lengthwise = latency.stroke_count(sources, axis=1) if strokes_across < LEAST_STROKES else 0
     low, high = map(float, settings.pressure_window_kpa)
     recipe = MapRecipe(
         "scan",
@@ -211,7 +221,7 @@ def _build(
         settings.flat_field,
         settings.register_strokes,
     )
-    return _as_map(cells, selections, plane, recipe, figures, findings=findings)
+    return _as_map(cells, selections, plane, recipe, figures, findings=findings, strokes_lengthwise=lengthwise)
 
 
 def _flattened(selections: list[SelectedFrames], figures: dict[str, float]) -> list[Scan]:
@@ -289,9 +299,12 @@ def _as_map(
     figures: dict[str, float],
     *,
     findings: tuple[Finding, ...],
+    strokes_lengthwise: int,
 ) -> TactileMap:
     sums, scans = cells.sums.trimmed(), [part.scan for part in selections]
     patient, nipple, spread = _landmarks(scans, plane)
+    sides = [scan.session.get("side", "") for scan in scans]
+    centre = None if patient is None else patient[:2, 3].tolist()  # the plane's origin is the middle of the frames
     parts = [(f"scan {number} " if len(scans) > 1 else "", part) for number, part in enumerate(selections, start=1)]
     quality = {
         **select.frame_figures(selections),
@@ -318,8 +331,9 @@ def _as_map(
         head=_head(scans),
     )
     quality_findings = (
+        *side_findings(next(filter(None, sides), ""), centre, "the scanned place"),
         *convention_findings(quality, findings),
-        *broken_assumptions(quality),
+        *broken_assumptions(quality, strokes_lengthwise=strokes_lengthwise),
         *handling_findings(quality),
     )
     return replace(tactile_map, findings=by_severity((*map_findings(tactile_map), *quality_findings, *findings)))

@@ -381,11 +381,10 @@ def find_strokes(sources: Sequence[FrameSource]) -> list[StrokeShift]:
     ]
 
 
-def stroke_count(sources: Sequence[FrameSource]) -> int:
-    """Number of strokes along x; runs less than half as long as the longest are turns or corrections."""
-    lengths = [
-        float(np.ptp(sources[run.scan].projection.shift[run.start : run.stop, 0])) for run in find_strokes(sources)
-    ]
+def stroke_count(sources: Sequence[FrameSource], *, axis: int = 0) -> int:
+    """Number of strokes along x, or y (1); runs less than half as long as the longest are turns or corrections."""
+    paths = [source.projection.shift[:, axis] * source.projection.cell_mm for source in sources]
+    lengths = [float(np.ptp(path[a:b])) for path in paths for a, b, _ in convention.strokes_along(path)]
     longest = max(lengths, default=0.0)
     return sum(length >= longest / 2 for length in lengths)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Final
 
 import numpy as np
@@ -186,14 +186,18 @@ MOST_CURVATURE_PER_M = 4.0
 MOST_LAG_MM = 1.2  #: A latency of 12 ms left in the poses makes up to 0.75 mm at a hand's 60 mm/s.
 LEAST_STROKES = 4
 """As in the exams that sizes were learned from: 3 strokes, 8 mm apart, made sizes 6 % larger (record 0123)."""
+MOST_USED = 0.7  #: Share of the frames below which strokes may be missing for the frames that are left out.
 LEAST_COVERAGE = 0.5  #: A strip of the plane narrower than the head itself shows no lump's flanks.
 MOST_TILT_DEG = 10.0
 MOST_YAW_DEG = 15.0
 _ERRORS = 2.5  #: Standard errors by which a figure must exceed 0, besides its limit.
 
 
-def broken_assumptions(quality: Mapping[str, float]) -> Iterator[Finding]:
-    """Findings from a map's `quality` figures against the assumptions of a size; missing figures give none."""
+def broken_assumptions(quality: Mapping[str, float], *, strokes_lengthwise: int = 0) -> Iterator[Finding]:
+    """Findings from a map's `quality` figures against the assumptions of a size; missing figures give none.
+
+    `strokes_lengthwise`: number of strokes along the head, counted where there are few across it.
+    """
     if lag := _beyond(quality, "stroke_lag_mm", "stroke_lag_sd_mm", MOST_LAG_MM):
         cause = "each dragged it along" if lag > 0 else "the tracker's positions came late"
         text = (
@@ -221,14 +225,43 @@ def broken_assumptions(quality: Mapping[str, float]) -> Iterator[Finding]:
             "moved by 7 %)"
         )
         yield finding("curved_skin", text)
-    strokes = quality.get("stroke_count", LEAST_STROKES)
-    if strokes < LEAST_STROKES:
+    strokes, remedy = (
+        quality.get("stroke_count", LEAST_STROKES),
+        f"scan with {LEAST_STROKES} strokes or more, side by side",
+    )
+    if strokes < min(LEAST_STROKES, strokes_lengthwise):
+        text = f"the {strokes_lengthwise} strokes run along the head, and sizes were learned from strokes across it"
+        remedy = "scan with the head's long side square to the strokes"
+        yield finding("few_strokes", text, remedy, remedy)
+    elif strokes < LEAST_STROKES:
+        total, used = quality.get("frames_total", 0.0), quality.get("frames_used", 0.0)
+        whose = f"the {used:.0f} frames used make" if used < MOST_USED * total else "the scan has"
         text = (
-            f"the scan has {strokes:.0f} stroke{'' if strokes == 1 else 's'} only, and sizes were learned from 4 to 7 "
+            f"{whose} {strokes:.0f} stroke{'' if strokes == 1 else 's'} only, and sizes were learned from 4 to 7 "
             "(simulated ones from 3 came out 6 % large)"
         )
-        remedy = f"scan with {LEAST_STROKES} strokes or more, side by side"
         yield finding("few_strokes", text, remedy, remedy)
+
+
+MIDDLE_MM: Final = 20.0
+"""So far from the xiphoid a place is on that side of the body, whatever is wrong with the landmarks' direction."""
+
+
+def side_findings(side: str, patient_mm: Sequence[float] | None, what: str = "the lump") -> tuple[Finding, ...]:
+    """Caution where the landmarks put the lump, or `what`, on the other side of the body than the scans say.
+
+    `patient_mm`: from the xiphoid to the patient's right and up; None without landmarks or a lump.
+    """
+    if side not in ("left", "right") or patient_mm is None or abs(patient_mm[0]) < MIDDLE_MM:
+        return ()
+    other = "right" if patient_mm[0] > 0 else "left"
+    if other == side:
+        return ()
+    place = f"the landmarks put {what} {abs(patient_mm[0]):.0f} mm to the patient's {other} of the xiphoid"
+    text = f"the scan says {side} breast, and {place}: side or landmarks are wrong"
+    check = "check which breast it was, and that sternal notch and xiphoid are not exchanged"
+    correct = "`import SCAN.mcap -o NEW.mcap` corrects them by --session and --landmarks"
+    return (finding("side", text, f"{check}; {correct}", check),)
 
 
 def handling_findings(quality: Mapping[str, float]) -> Iterator[Finding]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from itertools import combinations
-from typing import Any, Final, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from tactile_bayes.files.reports import EstimateReport, MassReport
 from tactile_bayes.findings import Finding, capitalised, finding, verdict
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.inference.draws import Quantity, summarise
-from tactile_bayes.mapping.clock import SIDES, ClockPosition, Position, clock_position, clock_text
+from tactile_bayes.mapping.clock import ClockPosition, Position, clock_position, clock_text
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.draw import MapPosterior
@@ -66,9 +66,6 @@ def another_exam(size: SizePosterior | None, *, probability: float) -> reports.A
 
 # --- Place of a lump in the breast, by clock and distance from the nipple, of an estimate and in words.
 
-MIDDLE_MM: Final = 20.0
-"""So far from the xiphoid a lump is on that side of the body, whatever is wrong with the landmarks' direction."""
-
 
 def side_of(scans: Sequence[Mapping[str, str]]) -> str:
     """The breast's side in `Provenance.scans`; empty where the scans do not agree."""
@@ -106,21 +103,6 @@ def from_xiphoid(x_mm: float, y_mm: float) -> str:
     """A place in the patient's axes, in words."""
     across = f"{abs(x_mm):.0f} mm to the patient's {'right' if x_mm >= 0 else 'left'}"
     return f"{across} of the xiphoid and {abs(y_mm):.0f} mm {'above' if y_mm >= 0 else 'below'} it"
-
-
-def side_findings(side: str, patient_mm: tuple[float, float] | None) -> tuple[Finding, ...]:
-    """Caution where the landmarks put a lump on the other side of the body than the scans say; empty where they do not.
-
-    `side`: as `side_of` gives it; `patient_mm`: from the xiphoid to the patient's right and up; None without landmarks
-    or a lump.
-    """
-    if side not in SIDES or patient_mm is None or abs(patient_mm[0]) < MIDDLE_MM:
-        return ()
-    other = "right" if patient_mm[0] > 0 else "left"
-    if other == side:
-        return ()
-    place = f"the landmarks put the lump {abs(patient_mm[0]):.0f} mm to the patient's {other} of the xiphoid"
-    return (finding("side", f"the scan says {side} breast, and {place}: side or landmarks are wrong"),)
 
 
 # --- Masses of a map that may be one lump: whether they touch, and how long they are together.

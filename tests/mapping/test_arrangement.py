@@ -244,6 +244,12 @@ def test_another_clock_is_named_with_its_sign(late_ms):
 
 
 @pytest.mark.long
+def test_a_clock_too_far_off_to_be_estimated_is_named_where_it_is_asked_for():
+    with pytest.raises(BadDataError, match=r"does not determine .*; map it with latency_ms=3[01]0$"):
+        tb.build_map(later(lump(), 300.0), latency_ms="auto")
+
+
+@pytest.mark.long
 def test_the_latency_that_is_stated_is_what_the_clock_is_held_against():
     late = select_frames(later(lump(), 300.0), pressure_window_kpa=(5.0, 14.0), latency_ms=300.0)
     right = check_arrangement(late, latency_ms=300.0)

@@ -7,7 +7,7 @@ import pytest
 from numpy.polynomial import legendre
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes, Tracker, head_poses
+from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, Strokes, Tracker, head_poses
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import broken_assumptions, skewed
@@ -118,6 +118,20 @@ def test_strokes_are_counted_and_few_of_them_told(lines: int) -> None:
     checks = [text for text in told(found, "check") if "stroke" in text]
     assert len(checks) == (lines < 4)
     assert all(f"has {lines} stroke{'s' if lines > 1 else ''} only" in text for text in checks)
+
+
+@pytest.mark.parametrize(
+    ("yaw_deg", "mean_kpa", "words"),
+    [
+        (90.0, 9.5, "the 5 strokes run along the head, and sizes were learned from strokes across it; scan with the"),
+        (0.0, 15.0, "the 106 frames used make 3 strokes only"),
+    ],
+)
+def test_strokes_along_the_head_or_left_out_are_not_called_few(yaw_deg: float, mean_kpa: float, words: str) -> None:
+    pressed = Background(mean_kpa, drift_kpa=1.5, ramp_s=0.0)
+    one = scan_of(scene(strokes=Strokes(yaw_deg=yaw_deg), background=pressed))
+    (text,) = (each.sentence() for each in build_map(one).findings if each.kind == "few_strokes")
+    assert words in text
 
 
 def test_a_figure_that_its_error_does_not_tell_from_0_says_nothing() -> None:

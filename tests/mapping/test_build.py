@@ -31,6 +31,9 @@ def wide_scan(**options) -> Scan:
     return scans.make_scan(scans.even_centres(), head=scans.flat_head(rows=32, columns=32), **options)
 
 
+EXCHANGED = Landmarks(MARKS.xiphoid_mm, MARKS.sternal_notch_mm)
+
+
 def stroke_scan(**options) -> Scan:
     options.setdefault("field", scans.gaussian(x=3.0, y=-2.0))
     return scans.make_scan(scans.strokes(), landmarks=MARKS, **options)
@@ -271,15 +274,24 @@ def frozen() -> Scan:
     scan = stroke_scan()
     position = np.broadcast_to(scan.poses.position_mm[:1], (120, 3))
     quaternion = np.broadcast_to(scan.poses.quaternion_wxyz[:1], (120, 4))
-    late = PressureFrames(scan.frames.time_s + 0.001, scan.frames.counts)
-    return replace(scan, frames=late, poses=TrackerPoses(scan.poses.time_s, position, quaternion))
+    return replace(between_poses(), poses=TrackerPoses(scan.poses.time_s, position, quaternion))
+
+
+def between_poses() -> Scan:
+    scan = stroke_scan()
+    return replace(scan, frames=PressureFrames(scan.frames.time_s + 0.001, scan.frames.counts))
+
+
+def with_poses(scan: Scan, kept: slice) -> Scan:
+    poses = scan.poses
+    return replace(scan, poses=TrackerPoses(poses.time_s[kept], poses.position_mm[kept], poses.quaternion_wxyz[kept]))
 
 
 REFUSED = {
     "pressed too lightly": (
         lambda: stroke_scan(field=scans.uniform, levels_kpa=np.linspace(1, 3, 120)),
         r"no frame's mean lies within 5 to 14 kPa \(120 frames, means 1.00 to 3.00 kPa, median 2.00\); "
-        r"a window of 1.1 to 2.9 kPa would keep nine in ten",
+        r"press harder, or a window of 1.1 to 2.9 kPa \(--pressure-window-kpa\) would keep nine in ten",
     ),
     "a few frames": (
         lambda: scans.part(stroke_scan(levels_kpa=np.linspace(1, 3, 120)), slice(0, 20)),
@@ -287,7 +299,19 @@ REFUSED = {
     ),
     "a line": (line_scan, "lie on a line .*strokes side by side"),
     "other times": (no_overlap, r"no frame has a tracker pose \(frames 160.000 to 161.190 s, 120 poses 100.000"),
-    "frozen tracker": (frozen, "no frame has a tracker pose .*did not freeze"),
+    "times in ms": (
+        lambda: replace(stroke_scan(), frames=PressureFrames(10.0 * np.arange(120.0) + 5, stroke_scan().frames.counts)),
+        "no frame has a tracker pose .*are the times in milliseconds",
+    ),
+    "few poses a second": (
+        lambda: with_poses(between_poses(), slice(None, None, 12)),
+        "10 poses .*, 120 ms apart: between them .*set the tracker to 50 poses a second",
+    ),
+    "one frame before the poses": (
+        lambda: with_poses(scans.part(stroke_scan(), slice(0, 1)), slice(5, None)),
+        "the scan has 1 frame only: record for longer; check that both run on one clock",
+    ),
+    "frozen tracker": (frozen, "the tracker's 120 poses are of one place: it froze; check the tracker"),
     "no pose": (
         lambda: replace(stroke_scan(), poses=TrackerPoses(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4)))),
         "holds no tracker pose",
@@ -332,6 +356,17 @@ def test_scans_without_a_map_are_refused_in_one_line(make, message):
 def test_options_out_of_range_are_refused(options, message):
     with pytest.raises(UsageError, match=message):
         build_map(stroke_scan(), **options)
+
+
+@pytest.mark.parametrize("side", ["left", "right", "phantom", ""])
+def test_exchanged_landmarks_are_told_by_the_breast(side):
+    """The right ones put the scan to the patient's left, exchanged ones to the right."""
+    for marks, place in ((MARKS, "left"), (EXCHANGED, "right")):
+        made = build_map(replace(stroke_scan(), session={"side": side}, landmarks=marks))
+        findings = [one.text for one in made.findings if one.kind == "side"]
+        told = f"the scan says {side} breast, and the landmarks put the scanned place 60 mm to the patient's {place} of"
+        wrong = side in ("left", "right") and side != place
+        assert [text.startswith(told) for text in findings] == [True] * wrong
 
 
 def test_scans_that_do_not_belong_together_are_refused():

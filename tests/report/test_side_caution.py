@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tactile_bayes.report.estimate_document import side_findings
+from tactile_bayes.mapping.map import side_findings
 
 WORDS = (
     "the scan says left breast, and the landmarks put the lump 60 mm to the patient's right of the xiphoid: side or "
@@ -28,4 +28,4 @@ WORDS = (
 )
 def test_it_is_told_where_both_are_known_and_disagree(side: str, place: tuple[float, float] | None, told: str) -> None:
     found = side_findings(side, place)
-    assert [one.sentence() for one in found] == ([told.replace("RIGHT", "right")] if told else [])
+    assert [one.text for one in found] == ([told.replace("RIGHT", "right")] if told else [])
