@@ -202,7 +202,8 @@ class WholeRange(click.IntRange):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         with contextlib.suppress(click.BadParameter):
             return super().convert(value, param, ctx)
-        return self.fail(f"{str(value)!r} is not {number_words(self.min, self.max, (), whole=True)}", param, ctx)
+        again = "; repeat the option for each of several" if param is not None and param.multiple else ""
+        return self.fail(f"{str(value)!r} is not {number_words(self.min, self.max, (), whole=True)}{again}", param, ctx)
 
 
 class NumberOr(_ParamType):

@@ -42,7 +42,11 @@ def validate_command() -> None:
 
 
 @options.command("plan", "trial.plan_action")
-@options.record_options(PlanOptions, "patients", "maps", "power", "precision")
+@options.record_options(PlanOptions, "patients", help="Number of patients, one mass each; may be repeated.")
+@options.record_options(
+    PlanOptions, "maps", help="Number of tactile maps per mass, 3 with --power or --precision; may be repeated."
+)
+@options.record_options(PlanOptions, "power", "precision")
 @options.record_options(PlanErrors)
 @options.path_option("--pilot", "TRIAL.csv", "Take the errors that no option gives from this trial; needs --excision.")
 @options.path_option("--excision", "EX.csv", "Sizes measured after excision in the pilot.")

@@ -274,11 +274,18 @@ def _check_header(header: Sequence[str], fields: Mapping[str, Any], *, wide: str
 
 def _advice_on_column(name: str, header: Sequence[str], fields: Mapping[str, Any]) -> str:
     """Way out for an unknown column: give the other table (trial and excision exchanged), or correct the name."""
-    for kind, contents in (("trial", "readings"), ("excision", "sizes after excision")):
-        fields_of_other = {field["name"]: field for field in load_schema(f"{kind}.table.json")["fields"]}
-        needed = {name for name, field in fields_of_other.items() if _is_required(field)}
-        if list(fields_of_other) != list(fields) and needed <= set(header) <= set(fields_of_other):
-            return f"this is the table of {contents}: give the other one here"
+    trial_tables = {
+        contents: {field["name"]: field for field in load_schema(f"{kind}.table.json")["fields"]}
+        for kind, contents in (("trial", "readings"), ("excision", "sizes after excision"))
+    }
+    other_one = any(list(known) == list(fields) for known in trial_tables.values())
+    for contents, known in trial_tables.items():
+        needed = {name for name, field in known.items() if _is_required(field)}
+        if list(known) != list(fields) and needed <= set(header) <= set(known):
+            way_out = "give the other one here" if other_one else f"the columns here are {_names(fields)}"
+            return f"this is a trial's table of {contents}: {way_out}"
+    if set(fields).isdisjoint(header):
+        return f"this is another table; the columns here are {_names(fields)}"
     name = name.strip().lower()
     stem, _, unit = name.rpartition("_")
     if unit in MM_PER_UNIT and unit != "mm" and f"{stem}_mm" in fields:
@@ -380,6 +387,13 @@ def _parse_number(text: str, field: Mapping[str, Any]) -> float:
             what = f"{_shown(text)} has a comma that may separate thousands or decimals"
             raise BadDataError(what, way_out=f"write {whole}{rest} or {whole}.{rest}, whichever is meant")
         raise BadDataError(f"{_shown(text)} has a decimal comma", way_out=f"write {whole}.{rest}")
+    if text[0] in "<>≤≥":
+        raise BadDataError(
+            f"{_shown(text)} is a bound, not a number", way_out="give the number measured, or leave it out"
+        )
+    if text.endswith("%"):
+        way_out = "write the number that is meant without it, as 12.5 or 0.125"
+        raise BadDataError(f"{_shown(text)} has a percent sign", way_out=way_out)
     unit = " in mm" if field["name"].endswith("_mm") else ""
     raise BadDataError(f"{_shown(text)} is not a number", way_out=f"write digits only{unit}; {_blank_advice(field)}")
 

@@ -18,6 +18,12 @@ DIGITS: Final = 12  #: Of the numbers of `validate`'s file, so that the order of
 # --- Text of a trial plan: one line per design, then the benefit of more maps.
 
 
+_NO_MASS_SD: Final = (
+    "The pilot's masses differ no more than maps of one mass do, so its mass sd is taken as 0: with few masses that is "
+    "chance; see what --mass-sd 0.1 makes of the plan."
+)
+
+
 def plan_text(plan: PlanReport) -> str:
     """Full text of a plan, ending with the research-use line."""
     by_option = [name for name, source in plan.errors_from.items() if source == "option"]
@@ -26,6 +32,7 @@ def plan_text(plan: PlanReport) -> str:
         *map(needed_sentence, plan.needed),
         f"Assumed errors of ln size: {_errors(plan, plan.errors)}",
         *([f"Given by options: {_errors(plan, by_option)}; the others are the pilot's."] if piloted else []),
+        *([_NO_MASS_SD] if plan.errors["mass_sd"] == 0 and plan.errors_from["mass_sd"] == "pilot" else []),
         "",
         "                                     mean error, %     interval, factor",
         "patients  maps  power                 tactile  other   tactile   ratio",

@@ -116,6 +116,20 @@ def test_a_pilot_gives_the_errors() -> None:
     assert errors["other_miss"] == pytest.approx(1 / 25)
 
 
+def test_masses_that_scatter_no_more_than_their_maps_are_told(tmp_path: Path) -> None:
+    """The SD between masses is the root of a difference of variances, which chance makes negative."""
+    readings, sizes = ["patient,mass,modality,replicate,size_mm,status"], ["patient,mass,ex_vivo_mm"]
+    for i in range(4):
+        readings += [f"P{i},1,tactile,{n},{size},detected" for n, size in ((1, 9), (2, 11.1))]
+        readings.append(f"P{i},1,ultrasound,1,{8 + i},detected")
+        sizes.append(f"P{i},1,10")
+    for name, lines in (("trial", readings), ("excision", sizes)):
+        (tmp_path / f"{name}.csv").write_text("\n".join(lines) + "\n")
+    pilot = ("--pilot", tmp_path / "trial.csv", "--excision", tmp_path / "excision.csv")
+    assert "its mass sd is taken as 0" in plan(*SMALL, *pilot).stdout
+    assert "its mass sd is taken as 0" not in plan(*SMALL, *pilot, "--mass-sd", 0).stdout
+
+
 def test_refusals_name_the_way_out() -> None:
     assert isinstance(plan(*SMALL, "--pilot", DEMO / "trial.csv").exception, UsageError)
     pilot = ("--pilot", DEMO / "trial.csv", "--excision", DEMO / "excision.csv")

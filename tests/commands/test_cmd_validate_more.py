@@ -86,6 +86,8 @@ def test_a_wide_table_is_read_by_its_mapping(tmp_path: Path) -> None:
     [
         (WIDE.replace("1.2", "0"), MAPPING, 'line 2, column us_cm: is 0; does 0 mean that the mass was not found'),
         (WIDE.replace("1.2", "about 1"), MAPPING, "line 2, column us_cm: 'about 1' is not a number"),
+        (WIDE.replace("1.2", "<1"), MAPPING, "'<1' is a bound, not a number; give the number measured"),
+        (WIDE.replace("1.2", "1.2%"), MAPPING, "'1.2%' has a percent sign; write the number that is meant without it"),
         (WIDE.replace("P2", "P1"), MAPPING, "stands on line 2 already"),
         (WIDE.replace("P2", ""), MAPPING, "line 3"),
         (WIDE, MAPPING.replace("map2", "map3"), "column map3: is missing"),
@@ -381,7 +383,13 @@ def test_a_ratio_over_no_error_and_lines_through_one_mass_are_reasons(tmp_path: 
 
 
 def test_exchanged_tables_and_readings_without_excision_are_told_apart(tmp_path: Path) -> None:
-    assert "this is the table of readings: give the other one here" in refusal(EXCISION, "--excision", TRIAL)
-    assert "this is the table of sizes after excision" in refusal(EXCISION, "--excision", EXCISION)
+    assert "this is a trial's table of readings: give the other one here" in refusal(EXCISION, "--excision", TRIAL)
+    assert "this is a trial's table of sizes after excision" in refusal(EXCISION, "--excision", EXCISION)
     words = small(tmp_path, [("A", 1, "tactile", 10.0), ("B", 1, "tactile", 12.0)], [("A", 1, 11.0)])
     assert "or leave its readings out" in refusal(*words)
+    for table, contents in ((TRIAL, "readings"), (EXCISION, "sizes after excision")):
+        with pytest.raises(BadDataError, match=f"this is a trial's table of {contents}: the columns here are "):
+            tactile_bayes.calibrate_size(table)
+    assert "this is another table; the columns here are patient, mass, modality" in refusal(
+        TRIAL.with_name("phantoms.csv"), "--excision", EXCISION
+    )
