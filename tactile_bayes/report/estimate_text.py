@@ -54,14 +54,19 @@ SOURCES = {
 }
 
 
+def spread_percent(spread: float) -> str:
+    """A spread between exams in percent, to a tenth: whole ones made 2 and 3 of what is 2.5 on all maps."""
+    return f"{100 * spread:.1f}".removesuffix(".0") + " %"
+
+
 def exams_label(spread: float | None) -> str:
     """The spread between exams that an interval supposes; `spread` is a share of the size, None for no spread."""
-    return f"if exams differ by {100 * spread:.0f} %" if spread is not None else "if exams do not differ"
+    return f"if exams differ by {spread_percent(spread)}" if spread is not None else "if exams do not differ"
 
 
 def two_intervals_text(this: float | None, another: float) -> str:
     """Both spreads that the intervals of a size suppose; `this`: of the narrower one, None for no spread."""
-    alike = "no spread" if this is None else f"{100 * this:.0f} %"
+    alike = "no spread" if this is None else spread_percent(this)
     return (
         f"The intervals of the sizes suppose that exams of one mass differ by {100 * another:.0f} %, as those of "
         f"patients did in the paper; the narrower one supposes {alike}, as those of simulated bodies do: what exams "

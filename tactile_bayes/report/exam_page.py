@@ -10,7 +10,7 @@ from tactile_bayes.posterior.verdict import SHARE_WITH_LUMP, chance_text
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.report import exam_words, svg
 from tactile_bayes.report.estimate_document import size_words
-from tactile_bayes.report.estimate_text import width_lines
+from tactile_bayes.report.estimate_text import spread_percent, width_lines
 from tactile_bayes.report.exam_words import ShownExam, headline
 from tactile_bayes.report.pages import cut, foot, page
 
@@ -93,6 +93,6 @@ def _intervals(exam: ShownExam, size: Quantity) -> list[tuple[str, Quantity]]:
     narrow_size = exam.report.max_size_mm
     if another is None or narrow_size is None:
         return [("this exam" if exam.pooled is None else "these exams", size)]
-    narrow = "exams alike" if alike is None else f"if exams differ by {100 * alike:.0f} %"
+    narrow = "exams alike" if alike is None else f"if exams differ by {spread_percent(alike)}"
     patients = f"as exams of patients differ, {100 * another.between_map_sd:.0f} %"
     return [(patients, size), (narrow, narrow_size)]

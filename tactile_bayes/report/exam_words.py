@@ -21,7 +21,7 @@ from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
 from tactile_bayes.mapping.plausibility import WHY_NOT
 from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.report.estimate_document import from_xiphoid, other_masses, patient_mm, share_words, size_words
-from tactile_bayes.report.estimate_text import shape_text, smallest_text
+from tactile_bayes.report.estimate_text import shape_text, smallest_text, spread_percent
 from tactile_bayes.report.map import ellipse_of
 from tactile_bayes.report.pages import cut
 from tactile_bayes.size.pooling import DISAGREE
@@ -193,7 +193,7 @@ def size_sentences(exam: ShownExam) -> Iterator[str]:
     yield f"With a probability of {share} it lies between {size.low:.1f} and {size.high:.1f} mm{_supposed(exam)}."
     alike, spread = report.max_size_mm, report.figures.get("between_map_sd")
     if report.another_exam is not None and alike is not None:
-        differ = "did not differ" if spread is None else f"differed by {100 * spread:.0f} % only"
+        differ = "did not differ" if spread is None else f"differed by {spread_percent(spread)} only"
         learned = "as these maps suggest" if exam.pooled is not None else "as those of simulated bodies do"
         yield (
             f"If exams of one lump {differ}, {learned}, it would lie between {alike.low:.1f} and {alike.high:.1f} mm "
@@ -219,7 +219,7 @@ def _supposed(exam: ShownExam) -> str:
     at_site = report.figures.get("repeatability") if exam.pooled is None else exam.pooled.site_words
     if at_site and exam.pooled is None:
         return f"; {at_site}"
-    words = f"; exams of a lump are taken to differ by {100 * spread:.0f} %"
+    words = f"; exams of a lump are taken to differ by {spread_percent(spread)}"
     if at_site:
         return f"{words}, by these maps and this site's other exams"
     stated = report.origin.settings.get("between_map_sd")
@@ -227,7 +227,7 @@ def _supposed(exam: ShownExam) -> str:
         return f"{words}, as was stated"
     if exam.pooled is not None:
         return f"{words}, learned from these maps"
-    return f", if exams of a lump differ by {100 * spread:.0f} %, as those of simulated bodies do"
+    return f", if exams of a lump differ by {spread_percent(spread)}, as those of simulated bodies do"
 
 
 def nothing_sentences(exam: ShownExam) -> Iterator[str]:

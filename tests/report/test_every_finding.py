@@ -341,7 +341,7 @@ def test_python_begins_with_the_caution(kind: str) -> None:
 
 def test_a_notebook_has_both_intervals_and_the_probability() -> None:
     table = words_of(sound()[0]._repr_html_())
-    assert re.search(r"largest size if exams differ by \d % +\d+\.\d mm", table)
+    assert re.search(r"largest size if exams differ by 2\.\d % +\d+\.\d mm", table)
     assert re.search(r"probability of a lump +0\.9\d", table)
 
 
