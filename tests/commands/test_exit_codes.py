@@ -90,6 +90,7 @@ def test_what_nohup_ignores_stays_ignored() -> None:
             "No such command 'exam.mcap'; the command stands first: `tactile-bayes show FILE` says what a file is; "
             "see `tactile-bayes --help`",
         ),
+        (
             ("plan", "--maps", "1,3"),
             "Invalid value for '--maps': '1,3' is not a whole number from 1 to 1000; repeat the option for each of "
             "several; see `tactile-bayes plan --help`",
