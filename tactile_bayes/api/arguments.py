@@ -159,7 +159,7 @@ def path_of(path: PathLike | None) -> Path | None:
         raise UsageError(f"a path is wanted, not {type(path).__name__}; give it as text or pathlib.Path")
     if not os.fspath(path):
         raise UsageError("the path is empty; give the name of a file or folder")
-    return Path(path).expanduser()
+    return Path(os.path.expanduser(path))  # noqa: PTH111 (~x may be a file)
 
 
 def required_path(path: PathLike, name: str) -> Path:

@@ -50,9 +50,10 @@ class FilePath(click.Path):
         """Record and return the path; refuse an output that another argument of the command reads or writes."""
         if self._addresses and "://" in str(value):
             return str(value)
-        if not value:
-            self.fail("the path is empty; give the name of a file or folder", param, ctx)
-        path = Path(os.fsdecode(super().convert(value, param, ctx)))
+        if str(value) in ("", "-"):
+            fault = "'-' (standard input or output) is not taken" if value else "the path is empty"
+            self.fail(f"{fault}; give the name of a file or folder", param, ctx)
+        path = Path(os.path.expanduser(os.fsdecode(super().convert(value, param, ctx))))  # noqa: PTH111 (~x may be a file)
         if ctx is not None and param is not None:
             written = param.name in WRITTEN
             seen: list[tuple[Path, bool]] = ctx.meta.setdefault(_SEEN, [])

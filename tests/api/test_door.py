@@ -301,6 +301,18 @@ def test_scans_are_short_to_look_at() -> None:
     assert simulated.startswith("<SimulatedScan of <Scan ")
 
 
+def test_a_tilde_is_the_home_folder_on_either_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No shell expands it behind `--output=`; a name of nobody's home broke Python down."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    away = f"{tmp_path / 'nofolder'} is not a directory"
+    assert away in run_here("simulate", DEMO / "scene.toml", "--output=~/nofolder/s.mcap", cwd=tmp_path).stderr
+    with pytest.raises(UsageError, match="nofolder is not a directory"):
+        tb.map_of(np.ones((30, 30)), spacing_mm=1, normalise="gain").save("~/nofolder/m.nc")
+    with pytest.raises(BadDataError, match=r"^~nobody-12/m.nc: cannot be read"):
+        tb.read_map("~nobody-12/m.nc")
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [

@@ -80,6 +80,11 @@ def test_what_nohup_ignores_stays_ignored() -> None:
             "see `tactile-bayes plan --help`",
         ),
         (
+            ("map", "scan.mcap", "-o", "-"),
+            "Invalid value for '-o' / '--output': '-' (standard input or output) is not taken; "
+            "give the name of a file or folder; see `tactile-bayes map --help`",
+        ),
+        (
             ("estimate", ""),
             "Invalid value for 'MAP.nc...': the path is empty; give the name of a file or folder; "
             "see `tactile-bayes estimate --help`",
