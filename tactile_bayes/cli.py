@@ -147,6 +147,8 @@ COLLECT_AFTER = 100_000
 
 def main() -> None:
     """Run the program; every known error becomes one line on stderr and its documented exit code."""
+    if sys.platform == "win32":
+        sys.exit("error: Windows is not supported; install and run tactile-bayes in WSL (Linux on Windows)")
     gc.set_threshold(COLLECT_AFTER)
     atexit.register(gc.freeze)  # the process ends: a last search for cycles gains nothing
     # The matrices here are small: more threads cost CPU and gain nothing, and workers would fight over the cores.

@@ -11,7 +11,7 @@ import pytest
 from in_process import run_here
 
 from tactile_bayes import errors
-from tactile_bayes.cli import GROUPS
+from tactile_bayes.cli import GROUPS, main
 from tactile_bayes.shell import interrupt_on_signals
 from tests.conftest import ROOT
 
@@ -106,6 +106,13 @@ def test_a_usage_error_is_one_line_without_the_usage(words: tuple[str, ...], sai
     """They came with two lines of usage before the line that says what is wrong."""
     done = run_here(*words, cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (errors.EXIT_USAGE, "", f"error: {said}\n")
+
+
+def test_windows_is_told_what_to_do_instead(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first command ended in a traceback: Windows has no SIGHUP."""
+    monkeypatch.setattr(sys, "platform", "win32")
+    with pytest.raises(SystemExit, match="Windows is not supported; .* in WSL"):
+        main()
 
 
 def test_no_words_at_all_are_answered_by_the_help(tmp_path: Path) -> None:
