@@ -111,7 +111,7 @@ def test_a_usage_error_is_one_line_without_the_usage(words: tuple[str, ...], sai
 def test_windows_is_told_what_to_do_instead(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first command ended in a traceback: Windows has no SIGHUP."""
     monkeypatch.setattr(sys, "platform", "win32")
-    with pytest.raises(SystemExit, match="Windows is not supported; .* in WSL"):
+    with pytest.raises(SystemExit, match=r"Windows is not supported; .* in WSL"):
         main()
 
 
