@@ -1,5 +1,5 @@
 # Two commands do all the set-up: `make demo` installs and runs the main job, `make test` installs and runs the tests.
-PYTHON ?= python3.11
+PYTHON ?= $(firstword $(foreach minor,11 12 13,$(shell command -v python3.$(minor))) python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
 
