@@ -27,7 +27,7 @@ _SETTINGS_FILE: Final = re.compile(r" in --settings FILE\.toml|--settings FILE\.
 _OPTION: Final = re.compile(r"(?<![\w-])--([a-z]+(?:-[a-z]+)*)(?: (-?[\d.]+|[a-z]+[A-Z]?[a-z]*\d*(?:-[a-z]+)*))?")
 _CHOICES: Final = (
     *("method", "normalise", "fidelity", "noise", "background", "scene", "form", "fit", "to", "size_calibration"),
-    *("level", "unit", "units", "length_unit", "time_unit", "pose_layout"),
+    *("level", "unit", "units", "length_unit", "time_unit", "pose_time_unit", "pose_layout"),
 )
 _FLAGS: Final = ("force", "same-mass", "register-strokes", "flat-field", "patient-id-from-scan", "invert-rotation")
 

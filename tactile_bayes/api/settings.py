@@ -21,7 +21,6 @@ else:
 # --- Settings of `estimate`, shared by the command line, Python and batches.
 
 GIVEN: Final = "given in Python"  #: Name of a calibration that is in no file.
-_SITE: Final = {"metavar": "SITE.json", "path": True}
 
 
 class Settings(FitSettings, kw_only=True):
