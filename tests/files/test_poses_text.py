@@ -234,7 +234,7 @@ FAULTS: dict[str, tuple[list[str], dict[str, Any], str]] = {
     "metres": (
         ["t,x,y,z,qw,qx,qy,qz", *with_times(IN_METRES)],
         {},
-        "looks like metres .* or their unit, .*length_unit m",
+        "looks like metres .* or their unit, .*length_unit=.m",
     ),
     "no qz": (["t,x,y,z,qw,qx,qy", *with_times(QUATERNIONS)], {}, "line 1 names no qz"),
     "no row": (["5,2,3,1,0,0,0,9", "t,x,y,z,qw,qx,qy,qz"], {}, "line 2 names columns, and no row stands below it"),
