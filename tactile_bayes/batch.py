@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 from tactile_bayes import __version__
 from tactile_bayes.declarations import EXACT, Record, from_plain, to_plain
 from tactile_bayes.errors import BadDataError, UsageError, one_line
+from tactile_bayes.findings import first_of
 from tactile_bayes.shell import raise_if_interrupted
 
 if TYPE_CHECKING:
@@ -444,8 +445,7 @@ def fault_lines(outcomes: Iterable[Outcome[Any]]) -> list[str]:
     for outcome in outcomes:
         if not outcome.ok:
             names.setdefault(outcome.error, []).append(outcome.key)
-    more = {error: f" and {len(keys) - _LISTED} more" if len(keys) > _LISTED else "" for error, keys in names.items()}
-    return [f"{', '.join(keys[:_LISTED])}{more[error]}: {error}" for error, keys in names.items()]
+    return [f"{first_of(keys, _LISTED)}: {error}" for error, keys in names.items()]
 
 
 def run_batch(

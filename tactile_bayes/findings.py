@@ -130,6 +130,17 @@ def findings_in(document: object) -> tuple[Finding, ...]:
     return from_plain(tuple[Finding, ...], document, where="findings")
 
 
+def counted(count: int, noun: str) -> str:
+    """The number with its noun, in the plural where it is not one."""
+    return f"{count} {noun if count == 1 else f'{noun}es' if noun.endswith('s') else f'{noun}s'}"
+
+
+def first_of(texts: Sequence[str], most: int, separator: str = ", ") -> str:
+    """The first texts in a line, and the number of the others."""
+    more = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return f"{separator.join(texts[:most])}{more}"
+
+
 def capitalised(text: str) -> str:
     """The text with a capital letter, to begin a sentence."""
     return f"{text[0].upper()}{text[1:]}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.findings import by_severity, finding, verdict
+from tactile_bayes.findings import by_severity, counted, finding, first_of, verdict
 
 CAUTION = finding("late_poses", "poses came late", remedy="--latency-ms auto", on_paper="map the scan again")
 CHECK = finding("few_strokes", "the scan has 2 strokes only")
@@ -29,3 +29,8 @@ def test_paper_never_reads_an_option():
 def test_an_unknown_kind_is_refused_with_the_kinds():
     with pytest.raises(BadDataError, match="finding of unknown kind 'nothing'"):
         finding("nothing", "text")
+
+
+def test_a_number_has_its_noun_and_a_list_counts_what_it_leaves_out():
+    assert [counted(1, "mass"), counted(0, "mass"), counted(2, "exam")] == ["1 mass", "0 masses", "2 exams"]
+    assert [first_of("ab", 2), first_of("abcd", 2, "; ")] == ["a, b", "a; b and 2 more"]

@@ -20,6 +20,7 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import refuse_existing
 from tactile_bayes.files.manifest_csv import add_rows, read_manifest, read_rows, write_manifest
 from tactile_bayes.files.size_json import NONE
+from tactile_bayes.findings import counted
 from tactile_bayes.options import CampaignOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.shell import progress_bar
@@ -47,23 +48,27 @@ def campaign_init_action(folder: Path | str, output: Path, names: str | None, ad
         write_manifest(output, search.rows, force=force)
     elif search.rows:
         add_rows(table, search.rows)
-    _print_table_summary(search, output, table.rows if table else None)
+    _print_table_summary(search, output, table.rows if table else None, names)
 
 
-def _print_table_summary(search: FolderExams, output: Path, kept: Sequence[Mapping[str, str]] | None) -> None:
+def _print_table_summary(
+    search: FolderExams, output: Path, kept: Sequence[Mapping[str, str]] | None, names: str | None
+) -> None:
     """Print the number of exams and patients, gaps and faults of the table, and the next command."""
     rows = [*(kept or ()), *search.rows]
     patients = {row["patient"].casefold() for row in rows} - {""}
+    of_patients = f" of {counted(len(patients), 'patient')}" if patients else ""
     added = "" if kept is None else f" ({len(search.rows)} added, {len(kept)} kept)"
-    click.echo(f"{output}: {len(rows)} exams of {len(patients)} patients{added}")
+    click.echo(f"{output}: {counted(len(rows), 'exam')}{of_patients}{added}")
     for line in (*search.spelled, *names_line("listed, and not there any more", search.gone)):
         click.echo(line)
     if search.others:
-        kinds = ", ".join(sorted(search.others))
-        click.echo(f"passed over: {sum(search.others.values())} other files ({kinds})")
+        others = counted(search.others.total(), "other file")
+        click.echo(f"passed over: {others} ({', '.join(sorted(search.others))})")
     nameless = sum(not row["patient"] for row in rows)
     if nameless:
-        click.echo(f"{nameless} of them do not say whose they are: fill in the column patient")
+        from_names = ", or take it from the files' names (--names, --force)" if kept is None and names is None else ""
+        click.echo(f"{counted(nameless, 'exam')} without a patient: fill in the column patient{from_names}")
     else:
         try:
             read_manifest(output)

@@ -21,6 +21,7 @@ from tactile_bayes.files.atomic import refuse_same
 from tactile_bayes.files.manifest_csv import JOURNAL, Exam, read_manifest
 from tactile_bayes.files.reading import check_address, upload
 from tactile_bayes.files.size_json import NONE, size_calibration_path
+from tactile_bayes.findings import counted
 from tactile_bayes.options import CampaignOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.pooling import Repeatability
@@ -61,10 +62,10 @@ class CampaignResult(TextResult, eq=False):
 
     def _done(self, written: report.Written) -> Iterator[str]:
         run = self.campaign
-        yield f"{self.folder}: {len(run.exams)} exams: {written.counts}"
+        yield f"{self.folder}: {counted(len(run.exams), 'exam')}: {written.counts}"
         yield from written.masses
         yield f"to look at: {self.folder / report.INDEX}, a row for each mass with the pages of its exams"
-        yield f"{sum(run.todo.values())} steps run, {sum(run.kept.values())} kept from earlier runs"
+        yield f"{counted(run.todo.total(), 'step')} run, {run.kept.total()} kept from earlier runs"
         for step, todo in run.todo.items():
             more = "" if _all_named(run, step) else f" and {todo - len(run.names[step])} more"
             if todo and any(run.kept.values()):
@@ -73,7 +74,7 @@ class CampaignResult(TextResult, eq=False):
 
     def __repr__(self) -> str:
         counts = "nothing was run" if self.written is None else self.written.counts
-        return f"<CampaignResult of {len(self.campaign.exams)} exams: {counts}>"
+        return f"<CampaignResult of {counted(len(self.campaign.exams), 'exam')}: {counts}>"
 
 
 @takes(CampaignOptions, Settings, without=["settings_file", "repeatability"])

@@ -22,6 +22,7 @@ from tactile_bayes.errors import Abstention, BadDataError, UsageError
 from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.manifest_csv import JOURNAL, SAME_IN_SCANS, Exam, natural_key
 from tactile_bayes.files.map_nc import read_map, read_map_and_scans
+from tactile_bayes.files.named_arrays import read_named
 from tactile_bayes.files.reading import check_address, downloaded, files_below, is_address
 from tactile_bayes.files.reports import Place
 from tactile_bayes.files.scan_mcap import provenance_of, scan_records
@@ -120,7 +121,9 @@ def _read_facts(path: Path, name: str, pattern: NamePattern | None) -> FileFacts
     if name.lower().endswith(MAP):
         _, made = read_map_and_scans(path)
         sessions = made
-    elif not name.lower().endswith(ARRAYS):
+    elif name.lower().endswith(ARRAYS):
+        read_named(path, lambda _: ())  # opened, so that what cannot be read is left out
+    else:
         records = scan_records(path, keep=())
         sessions, made = [records.metadata.get("session", {})], provenance_of(records).get("inputs")
     values = {column: {session.get(key) or "" for session in sessions} for column, key in SAME_IN_SCANS.items()}

@@ -23,7 +23,7 @@ from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
 from tactile_bayes.files.reports import EstimateReport, PooledReport, centre_of
 from tactile_bayes.files.tables import Table
-from tactile_bayes.findings import Finding, by_severity, capitalised, finding_lines, verdict
+from tactile_bayes.findings import Finding, by_severity, capitalised, counted, finding_lines, first_of, verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.report.campaign_page import ExamEntry, MassEntry, VisitEntry, campaign_html, worst
 from tactile_bayes.report.compare import CompareReport, growths
@@ -320,8 +320,6 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
     counts = f"{sized} sized, {len(rows) - sized - failed} without a size, {failed} failed"
     write_text(folder / INDEX, index_html(campaign, rows, pooled, growth, counts=counts, links=links), force=True)
     left_out = set() if masses is None else {(row.exam.patient, row.exam.mass) for row in rows} - masses
-    together = f"no mass pooled: {campaign.not_pooled}" if campaign.not_pooled else ""
-    together = f"{len(pooled)} masses pooled, each at one visit" if pooled else together
     doubts = {
         "no size after excision, left out of trial.csv": [" ".join(mass) for mass in sorted(left_out)],
         "masses whose exams disagree, without a pooled size": _names_with_finding(rows, "maps_disagree", "of_mass"),
@@ -329,12 +327,25 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
         "folders of exams that the table does not list": unlisted,
     }
     doubtful = [line for words, names in doubts.items() for line in names_line(words, names)]
+    together = _pooled_words(campaign, pooled), repeatability_words(campaign), growth_line(growth, layout.GROWN)
     return Written(
         counts,
-        tuple(filter(None, (together, repeatability_words(campaign), growth_line(growth, layout.GROWN)))),
+        tuple(filter(None, together)),
         (*doubtful, *([f"no trial report: {fault}"] if fault and not report else [])),
         report,
     )
+
+
+def _pooled_words(campaign: Campaign, pooled: Pooled) -> str:
+    """How many masses were pooled, and how many of them have a size; else why none was."""
+    if not pooled:
+        return f"no mass pooled: {campaign.not_pooled}" if campaign.not_pooled else ""
+    masses = len({exam.of_visits for exam in campaign.exams if exam.of_mass in pooled})
+    what = f"{counted(masses, 'mass')} pooled, each at one visit"
+    if masses < len(pooled):
+        what = f"{len(pooled)} visits of {counted(masses, 'mass')} pooled, each by itself"
+    sized = sum(one.max_size_mm is not None for one in pooled.values())
+    return f"{what}: {sized} sized, {len(pooled) - sized} without a size"
 
 
 def _names_with_finding(rows: Sequence[ExamRow], kind: str, name: str) -> list[str]:
@@ -344,8 +355,7 @@ def _names_with_finding(rows: Sequence[ExamRow], kind: str, name: str) -> list[s
 
 def names_line(words: str, names: Sequence[str]) -> list[str]:
     """The first names in a line that counts the others; none without any."""
-    more = f" and {len(names) - FEW} more" if len(names) > FEW else ""
-    return [f"{words}: {', '.join(names[:FEW])}{more}"] if names else []
+    return [f"{words}: {first_of(names, FEW)}"] if names else []
 
 
 def check_inputs(exams: Sequence[Exam], settings: CampaignSettings) -> None:
@@ -433,7 +443,8 @@ def index_html(
         masses.append(MassEntry(first.patient, first.mass, tuple(entries), first.side or "", change))
     shown = worst(masses, _MOST_ROWS)
     patients = len({row.patient for row in masses})
-    lines = [f"{len(masses)} masses of {patients} patients; {len(rows)} exams: {counts}."]
+    of_patients = f"{counted(len(masses), 'mass')} of {counted(patients, 'patient')}"
+    lines = [f"{of_patients}; {counted(len(rows), 'exam')}: {counts}."]
     if len(shown) < len(masses):
         lines.append(
             f"Here are the {len(shown)} to be looked at first; all are in {layout.DONE} and {layout.FAILURES}."

@@ -175,6 +175,10 @@ def export(
             fault = "is given twice" if other == one.path else f"holds what {other} holds"
             raise UsageError(f"{one.path} {fault}; give each once")
         path_of[one.digest] = one.path
+    of_maps = dict[frozenset[str], Path]()
+    for estimate in estimates:
+        if estimate.maps and (other := of_maps.setdefault(frozenset(estimate.maps), estimate.path)) != estimate.path:
+            raise UsageError(f"{other} and {estimate.path} are estimates of one exam; give one of them")
     check_pairs(maps, estimates)
     dropped = {name: "" for name in identity.given if name not in IDENTITY_FIELDS[to]}
     identity = replace(identity, **dropped)

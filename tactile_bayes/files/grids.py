@@ -15,7 +15,7 @@ from tactile_bayes.files import tables
 from tactile_bayes.files.arrays_layout import GridOptions
 from tactile_bayes.files.images import read_image
 from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, AXES, Grid, orient_by_axes, read_named
-from tactile_bayes.findings import finding
+from tactile_bayes.findings import finding, first_of
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap, block_sums
 from tactile_bayes.posterior.draw import SamplerSettings
@@ -62,8 +62,7 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
             raise BadDataError(what, way_out=way_out)
     for part, where in ((before, "before"), (after, "after")):
         if lines := [text_of_row for row in part if (text_of_row := " ".join(filter(None, row)))]:
-            more = f" and {len(lines) - 1} more" if len(lines) > 1 else ""
-            notes.append(f"text {where} the numbers was left out: {lines[0][:40]!r}{more}")
+            notes.append(f"text {where} the numbers was left out: {first_of([repr(one[:40]) for one in lines], 1)}")
     if len(rows[0]) > 2 and all(row[-1] == "" for row in rows):
         rows = [row[:-1] for row in rows]
         notes.append("every row ends with a separator: it begins no column")

@@ -14,7 +14,7 @@ from tactile_bayes.declarations import Record, field
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import load_schema
-from tactile_bayes.files.reading import TABLE_BYTES, check_address, is_address, read_bytes
+from tactile_bayes.files.reading import TABLE_BYTES, check_address, is_address, kind_of, read_bytes
 from tactile_bayes.files.size_json import NONE, SHIPPED
 from tactile_bayes.files.tables import RawTable, Table, csv_cell, csv_text, read_raw, read_table
 from tactile_bayes.trial.readings import Reading, at_excision
@@ -121,6 +121,9 @@ def read_manifest(path: Path) -> list[Exam]:
     backslashes, half a place, codes that differ by capitals alone, rows of one mass that contradict each other, and
     visits of one mass whose order is not known.
     """
+    if kind := "a folder" if path.is_dir() else kind_of(path):
+        way_out = "give the table of exams: `tactile-bayes campaign init FOLDER -o exams.csv` writes one"
+        raise BadDataError(f"is {kind}, not a table", way_out=way_out, path=str(path))
     table = read_table(path, SCHEMA)
     exams = [_exam(table, row) for row in range(len(table))]
     _check_spelling(table, exams)

@@ -13,6 +13,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from tactile_bayes.errors import DeviceError
+from tactile_bayes.findings import first_of
 from tactile_bayes.geometry import FloatArray, inverse, rotation_from_quaternion
 from tactile_bayes.hardware import readings
 from tactile_bayes.hardware.ports import SILENT_S, Port, Stream
@@ -491,6 +492,5 @@ class Recorder:
 
 def _counts_in_words(counted: Counter[str]) -> str:
     """Words with their numbers, the most frequent first."""
-    counts = [f"{word or 'one without a name'} {number:,}" for word, number in counted.most_common(_MOST_REASONS)]
-    more = [f"and {len(counted) - _MOST_REASONS} more"] if len(counted) > _MOST_REASONS else []
-    return ", ".join(counts + more)
+    counts = [f"{word or 'one without a name'} {number:,}" for word, number in counted.most_common()]
+    return first_of(counts, _MOST_REASONS)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from tactile_bayes.findings import first_of
 from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.presets import HELD_OUT_PROBABILITY, INTERVAL, RESEARCH_USE
 from tactile_bayes.size.bodies import BodyCalibration
@@ -92,8 +93,7 @@ def repeatability_text(site: RepeatabilityFile) -> str:
 
 
 def _names_lines(lead: str, texts: Sequence[str]) -> list[str]:
-    more = f" and {len(texts) - _MOST_NAMED} more" if len(texts) > _MOST_NAMED else ""
-    return [f"{lead}: {'; '.join(texts[:_MOST_NAMED])}{more}."] if texts else []
+    return [f"{lead}: {first_of(texts, _MOST_NAMED, '; ')}."] if texts else []
 
 
 # --- A size calibration learned over a population of bodies as text for people.

@@ -13,7 +13,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, replace, set_fields
 from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, UsageError
 from tactile_bayes.files.reports import EstimateReport, MassReport, Place, Point, PooledReport, centre_of
-from tactile_bayes.findings import capitalised
+from tactile_bayes.findings import capitalised, first_of
 from tactile_bayes.geometry import apply
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.clock import ClockPosition, clock_position, clock_text
@@ -386,7 +386,6 @@ def facts(exam: ShownExam) -> Iterator[tuple[str, str]]:
     for key in ("subject", "side", "mass", "visit", "posture", "examiner"):
         values = list(dict.fromkeys(scan[key] for scan in exam.scans if scan.get(key)))
         if values:
-            more = f" and {len(values) - 2} more" if len(values) > 2 else ""
-            yield key.capitalize(), ", ".join(cut(value, 32) for value in values[:2]) + more
+            yield key.capitalize(), first_of([cut(value, 32) for value in values], 2)
     if exam.labels.day:
         yield "Date", exam.labels.day

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.findings import Finding, finding_lines, verdict
+from tactile_bayes.findings import Finding, finding_lines, first_of, verdict
 from tactile_bayes.mapping.accumulate import LEAST_SHARE
 from tactile_bayes.mapping.map import FEW_READINGS, Orientation, TactileMap, advise_cell, orientation_of, skewed
 from tactile_bayes.mapping.plausibility import WHY_NOT
@@ -174,9 +174,7 @@ def _map_facts(tactile_map: TactileMap) -> dict[str, Any]:
 def _notes(tactile_map: TactileMap) -> Iterator[str]:
     quality = tactile_map.quality
     if tactile_map.masked_taxels:
-        shown = "; ".join(tactile_map.masked_taxels[:_LISTED_TAXELS])
-        more = len(tactile_map.masked_taxels) - _LISTED_TAXELS
-        yield f"taxels left out: {shown}{f'; and {more} more' if more > 0 else ''}"
+        yield f"taxels left out: {first_of(tactile_map.masked_taxels, _LISTED_TAXELS, '; ')}"
     if quality.get("few_cells"):
         yield f"{quality['few_cells']:.0f} cells have fewer than {FEW_READINGS} readings: noisy, mostly at the rim"
     if quality.get("negative_readings"):

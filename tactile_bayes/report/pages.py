@@ -18,7 +18,7 @@ from tactile_bayes import __version__
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import check_suffix, refuse_existing, same_file, write_all
-from tactile_bayes.findings import Finding, finding_lines
+from tactile_bayes.findings import Finding, counted, finding_lines
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
 
@@ -120,7 +120,7 @@ def growth_line(rows: Sequence[Growth], table: str) -> str:
     last = {(row.patient, row.mass): row.verdict for row in rows}
     counts = Counter(verdict.replace("_", " ") or "not compared" for verdict in last.values())
     parts = ", ".join(f"{counts[words]} {words}" for words in _OUTCOMES if counts[words])
-    return f"growth of {len(last)} mass{'es' * (len(last) > 1)} with several visits: {parts} ({table})"
+    return f"growth of {counted(len(last), 'mass')} with several visits: {parts} ({table})"
 
 
 # --- A page as files: HTML, and printed to PDF.

@@ -9,7 +9,7 @@ import numpy as np
 from tactile_bayes.declarations import UNSET
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
 from tactile_bayes.files.reports import POOLED, EstimateReport, Interval, MassReport, PooledMap, PooledReport
-from tactile_bayes.findings import Finding, capitalised, finding, finding_lines, finding_summary, verdict
+from tactile_bayes.findings import Finding, capitalised, finding, finding_lines, finding_summary, first_of, verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.presets import MATCH_MM, RESEARCH_USE
@@ -196,10 +196,9 @@ def pooled_summary(report: PooledReport) -> str:
     lines = finding_summary(findings, "caution", most=2)
     sizes = [one.max_size_mm for one in report.maps if one.max_size_mm is not None]
     if sizes:
-        words = ", ".join(_size_words(one, with_ends=report.status == DISAGREE) for one in sizes[:MOST_NAMED])
-        more = f" and {len(sizes) - MOST_NAMED} more" if len(sizes) > MOST_NAMED else ""
+        words = first_of([_size_words(one, with_ends=report.status == DISAGREE) for one in sizes], MOST_NAMED)
         found = f"A lump was found on {len(sizes)} of {len(report.maps)} maps"
-        lines.append(f"{found}, alone sized at {words}{more} mm{_alike(report) if report.status == DISAGREE else ''}.")
+        lines.append(f"{found}, alone sized at {words} mm{_alike(report) if report.status == DISAGREE else ''}.")
     lines += finding_summary(findings, "check", most=2)
     if largest is None:
         lines.append(_no_size_line(report))

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
 
 from tactile_bayes.declarations import UNSET, replace
+from tactile_bayes.findings import counted
 from tactile_bayes.shell import padded, text_width
 from tactile_bayes.trial.accuracy import REFERENCE, ModalityRatio, PairedComparison, least_p
 from tactile_bayes.trial.figures import MIN_PATIENTS, Ends, Figure
@@ -150,7 +151,7 @@ def growing_line(report: TrialReport) -> str | None:
 
 
 def _pair_line(pair: PairedComparison) -> str:
-    head = f"{pair.first} - {pair.second} on {_plural(pair.masses, 'common mass')}: "
+    head = f"{pair.first} - {pair.second} on {counted(pair.masses, 'common mass')}: "
     if pair.difference_percent is None:
         return head + f"no comparison: {pair.reasons['difference_percent']}"
     test = "" if pair.p_value is None or pair.p_holm is None else f"; p {pair.p_value:.4f}, p Holm {pair.p_holm:.4f}"
@@ -200,8 +201,8 @@ def trial_text(report: TrialReport, *, left_out: Sequence[str] = (), methods: bo
         share = "all" if counts.synthetic_readings == counts.readings else f"{counts.synthetic_readings} of them"
         made = f" ({share} synthetic: made by a generator, not measured)"
     lines = [
-        f"Sizes against excision: {_plural(counts.masses, 'mass')} of {_plural(counts.patients, 'patient')}, "
-        f"{_plural(counts.readings, 'reading')}{made}",
+        f"Sizes against excision: {counted(counts.masses, 'mass')} of {counted(counts.patients, 'patient')}, "
+        f"{counted(counts.readings, 'reading')}{made}",
         *left_out,
         *(f"Doubtful: {doubt}" for doubt in report.doubts),
         *comparison_sentences(report),
@@ -230,7 +231,7 @@ def _comparison_sentence(pair: PairedComparison, percent: str) -> str:
     if second == REFERENCE:
         first, second = second, first
         quotient = quotient.mapped(lambda ratio: 1 / ratio) if quotient.value else replace(quotient, value=None)
-    other, masses = SPELLED.get(second, second), _plural(pair.masses, "mass")
+    other, masses = SPELLED.get(second, second), counted(pair.masses, "mass")
     if quotient.value is None:
         return f"{first} and {other} are not compared on {masses}: {quotient.reason or 'an error is 0'}"
     interval = f"no interval: {quotient.interval_reason}"
@@ -301,11 +302,11 @@ def _notes(report: TrialReport) -> Iterator[str]:
             yield (
                 f"{name}: {100 * stated.probability:g} % intervals cover {stated.covered} of {stated.n} "
                 f"({100 * stated.fraction:.0f} %, {percent} interval {100 * low:.0f} to {100 * high:.0f} %) "
-                f"on {_plural(stated.masses, 'mass')}"
+                f"on {counted(stated.masses, 'mass')}"
             )
         yield from _reasons(name, one, [key for key in one.reasons if key.removesuffix("_interval") in _FIRST])
     if report.counts.masses_without_any_reading:
-        yield f"{_plural(report.counts.masses_without_any_reading, 'excised mass')} without any reading, left out"
+        yield f"{counted(report.counts.masses_without_any_reading, 'excised mass')} without any reading, left out"
     yield (
         f"Errors: mean absolute error, in percent of the size after excision and in mm, with its {percent} interval "
         "below; a mass not found counts as size 0, an error of 100 %."
@@ -316,14 +317,14 @@ def _notes(report: TrialReport) -> Iterator[str]:
         yield f"p: sign-flip test by patient on the masses that both looked for{pairs}."
         patients = max(pair.patients for pair in report.paired_comparisons if pair.p_value is not None)
         if (least := least_p(patients)) >= 0.05:  # no difference between modalities could give less
-            yield f"With {_plural(patients, 'patient')} p cannot be below {least:.2g}: the test says nothing here."
+            yield f"With {counted(patients, 'patient')} p cannot be below {least:.2g}: the test says nothing here."
 
 
 def ratio_line(name: str, one: ModalityRatio) -> str:
     """Ratio of errors, with the number of masses it is over."""
     if one.masses == 0:
         return f"{name}: no MAPE ratio: no mass was looked for by both this modality and the tactile one"
-    masses = _plural(one.masses, "common mass")
+    masses = counted(one.masses, "common mass")
     if one.ratio is None:
         return f"{name}: no MAPE ratio on {masses}: {one.reasons['ratio']}"
     ratio, of_found = shown(one.figure("ratio"), ".2f"), shown(one.figure("ratio_detected"), ".2f")
@@ -353,8 +354,3 @@ def found_share(report: ModalityReport) -> str:
         return share
     low, high = report.detected_interval
     return f"{share} [{100 * low:.0f}, {100 * high:.0f} %]"
-
-
-def _plural(count: int, noun: str) -> str:
-    plural = f"{noun}es" if noun.endswith("s") else f"{noun}s"
-    return f"{count} {noun if count == 1 else plural}"

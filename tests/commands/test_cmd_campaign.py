@@ -118,11 +118,19 @@ def test_init_writes_what_the_scans_carry_and_names_what_it_leaves_out(study: Pa
 def test_init_leaves_blank_what_no_scan_says_and_run_asks_for_it(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap", thinned(0, 3))
     done = run_here("campaign", "init", ".", "-o", "exams.csv", cwd=tmp_path)
-    assert "1 of them do not say whose they are: fill in the column patient" in done.stdout
+    assert "1 exam without a patient: fill in the column patient, or take it from the files' names" in done.stdout
     assert (tmp_path / "exams.csv").read_text().splitlines()[0] == "file,patient,visit,mass,replicate,side"
     refused = run_here("campaign", "run", "exams.csv", "-o", "out", cwd=tmp_path)
     assert (refused.returncode, refused.stderr.count("\n")) == (3, 1)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_or_a_scan_instead_of_the_table_is_told_how_to_make_one(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap", thinned(0, 3))
+    for name, kind in ((".", "a folder"), ("a.mcap", "a scan")):
+        done = run_here("campaign", "run", name, "-o", "out", cwd=tmp_path)
+        assert (done.returncode, done.stderr.count("\n")) == (3, 1)
+        assert f"{name}: is {kind}, not a table; give the table of exams: `tactile-bayes campaign init" in done.stderr
 
 
 FAULTS = {
@@ -171,14 +179,14 @@ def test_a_fault_of_the_table_is_one_line_and_no_work(case: str, tmp_path: Path)
 def test_a_file_whose_name_has_a_backslash_is_an_exam(own: Path) -> None:
     (own / "scans" / "07-a.mcap").rename(own / "scans" / "07\\a.mcap")
     write_table(own / "exams.csv", [("scans/07\\a.mcap", "07", 1, "left")])
-    assert "1 exams: 1 sized" in campaign(own).stdout
+    assert "1 exam: 1 sized" in campaign(own).stdout
 
 
 @pytest.mark.long
 def test_capitals_do_not_make_a_scan_another_patients(own: Path) -> None:
     write(own / "scans" / "07-a.mcap", thinned(0, 2, subject="p07", side="left"))
     write_table(own / "exams.csv", [("scans/07-a.mcap", "P07", 1, "left")])
-    assert "1 exams: 1 sized" in campaign(own).stdout
+    assert "1 exam: 1 sized" in campaign(own).stdout
 
 
 @pytest.mark.long
@@ -268,7 +276,7 @@ def test_python_runs_what_the_command_runs(own: Path, monkeypatch: pytest.Monkey
     tb.campaign("exams.csv", "out", method="laplace")
     done = run_here(*words, "--excision", "excision.csv", cwd=own)
     found = tb.campaign("exams.csv", Path("out"), excision="excision.csv", method="laplace")
-    assert "1 steps run, 3 kept" in found.text
+    assert "1 step run, 3 kept" in found.text
     assert found.text == done.stdout
     assert [f"failed: {line}" for line in found.failed] == done.stderr.splitlines()
     assert repr(found) == "<CampaignResult of 2 exams: 1 sized, 0 without a size, 1 failed>"

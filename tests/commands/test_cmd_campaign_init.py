@@ -32,6 +32,7 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copy(one / "P01 links – 1.mcap", one / "P01 links – 1 - Kopie.mcap")
     for name in ("._P01 links – 1.mcap", ".DS_Store", "~$liste.xlsx"):
         (one / name).write_bytes(b"\0\5\26\7")
+    (two / "leer.npz").touch()
     (two / "liste.xlsx").write_bytes(b"PK\3\4")
     (folder / "Studie 1" / "README.txt").write_text("notes")
     made = run_here("map", "P01 links – 1.mcap", "-o", "P01 links – 1.nc", cwd=one)
@@ -53,6 +54,7 @@ def test_copies_maps_of_listed_scans_and_files_of_systems_give_no_exam(site: Pat
         "Studie 1/B/p2.mcap",
     ]
     assert done.stderr.splitlines() == [
+        "left out: Studie 1/B/leer.npz: is not an .npz, .npy, .mat or HDF5 file (it starts with b'')",
         "left out: Studie 1/Köhler, M./P01 links – 1 - Kopie.mcap: holds the same bytes as "
         "Studie 1/Köhler, M./P01 links – 1.mcap",
         "left out: Studie 1/Köhler, M./P01 links – 1.nc: was made from Studie 1/Köhler, M./P01 links – 1.mcap, "

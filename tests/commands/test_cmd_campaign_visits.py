@@ -68,6 +68,7 @@ def done(maps: Path) -> tuple[Path, str]:
 @pytest.mark.long
 def test_the_report_is_of_the_last_visit_and_says_so(done: tuple[Path, str]) -> None:
     out, told = done
+    assert "4 visits of 2 masses pooled, each by itself: 4 sized, 0 without a size" in told
     assert "2 masses were read at several visits: the last one before excision is analysed" in told
     assert "readings left out: 6 of earlier visits" in told
     report = json.loads((out / "report.json").read_text())

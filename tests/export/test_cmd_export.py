@@ -31,6 +31,7 @@ REFUSED = {
     "two estimates": (("map.json", "empty.json", "--to", "fhir"), "csv takes several"),
     "a copy": (("map.json", "copy.json", "--to", "csv"), "copy.json holds what map.json holds; give each once"),
     "twice": (("map.json", "map.json", "--to", "csv"), "map.json is given twice; give each once"),
+    "its draws too": (("map.json", "map_post.nc", "--to", "csv"), "map.json and map_post.nc are estimates of one exam"),
     "no date": (("map.nc", "--to", "dicom"), "--study-date YYYY-MM-DDTHH:MM"),
     "no time": (("map.nc", "--to", "dicom", "--study-date", "2026-11-24"), "--study-date 2026-11-24THH:MM"),
     "a name in a csv": (("map.json", "--to", "csv", "--patient-name", "Doe"), "--patient-name has no place in csv"),
