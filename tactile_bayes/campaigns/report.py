@@ -19,7 +19,7 @@ from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError
 from tactile_bayes.files import manifest_csv as layout
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import read_record
-from tactile_bayes.files.manifest_csv import Exam
+from tactile_bayes.files.manifest_csv import Exam, same_code
 from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
 from tactile_bayes.files.reports import EstimateReport, PooledReport, centre_of
 from tactile_bayes.files.tables import Table
@@ -310,7 +310,12 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
     for name, lines in tables.items():
         columns = _TRIAL_COLUMNS if name == layout.TRIAL else layout.columns_of(Path(name).stem)
         write_text(folder / name, layout.table_text(lines, columns), force=True)
-    report, fault = ("", "") if excised is None else _write_report(folder, campaign.settings, growth)
+    report, fault = (
+        "",
+        "" if masses is None or tables[layout.TRIAL] else "no exam is of a mass with a size after excision",
+    )
+    if masses is not None and not fault:
+        report, fault = _write_report(folder, campaign.settings, growth)
     for name in (*(() if report else (REPORT, PAGE)), *(() if growth else (layout.GROWN,))):
         (folder / name).unlink(missing_ok=True)
     links = {name: name for name in tables}
@@ -390,10 +395,10 @@ def _masses_of(table: Table) -> Iterator[tuple[str, str]]:
 
 
 def _check_spelling(table: Table, exams: Iterable[Exam]) -> None:
-    """Refuse a row that is of a mass of the exams but for capitals: the mass would be left out of the trial."""
-    known = {(exam.patient.casefold(), exam.mass.casefold()): exam for exam in exams}
+    """Refuse a row that is of a mass of the exams by `same_code`: the mass would be left out of the trial."""
+    known = {(same_code(exam.patient), same_code(exam.mass)): exam for exam in exams}
     for row, (patient, mass) in enumerate(_masses_of(table)):
-        exam = known.get((patient.casefold(), mass.casefold()))
+        exam = known.get((same_code(patient), same_code(mass)))
         if exam is None:
             continue
         for column, code, spelled in (("patient", patient, exam.patient), ("mass", mass, exam.mass)):

@@ -118,8 +118,8 @@ def read_manifest(path: Path) -> list[Exam]:
     """Read the table; exams come in the order of `Exam.order`, whatever the order of the rows.
 
     Besides cells that are not as ``exams.table.json`` has them it refuses a path that leaves the table's folder or has
-    backslashes, half a place, codes that differ by capitals alone, rows of one mass that contradict each other, and
-    visits of one mass whose order is not known.
+    backslashes, half a place, codes that differ by capitals or leading zeros alone, rows of one mass that contradict
+    each other, and visits of one mass whose order is not known.
     """
     if kind := "a folder" if path.is_dir() else kind_of(path):
         way_out = "give the table of exams: `tactile-bayes campaign init FOLDER -o exams.csv` writes one"
@@ -181,8 +181,13 @@ def _shown(name: str) -> str:
     return f"'{short}'" if short.isprintable() and "'" not in short else repr(short)
 
 
+def same_code(code: str) -> str:
+    """What codes share that differ by capitals alone, or by leading zeros, which spreadsheets take off numbers."""
+    return code.lstrip("0") if code.isascii() and code.isdigit() else code.casefold()
+
+
 def _check_spelling(table: Table, exams: Sequence[Exam]) -> None:
-    """Refuse codes that differ by capitals alone: one may be mistyped, and on some disks their folders are one."""
+    """Refuse codes that `same_code` makes one: one may be mistyped, and on some disks their folders are one."""
     first: dict[tuple[str, str, str], tuple[str, int]] = {}
     for row, exam in enumerate(exams):
         patient_code = exam.patient
@@ -191,9 +196,10 @@ def _check_spelling(table: Table, exams: Sequence[Exam]) -> None:
             ("visit", exam.visit, patient_code),
             ("mass", exam.mass, patient_code),
         ):
-            spelled, line = first.setdefault((column, patient, code.casefold()), (code, exam.line))
+            spelled, line = first.setdefault((column, patient, same_code(code)), (code, exam.line))
             if code != spelled:
-                fault = f"{code!r} differs from {spelled!r} on line {line} by capitals alone"
+                apart = "leading zeros" if code.isdigit() else "capitals"
+                fault = f"{code!r} differs from {spelled!r} on line {line} by {apart} alone"
                 way_out = f"write it one way, or give the other {column} another code"
                 raise table.error(row, column, fault, way_out=way_out)
 

@@ -144,6 +144,7 @@ FAULTS = {
     ),
     "a drive": ("C:\\data\\x.mcap,1,1,1,1", "write the path from the table's folder with / between folders"),
     "a patient in capitals": ("a.mcap,p1,1,1,1\nb.mcap,P1,1,1,1", "'P1' differs from 'p1' on line 2 by capitals alone"),
+    "zeros lost": ("a.mcap,007,1,1,1\nb.mcap,7,1,1,1", "'7' differs from '007' on line 2 by leading zeros alone"),
     "a mass in capitals": ("a.mcap,1,1,a,1\nb.mcap,1,1,A,2", "column mass: 'A' differs from 'a' on line 2"),
     "semicolons and quotes": ('"a.mcap";1;1;1;0', "'0' is not at least 1"),
     "a formula": ("=cmd.mcap,1,1,1,1", "does not match"),
@@ -190,12 +191,16 @@ def test_capitals_do_not_make_a_scan_another_patients(own: Path) -> None:
 
 
 @pytest.mark.long
-def test_an_excision_table_that_writes_a_code_another_way_is_refused_before_any_work(own: Path) -> None:
-    write_table(own / "exams.csv", [("scans/09-a.mcap", "P09", 1, "right")])
-    (own / "excision.csv").write_text("patient,mass,ex_vivo_mm\nP10,1,12\np09,1,14\n")
+@pytest.mark.parametrize(("listed", "excised"), [("P09", "p09"), ("009", "9")])
+def test_an_excision_table_that_writes_a_code_another_way_is_refused_before_any_work(
+    listed: str, excised: str, own: Path
+) -> None:
+    write_table(own / "exams.csv", [("scans/09-a.mcap", listed, 1, "right")])
+    (own / "excision.csv").write_text(f"patient,mass,ex_vivo_mm\nP10,1,12\n{excised},1,14\n")
     done = campaign(own, "--excision", "excision.csv")
     assert (done.returncode, done.stderr.count("\n")) == (3, 1)
-    assert "line 3, column patient: 'p09' is 'P09' in the table of exams (line 2); write it one way" in done.stderr
+    told = f"line 3, column patient: '{excised}' is '{listed}' in the table of exams (line 2); write it one way"
+    assert told in done.stderr
     assert not (own / "out").exists()
 
 
@@ -774,4 +779,4 @@ def test_a_trial_without_a_reading_has_no_report_and_the_reason(finished: Path) 
     (finished / "excision.csv").write_text("patient,mass,ex_vivo_mm\nother,1,15\n")
     done = campaign(finished, "--excision", "excision.csv")
     assert done.returncode == 0, done.stderr
-    assert "no trial report: holds a header and no rows" in done.stdout
+    assert "no trial report: no exam is of a mass with a size after excision" in done.stdout
