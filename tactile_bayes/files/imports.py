@@ -42,7 +42,7 @@ _OTHER_ORDER: Final = (
     0.8  #: Squared difference of neighbours in another order over that as stated: right scans have 1.0.
 )
 _LOOKED_AT: Final = 500  # frames
-_TIME_OPTIONS: Final = {"frame_time_s": "time-unit", "pose_time_s": "pose-time-unit"}
+_TIME_OPTIONS: Final = {"frame_time_s": ("time-unit", "rate-hz"), "pose_time_s": ("pose-time-unit", "pose-rate-hz")}
 _BESIDE: Final = {
     "--poses FILE": ("position_mm", "quaternion_wxyz", "pose_time_s"),
     "--head-geometry HEAD.json": ("pitch_mm", "array_from_tracker", "head_surface_mm"),
@@ -253,7 +253,7 @@ def _arrange_poses(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
             notes.append(f"{name} of shape {(width, pose_count)} read along its columns")
     if "quaternion_wxyz" in arrays and stated.pose_layout in ("xyzw", "euler"):
         if stated.pose_layout == "euler" and np.abs(arrays["quaternion_wxyz"]).max() <= _TURN:
-            caution = f"angles lie within {_TURN:.1f} and are read as degrees"
+            caution = f"CAUTION: angles lie within {_TURN:.1f} and are read as degrees"
             notes.append(f"{caution}: radians are to be multiplied by 57.296")
         arrays["quaternion_wxyz"] = quaternions(arrays["quaternion_wxyz"], stated.pose_layout)
     if "position_mm" in arrays:
@@ -467,14 +467,17 @@ def _check_numbers(arrays: Arrays) -> None:
             index = tuple(int(i) for i in np.unravel_index(int(finite.argmin()), finite.shape))
             where = f" (first at {index})" if index else ""
             what = f"{name} holds {finite.size - int(finite.sum())} values that are not finite{where}"
-            raise BadDataError(what, way_out="repair or leave them out")
+            way_out = "repair or leave them out"
+            if name in ("frames", "counts"):
+                way_out = "leave such frames out; write 0 in all frames of an element that does not work"
+            raise BadDataError(what, way_out=way_out)
 
 
 def _check_largest(arrays: Arrays) -> None:
     for name, array in arrays.items():
         largest = float(np.abs(array, dtype=np.float64).max(initial=0.0))
         if largest > _LARGEST:
-            unit = f"; times in ms are stated, --{_TIME_OPTIONS[name]} ms" if name in _TIME_OPTIONS else ""
+            unit = f"; times in ms are stated, --{_TIME_OPTIONS[name][0]} ms" if name in _TIME_OPTIONS else ""
             way_out = f"give mm, kPa and s; the file may be damaged{unit}"
             raise BadDataError(f"{name} holds {largest:.3g}", way_out=way_out)
 
@@ -520,18 +523,25 @@ def _check_units(arrays: Arrays, *, calibrated: bool) -> None:
 
 def _check_clocks(arrays: Arrays) -> None:
     ends = []
-    for name, option in _TIME_OPTIONS.items():
+    for name, (unit, rate) in _TIME_OPTIONS.items():
         times = arrays[name]
         if len(times) > 1 and times[0] == times.min() == times.max():
             raise BadDataError(f"{name} is {times[0]:g} throughout", way_out="give its times, not a constant")
+        if 2 * (repeats := int((np.diff(times) == 0).sum())) > len(times):
+            what = f"{name} repeats the time before {repeats} times of {len(times)}"
+            raise BadDataError(what, way_out=f"give fractions of a second, or leave it out and give --{rate}")
         if len(times) > 1 and (step := float(np.median(np.diff(times)))) > 0.5:
             what = f"{name} steps by {step:.4g}"
-            raise BadDataError(what, way_out=f"looks like milliseconds, give s or --{option} ms")
+            raise BadDataError(what, way_out=f"looks like milliseconds, give s or --{unit} ms")
         ends.append((float(times.min()), float(times.max())))
     (a, b), (c, d) = ends
     if b < c or d < a:
         what = f"frame_time_s ({a:.3f} to {b:.3f}) and pose_time_s ({c:.3f} to {d:.3f}) do not overlap"
-        raise BadDataError(what, way_out="give both on one clock: --pose-offset-s is added to the poses' times")
+        way_out = "give both on one clock: --pose-offset-s is added to the poses' times"
+        hours = round((c - a) / 3600)
+        if hours and abs(c - a - 3600 * hours) < 60:
+            way_out = f"{way_out}; is it {-3600 * hours}, of a time zone?"
+        raise BadDataError(what, way_out=way_out)
 
 
 def _scan_of_arrays(arrays: Arrays, facts: Mapping[str, str], checked_on: str) -> Scan:

@@ -254,11 +254,8 @@ def _pose_times(
     """Times of all rows and their unit where the header says it."""
     named = ("time", "seconds", "nanoseconds", "frame")
     columns_read = {name: _column_values(rows, columns[name]) for name in named if name in columns}
-    if "time" in columns_read and not np.isfinite(columns_read["time"]).any():
-        what = f"its column of times holds {_cell(rows[0], columns['time'])!r}, which is no time that is known"
-        way_out = "write s, HH:MM:SS.s or YYYY-MM-DD HH:MM:SS.s, or leave it out and give --pose-rate-hz"
-        raise BadDataError(what, way_out=way_out)
     if "time" in columns_read:
+        _refuse_unknown_times(columns_read["time"], rows, columns["time"], "--pose-rate-hz")
         return _interpolated(columns_read["time"]), unit_of_time(header.fields[columns["time"]])
     if "seconds" in columns_read:
         return _interpolated(columns_read["seconds"] + 1e-9 * columns_read.get("nanoseconds", 0.0)), "s"
@@ -267,6 +264,14 @@ def _pose_times(
         raise BadDataError(f"has {lacking}", way_out="give the tracker's rate, --pose-rate-hz HZ")
     number = _interpolated(columns_read["frame"]) if "frame" in columns_read else np.arange(len(rows), dtype=np.float64)
     return (number - number[0]) / stated.pose_rate_hz, "s"
+
+
+def _refuse_unknown_times(values: FloatArray, rows: Sequence[Line], column: int, rate: str) -> None:
+    """Refuse a column of times of which none is known."""
+    if not np.isfinite(values).any():
+        what = f"its column of times holds {_cell(rows[0], column)!r}, which is no time that is known"
+        way_out = f"write s, HH:MM:SS.s or YYYY-MM-DD HH:MM:SS.s, or leave it out and give {rate}"
+        raise BadDataError(what, way_out=way_out)
 
 
 def _interpolated(values: FloatArray) -> FloatArray:
@@ -516,6 +521,7 @@ def _frames_of_rows(
     if len(readings) < values.shape[1]:
         notes.append(f"{len(readings)} of {values.shape[1]} columns are readings, from column {readings[0] + 1} on")
     if time is not None:
+        _refuse_unknown_times(values[:, time], rows, time, "--rate-hz")
         arrays["frame_time_s"] = values[:, time]
         unit = unit_of_time(names[time]) if names else ""
         named = f" ({names[time]!r})" if names else ""

@@ -133,7 +133,11 @@ CELL = ROW.split(",")[7]
 FAULTS: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
     "cut row": (changed(30, ROW.rpartition(",")[0]), {}, "line 31 holds 416 numbers, the others 417"),
     "word": (changed(30, ROW.replace(CELL, "x12", 1)), {}, "line 31 holds 'x12'"),
-    "no value": (changed(30, ROW.replace(CELL, "", 1)), {}, "frames holds 1 values that are not finite"),
+    "no value": (
+        changed(30, ROW.replace(CELL, "", 1)),
+        {},
+        "frames holds 1 values that are not fin.*leave such frames",
+    ),
     "cut frame": ("\n".join(tekscan(KPA, "KPA").splitlines()[:-6]), {}, "has frames of 16 rows and, at line .* one of"),
     "beside": (tekscan(KPA, "KPA").replace("\n0.0000,", "\nB,"), {}, "has 10 cells 'B' from line 31 on, which Tekscan"),
     "no number": ("hello\nworld\n", {}, "holds no table of numbers"),
@@ -149,6 +153,11 @@ FAULTS: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
     ),
     "time falls": ("\n".join([*timed(1)[30:], *timed(1)[:30]]), {}, "frame_time_s runs backwards at index 30"),
     "time stands": ("\n".join(f"1.5,{row}" for row in rows(FLAT)), {}, "frame_time_s is 1.5 throughout"),
+    "another clock": (
+        "\n".join(["time," + NAMES, *(f"27.11.2026 10:15,{row}" for row in rows(FLAT))]),
+        {},
+        "its column of times holds '27.11.2026 10:15', which is no time that is known.*rate_hz",
+    ),
     "only counted": ("\n".join(f"{i},{row}" for i, row in enumerate(rows(FLAT))), {}, "lacks frame_time_s .*rate_hz"),
     "epoch in ms": ("\n".join(f"{1.7e12 + 5 * i},{row}" for i, row in enumerate(rows(FLAT))), {}, 'time_unit="ms"'),
     "poses": ("t,x,y,z,qw,qx,qy,qz\n" + "0.1,1,2,3,1,0,0,0\n" * 9, {}, "is a table of poses by line 1; .*poses"),

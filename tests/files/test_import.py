@@ -86,7 +86,13 @@ FAULTS: list[tuple[str, Callable[[Arrays], object], str]] = [
     ("landmarks in m", put("landmarks_mm", lambda p: p / 1000), "landmarks_mm.*metres or inches, give mm"),
     ("gain in Pa", put("gain_kpa_per_count", lambda g: g * 1000), "gain_kpa_per_count.*Pa or MPa"),
     ("time in ms", put("frame_time_s", lambda t: t * 1000), "frame_time_s steps by 5.*milliseconds"),
-    ("two clocks", put("pose_time_s", lambda t: t + 100), "do not overlap"),
+    ("two clocks", put("pose_time_s", lambda t: t + 100), r"do not overlap.*poses' times$"),
+    ("time zones", put("pose_time_s", lambda t: t + 7200), "do not overlap.*is it -7200, of a time zone"),
+    (
+        "whole seconds",
+        put("frame_time_s", lambda t: np.floor(t + 0.93)),
+        "repeats the time before 18 times of 20.*--rate",
+    ),
 ]
 
 

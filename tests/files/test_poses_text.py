@@ -204,7 +204,7 @@ def test_angles_that_may_be_radians_are_asked_about() -> None:
     found = tb.scan(
         pressures(SCAN), SCAN.frames.time_s, (TIME, PLACE, angles), head=SCAN.head, unit="kPa", pose_layout="euler"
     )
-    assert "angles lie within 6.3 and are read as degrees" in found.session["imported_as"]
+    assert "CAUTION: angles lie within 6.3 and are read as degrees" in found.session["imported_as"]
 
 
 def test_a_status_in_numbers_has_to_be_stated(tmp_path: Path) -> None:
