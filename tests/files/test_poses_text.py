@@ -201,10 +201,9 @@ def test_gaps_of_arrays_are_gaps_too(hidden: float, as_matrices: bool) -> None:
 
 def test_angles_that_may_be_radians_are_asked_about() -> None:
     angles = TURNED.as_euler("ZYX")
-    found = tb.scan(
-        pressures(SCAN), SCAN.frames.time_s, (TIME, PLACE, angles), head=SCAN.head, unit="kPa", pose_layout="euler"
-    )
-    assert "CAUTION: angles lie within 6.3 and are read as degrees" in found.session["imported_as"]
+    poses = TIME, PLACE, angles
+    with pytest.warns(UserWarning, match="CAUTION: angles lie within 6.3 and are read as degrees"):
+        tb.scan(pressures(SCAN), SCAN.frames.time_s, poses, head=SCAN.head, unit="kPa", pose_layout="euler")
 
 
 def test_a_status_in_numbers_has_to_be_stated(tmp_path: Path) -> None:
