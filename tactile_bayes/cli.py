@@ -7,6 +7,7 @@ import gc
 import importlib
 import os
 import re
+import signal
 import sys
 from collections.abc import Iterable
 
@@ -151,6 +152,7 @@ def main() -> None:
         sys.exit("error: Windows is not supported; install and run tactile-bayes in WSL (Linux on Windows)")
     gc.set_threshold(COLLECT_AFTER)
     atexit.register(gc.freeze)  # the process ends: a last search for cycles gains nothing
+    atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C would change the exit code
     # The matrices here are small: more threads cost CPU and gain nothing, and workers would fight over the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     protect_streams()

@@ -112,9 +112,9 @@ def devices_action(
     *, url: str | None, pivot_url: str | None, tracker_protocol: str, tool: str | None, duration: float
 ) -> None:
     """List the serial ports and the devices that are probably on them."""
-    if url:
+    if url is not None:
         click.echo(f"{url}: {probe(url)}")
-    elif pivot_url:
+    elif pivot_url is not None:
         _pivot(pivot_url, tracker_protocol, tool, duration)
     else:
         none = "no serial ports; other URLs: socket://HOST:PORT, rfc2217://HOST:PORT, a pseudo-terminal's path"

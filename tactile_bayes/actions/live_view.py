@@ -40,6 +40,7 @@ from tactile_bayes.hardware.live import (
     parse_address,
     read_feed,
 )
+from tactile_bayes.hardware.reading import ENDING
 from tactile_bayes.mapping.map import Orientation, TactileMap, block_sums, orientation_of
 from tactile_bayes.posterior.bump import candidate_centres
 from tactile_bayes.posterior.draw import SamplerSettings
@@ -61,6 +62,8 @@ def live_view(
     if serve:
         parse_address(serve)  # an error before anything is recorded
     calibration_file = size_calibration_path(size_calibration)
+    if calibration_file is not None:
+        read_size_calibration(calibration_file)  # likewise
     setup = {
         "head": head_document(head),
         "calibration": calibration_document(calibration),
@@ -210,7 +213,7 @@ def _interval(name: str, draws: FloatArray, probability: float) -> str:
 
 def run(pipe: int, setup: dict[str, Any]) -> None:
     """Follow a recording until it ends."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in ENDING:
         signal.signal(number, signal.SIG_IGN)  # the signal ends the recording, and that ends the view
     live = LiveMap(from_plain(HeadGeometry, setup["head"]), from_plain(ElementCalibration, setup["calibration"]))
     estimator = LiveEstimator(setup["size_calibration"])

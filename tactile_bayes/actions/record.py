@@ -32,6 +32,7 @@ from tactile_bayes.files.scan_mcap import RecordingWriter, create_exclusive, ful
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.ports import SILENT_S, Port, read_in_process
+from tactile_bayes.hardware.reading import ENDING
 from tactile_bayes.hardware.readings import Follower, HelloReading, Parser
 from tactile_bayes.hardware.recorder import DeviceLine, LandmarkTouch, Observer, Recorder, RecordingReport
 from tactile_bayes.hardware.serial_trackers import TRACKERS, check_head, open_tracker
@@ -40,7 +41,7 @@ from tactile_bayes.presets import PRESSURE_RANGE_KPA, RECORDING_KEYS, RESEARCH_U
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks
 from tactile_bayes.shell import can_redraw
 
-_NOMINAL_FULL_SCALE = 4095
+_KEYS: dict[int, str] = {signal.SIGINT: "Ctrl-C", signal.SIGTSTP: "Ctrl-Z", signal.SIGQUIT: "Ctrl-\\"}
 _PATHS = ("like", "head_geometry", "array_calibration", "landmarks")
 
 
@@ -53,9 +54,10 @@ class Request(RecordOptions, kw_only=True):
     def facts(self) -> dict[str, str]:
         """Session facts as text: from the file, overridden by options."""
         facts = read_session(self.session_file) if self.session_file else {}
-        names = ("side", "posture", "lubricant", "examiner", "subject")
-        facts |= {name: value for name in names if (value := getattr(self, name))}
-        check_session(facts, path=self.output)
+        for name in ("side", "posture", "lubricant", "examiner", "subject"):
+            if value := getattr(self, name):
+                check_session({name: value}, path=Path(f"--{name}"))
+                facts[name] = value
         return facts
 
     def session(self, hello: HelloReading, follower: Follower, facts: dict[str, str]) -> dict[str, str]:
@@ -80,8 +82,11 @@ class Request(RecordOptions, kw_only=True):
         }
 
 
-def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration, Landmarks | None]:
-    """Geometry, calibration and landmarks, read from the files of the options; `UsageError` where one is missing."""
+def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration | None, Landmarks | None]:
+    """Geometry, calibration and landmarks, read from the files of the options; `UsageError` where one is missing.
+
+    Without a calibration is --uncalibrated: the head's own full scale is needed for one.
+    """
     like = read_scan(request.like) if request.like else None
     if request.head_geometry:
         head = read_head_geometry(request.head_geometry)
@@ -89,9 +94,9 @@ def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration, L
         head = like.head
     else:
         raise UsageError("the head's geometry is missing; give --head-geometry HEAD.json or --like SCAN.mcap")
+    calibration: ElementCalibration | None = None
     if request.uncalibrated:
-        gain = np.full(head.shape, PRESSURE_RANGE_KPA[1] / _NOMINAL_FULL_SCALE)
-        calibration = ElementCalibration(gain, np.zeros(head.shape), saturation_count=_NOMINAL_FULL_SCALE)
+        pass
     elif request.array_calibration:
         calibration = read_array_calibration(request.array_calibration).calibration
     elif like is not None:
@@ -136,13 +141,14 @@ def _landmarks(request: Request) -> Landmarks | None:
 
 @contextlib.contextmanager
 def noted_signals() -> Iterator[list[str]]:
-    """List the names of signals that are to end the recording (Ctrl-C, SIGTERM, SIGHUP) in place of their effect."""
+    """List the names of `ENDING` signals, which are to end the recording, in place of their effect."""
     names: list[str] = []
 
     def note(number: int, _frame: object) -> None:
-        names.append("Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name)
+        names.append(_KEYS.get(number) or signal.Signals(number).name)
 
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    under_nohup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    before = {one: signal.signal(one, note) for one in ENDING if not (one == signal.SIGHUP and under_nohup)}
     try:
         yield names
     finally:
@@ -202,8 +208,11 @@ class Keys:
 
     def _press(self, key: str) -> None:
         names = {"n": "sternal_notch", "x": "xiphoid", "p": "nipple"}
-        if key in names:
+        if key in names and self.recorder.tracker is None:
+            self._say("no landmark without a tracker")
+        elif key in names:
             self.recorder.touch = LandmarkTouch(names[key], scanhead_from_tracker=self.scanhead_from_tracker)
+            self._say(f"{names[key].replace('_', ' ')}: hold still")
         elif key == " " and self.waiting:
             self.waiting = False
             self.recorder.start()
@@ -242,7 +251,7 @@ def record_text(report: RecordingReport, *, output: str) -> str:
     counts = {
         "times the head's counter of time wrapped": report.head_clock_wraps,
         "times the tracker's counter of time wrapped": report.tracker_clock_wraps,
-        "poses without a time, left out": report.poses_without_time,
+        "poses before the first frame or without a time, left out": report.poses_without_time,
         "bytes from the head that made no sense": report.head_garbage_bytes,
         "bytes from the tracker that made no sense": report.tracker_garbage_bytes,
         "bytes this computer came too late for": report.overrun_bytes,
@@ -260,16 +269,19 @@ def make_recording(request: Request) -> tuple[RecordingReport, bool]:
             fault = "not a file" if ndi else f"not for {request.tracker_protocol}"
             way_out = "give a wireless NDI tool's .rom file with --tracker-protocol ndi"
             raise UsageError(f"--tracker-rom {rom} is {fault}; {way_out}")
+    if request.tracker_url == "":  # as of a shell's variable that is not set
+        raise UsageError("--tracker is empty; give the tracker's port, or leave the option out")
     if not request.tracker_url and (request.tool or request.reference):
         raise UsageError("--tool and --reference are of a tracker; give its port with --tracker")
-    if request.tracker_url == request.head_url != "loop://":  # each loop is a line of its own
+    if request.tracker_url == request.head_url:
         raise UsageError(f"--head and --tracker are both {request.head_url}; give two ports")
     refuse_existing(request.output, force=request.force)
-    head, calibration, landmarks = instrument_of(request)
+    head, given, landmarks = instrument_of(request)
     facts = request.facts()
-    with ExitStack() as stack:
+    with ExitStack() as after, ExitStack() as stack:
         hello, lines, follower = _connect(request, stack)
         _check_fit(hello, head, request)
+        calibration = calibration_for(hello, given, request)
         age = calibration_age(request, head_id=hello.device_id, today=date.today())
         session = request.session(hello, follower, facts) | age
         check_session(session, path=request.output)
@@ -308,7 +320,7 @@ def make_recording(request: Request) -> tuple[RecordingReport, bool]:
         for name, position_mm in {} if landmarks is None else landmarks.points().items():
             writer.add_landmark(name, position_mm, device_ns=0, host_ns=0)
             observer.landmark(name, position_mm)
-        signals = stack.enter_context(noted_signals())
+        signals = after.enter_context(noted_signals())  # to the end: a second Ctrl-C broke off what the first began
         try:
             report = _run(recorder, signals, head, request)
             writer.close(as_dict(report) | {"cautions": "\n".join(report.cautions)})
@@ -361,8 +373,26 @@ def _check_fit(hello: HelloReading, head: HeadGeometry, request: Request) -> Non
             f"head {request.head_url} has {hello.rows} x {hello.columns} taxels, the geometry given is for "
             f"{head.shape[0]} x {head.shape[1]}; give this head's"
         )
+    if not (request.tracker_url or request.uncalibrated):
+        click.echo("no tracker: no map can be made of this scan; give its port with --tracker", err=True)
     if request.every > 1:
         click.echo(f"one frame in {request.every}: {hello.rate_hz / request.every:g} Hz", err=True)
+
+
+def calibration_for(hello: HelloReading, given: ElementCalibration | None, request: Request) -> ElementCalibration:
+    """The calibration given, which must be of a head with this full scale; without one a nominal gain."""
+    full_scale, name = hello.saturation_count, f"head {request.head_url}"
+    if given is None:
+        if not full_scale:
+            raise DeviceError(f"{name}: its HELLO has saturation count 0; it must be the count at full scale, as 4095")
+        shape = hello.rows, hello.columns
+        return ElementCalibration(np.full(shape, PRESSURE_RANGE_KPA[1] / full_scale), np.zeros(shape), full_scale)
+    if given.saturation_count != full_scale and not request.accept_calibration:
+        raise UsageError(
+            f"{name} is saturated at {full_scale} counts, the calibration given at {given.saturation_count}; calibrate "
+            "this head, or give --accept-calibration"
+        )
+    return given
 
 
 def _run(recorder: Recorder, signals: list[str], head: HeadGeometry, request: Request) -> RecordingReport:

@@ -471,7 +471,7 @@ class RecordingWriter(ScanWriter):
         self._thread.shutdown()
 
 
-def full_disk(path: Path, error: OSError) -> BadDataError:
+def full_disk(path: Path, error: OSError) -> UsageError:
     """Error for a recording that could not be continued because the disk is full."""
     way_out = "what was recorded before is kept; free space, then `tactile-bayes repair` it"
-    return BadDataError(f"cannot be written any further ({error.strerror})", way_out=way_out, path=str(path))
+    return UsageError(f"{path}: cannot be written any further ({error.strerror}); {way_out}")

@@ -134,8 +134,11 @@ class Port:
 
 
 def _open(url: str, baud: int, role: str) -> Any:
-    if url.startswith(_NETWORK) and not re.search(r":\d+(?:[/?].*)?$", url.partition("://")[2]):
-        raise DeviceError(f"{role} {url}: not a port (no port number); give {url.partition('://')[0]}://HOST:PORT")
+    if url.startswith(_NETWORK):
+        scheme, _, address = url.partition("://")
+        number = re.search(r":(\d+)(?:[/?].*)?$", address)
+        if number is None or int(number[1]) > 65535:
+            raise DeviceError(f"{role} {url}: not a port (no port number up to 65535); give {scheme}://HOST:PORT")
     try:
         port = serial.serial_for_url(url, baudrate=baud, timeout=_READ_S, do_not_open=True)
         if "://" not in url:

@@ -21,6 +21,8 @@ RECORD = struct.Struct("<QIH")
 # A record of at most PIPE_BUF bytes goes into the pipe whole or not at all, so a full pipe loses whole records.
 MAX_DATA = select.PIPE_BUF - RECORD.size
 READY = 0xFFFF
+# Ctrl-C, Ctrl-Z, Ctrl-\, `kill`, a closed terminal: the recorder ends in order and needs what is on its way.
+ENDING = (signal.SIGINT, signal.SIGTSTP, signal.SIGQUIT, signal.SIGTERM, signal.SIGHUP)
 _LOOK_UP_S = 1.0
 
 
@@ -65,8 +67,8 @@ def ask_for_priority() -> None:
 
 def main() -> None:
     """Run the reader with the garbage collector frozen."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # for the recorder, which ends in order and needs what is on its way
+    for number in ENDING:
+        signal.signal(number, signal.SIG_IGN)  # for the recorder
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
     ask_for_priority()
     gc.freeze()

@@ -25,7 +25,7 @@ from tactile_bayes.mapping.select import Jumps, Span, disjoint, overlap_cautions
 _RATE_SHARE: Final = 0.02
 _RATE_LEAST_S: Final = 0.5
 _STUCK_POSES: Final = 10
-_CAUTION_SHARE: Final = 0.01  #: Of missing or flagged poses: any exam has fewer.
+_CAUTION_SHARE: Final = 0.01  #: Of lost frames, and of missing or flagged poses: any exam has fewer.
 
 
 @dataclass(slots=True)
@@ -67,15 +67,22 @@ class RecordingReport:
         return (self.last_ns - self.first_ns) / 1e9
 
 
-def _cautions(report: RecordingReport, passed_s: float, rate_hz: float) -> Iterator[str]:
-    """Cautions about clocks and counters that jump, about the pace of clock and frames, and about the poses.
+def _cautions(report: RecordingReport, passed_s: float, silent_s: float, rate_hz: float) -> Iterator[str]:
+    """Cautions about frames that did not come, clocks and counters that jump, the pace of both, and the poses.
 
-    `passed_s` is the time between the first frame and the last on the host's clock.
+    By the host's clock, `passed_s` is the time from the first frame to the last, `silent_s` from there to the stop.
     """
 
     def times(number: int) -> str:
         return "once" if number == 1 else f"{number} times"
 
+    if not (report.frames or report.fault):
+        yield "no frame was recorded"
+    elif silent_s > _RATE_LEAST_S and not report.fault:
+        yield f"no frame came in the last {silent_s:.1f} s"
+    all_frames = report.frames + report.frames_lost
+    if report.frames_lost > _CAUTION_SHARE * all_frames and not report.frame_counter_restarts:
+        yield f"{report.frames_lost:,} of {all_frames:,} frames lost: check the head's cable and line rate"
     head_s = report.duration_s
     if abs(head_s - passed_s) > max(_RATE_LEAST_S, _RATE_SHARE * passed_s):
         yield f"the head's clock ran {head_s:.1f} s while {passed_s:.1f} s passed on this computer"
@@ -231,7 +238,7 @@ class Recorder:
         self._begun_ns = self._heard_ns = 0
         self._last_pose: readings.PoseReading | None = None
         self._pose_ns = -1
-        self._drain_until_ns: int | None = None
+        self._stopped_ns: int | None = None
 
     def start(self) -> None:
         """Start the devices and record them."""
@@ -249,7 +256,7 @@ class Recorder:
         """End the recording once data on their way have arrived."""
         if not self.report.ended_by:
             self.report.ended_by = why
-            self._drain_until_ns = self.clock_ns() + round(DRAIN_S * 1e9)
+            self._stopped_ns = self.clock_ns()
 
     def run(self, each_tick: Callable[[], None] = lambda: None) -> RecordingReport:
         """Record until the end; `each_tick`, called many times a second, may call `stop` and `start` and set `touch`.
@@ -352,6 +359,7 @@ class Recorder:
         moment = self._clock.time_of(reading.device_ns, host_ns)
         if moment is None:
             self.report.poses_without_time += 1
+            self._last_pose = reading if reading.device_ns is not None else self._last_pose
             return
         device_ns, event = moment
         flags = self._record_flags(reading)
@@ -455,8 +463,10 @@ class Recorder:
         report.other_tools = _counts_in_words(self.follower.other_tools)
         report.tracker_remark = self.tracker.parser.remark if self.tracker else ""
         passed_s = (self._heard_ns - self._begun_ns) / 1e9
+        stopped_ns = self._heard_ns if self._stopped_ns is None else self._elapsed_ns(self._stopped_ns)
+        silent_s = (stopped_ns - self._heard_ns) / self.speed / 1e9
         spans = self._frame_span, self._pose_span
-        report.cautions = [*overlap_cautions(*spans), *_cautions(report, passed_s, self.rate_hz)]
+        report.cautions = [*overlap_cautions(*spans), *_cautions(report, passed_s, silent_s, self.rate_hz)]
         report.cautions += self._jumps.cautions()
         if self.head.parser.fault:
             report.cautions.append(f"the head's line: {self.head.parser.fault}")
@@ -467,11 +477,11 @@ class Recorder:
 
     def _done(self) -> bool:
         """True when all data of the recording have arrived."""
-        if self._drain_until_ns is None:
+        if self._stopped_ns is None:
             return False
         tracker = self.tracker
         behind = tracker is not None and not tracker.finished and self._pose_ns < self.report.last_ns
-        return not behind or self.clock_ns() > self._drain_until_ns
+        return not behind or self.clock_ns() > self._stopped_ns + DRAIN_S * 1e9
 
     def _update_report(self) -> None:
         report = self.report

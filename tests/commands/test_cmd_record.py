@@ -278,8 +278,8 @@ def test_a_full_disk_ends_it_with_one_line_and_keeps_what_was_written(tmp_path, 
     with head_and_tracker(long_scan) as devices:
         process = start(devices, preexec_fn=little_room)
         _, err = process.communicate(timeout=20)
-    assert process.returncode == 3
-    assert "cannot be written any further (File too large)" in err
+    assert process.returncode == 2, "as for any output that cannot be written"
+    assert "a.mcap: cannot be written any further (File too large); what was recorded" in err
     assert err.count("\n") == 1
     assert "`tactile-bayes repair`" in err
     assert len(read_scan_report(tmp_path / "a.mcap").scan.frames) > 50
@@ -356,8 +356,9 @@ def test_one_port_for_both_devices_is_refused(record):
         ("socket://127.0.0.1:9", "cannot be opened (Connection refused); `tactile-bayes devices`"),
         ("rfc2217://127.0.0.1:9", "cannot be opened (Connection refused); `tactile-bayes devices`"),
         ("/dev/null", "cannot be opened (Inappropriate ioctl for device); `tactile-bayes devices`"),
-        ("socket://127.0.0.1", "not a port (no port number); give socket://HOST:PORT"),
-        ("socket://[::1]", "not a port (no port number); give socket://HOST:PORT"),
+        ("socket://127.0.0.1", "not a port (no port number up to 65535); give socket://HOST:PORT"),
+        ("socket://[::1]", "not a port (no port number up to 65535); give socket://HOST:PORT"),
+        ("socket://127.0.0.1:99999", "not a port (no port number up to 65535); give socket://HOST:PORT"),
     ],
 )
 def test_a_port_that_cannot_be_opened_is_told_in_the_systems_words(record, url, words):
@@ -394,7 +395,13 @@ def test_another_device_on_the_port_is_told_by_what_it_says(record, scan, monkey
         (["--head", "nonsense://x", "--like", "SOURCE"], 4, "not a port"),
         (["--head-baud", "115200", "--like", "SOURCE"], 4, "--every 15"),
         (["--tracker", "/dev/nothing", "--like", "SOURCE"], 4, "tracker /dev/nothing: cannot be opened"),
-        (["--examiner", "Dr Who", "--like", "SOURCE"], 3, "examiner"),
+        (["--tracker", "", "--like", "SOURCE"], 2, "--tracker is empty; give the tracker's port"),
+        (["--examiner", "Dr Who", "--like", "SOURCE"], 3, "error: --examiner: examiner is 'Dr Who'; give a text"),
+        (
+            ["--size-calibration", "no.json", "--live", "--uncalibrated", "--like", "SOURCE"],
+            3,
+            "no.json: cannot be read",
+        ),
     ],
 )
 def test_mistakes_end_in_one_line(record, tmp_path, source, scan, words, code, said):
@@ -438,9 +445,14 @@ def test_keys_touch_landmarks_start_and_stop(child_environment, tmp_path, source
         )
         assert process.stderr is not None
         assert b"space start" in process.stderr.readline()
-        for key, answer in ((b"n", b"sternal notch at"), (b"x", b"xiphoid at"), (b" ", b"recording")):
+        for key, *answers in (
+            (b"n", b"sternal notch: hold still", b"sternal notch at"),
+            (b"x", b"xiphoid: hold still", b"xiphoid at"),
+            (b" ", b"recording"),
+        ):
             os.write(near, key)
-            assert answer in process.stderr.readline()
+            for answer in answers:
+                assert answer in process.stderr.readline()
         wait_for_bytes(tmp_path / "a.mcap", 60_000)
         os.write(near, b"q")
         out, err = process.communicate(timeout=20)

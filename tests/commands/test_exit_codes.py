@@ -56,6 +56,20 @@ def test_a_signal_to_end_ends_as_ctrl_c_does(number: signal.Signals, tmp_path: P
     assert list(tmp_path.iterdir()) == []
 
 
+def test_ctrl_c_once_the_command_has_ended_leaves_its_exit_code() -> None:
+    """A second one soon after the first ended `record` with -2."""
+    code = (
+        "import atexit, os, signal, sys\n"
+        "from tactile_bayes.cli import main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))\n"
+        "sys.argv = ['tactile-bayes', '--version']\n"
+        "main()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_what_nohup_ignores_stays_ignored() -> None:
     before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGTERM, signal.SIGHUP)}
     try:

@@ -103,6 +103,46 @@ class Session:
         return self.recorder.report
 
 
+def test_an_old_record_that_is_sent_again_before_the_frames_does_not_stop_the_trackers_clock() -> None:
+    """A tool hidden at the start: "the clock stood still", and poses were timed by their arrival from then on."""
+    session = Session()
+    for i in range(200):
+        session.now_ns = i * FRAME_NS
+        session.pose(S if i < 100 else S + session.now_ns, x_mm=float(max(0, i - 99)))
+        session.now_ns += FRAME_NS // 2
+        session.frame(i * FRAME_NS)
+    report = session.end()
+    assert report.tracker_clock_steps == 0
+    assert (report.poses, report.missing_why) == (100, "an old record sent again 99")
+
+
+@pytest.mark.parametrize(
+    ("lost", "silent_s", "caution"),
+    [
+        (3, 0.0, "3 of 203 frames lost: check the head's cable"),
+        (2, 0.4, None),
+        (0, 0.6, "no frame came in the last 0.6"),
+    ],
+)
+def test_frames_that_do_not_come_are_a_caution(lost: int, silent_s: float, caution: str | None) -> None:
+    """A fifth of the frames lost, or a head that died before the end, were told by numbers alone, if at all."""
+    session = Session(tracker=False)
+    for i in range(200):
+        session.now_ns = i * FRAME_NS
+        session.frame(i * FRAME_NS, lost=lost if i == 50 else 0)
+    session.now_ns += round(silent_s * S)
+    session.recorder.stop("q")
+    cautions = session.end().cautions
+    assert [one for one in cautions if "frame" in one][:1] == [one for one in cautions if caution and caution in one]
+    assert len(cautions) == (caution is not None)
+
+
+def test_a_recording_without_a_frame_is_a_caution() -> None:
+    session = Session(tracker=False)
+    session.recorder.stop("q")
+    assert session.end().cautions == ["no frame was recorded"]
+
+
 def run_head(raw_of, *, seconds: float = 2.0, **options) -> tuple[Session, RecordingReport]:
     """A head at 200 Hz whose clock says ``raw_of(true time in ns)``."""
     session = Session(tracker=False, **options)

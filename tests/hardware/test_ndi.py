@@ -196,7 +196,9 @@ def test_the_missing_extra_is_one_line(monkeypatch):
     ],
 )
 def test_a_tools_description_is_for_ndi_and_must_be_there(run_cli, tmp_path, words, said):
-    done = run_cli("record", "-o", "a.mcap", "--head", "loop://", "--tracker", "loop://", *words, cwd=tmp_path)
+    done = run_cli(
+        "record", "-o", "a.mcap", "--head", "loop://head", "--tracker", "loop://tracker", *words, cwd=tmp_path
+    )
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert said in done.stderr

@@ -9,15 +9,25 @@ import numpy as np
 import pytest
 from test_orientation import scan_of
 
-from tactile_bayes.actions.record import Keys, calibration_age
+from tactile_bayes.actions.record import Keys, calibration_age, calibration_for
+from tactile_bayes.declarations import replace
+from tactile_bayes.errors import DeviceError, UsageError
 from tactile_bayes.hardware.live import LiveMap
+from tactile_bayes.hardware.readings import HelloReading
 
 
 @pytest.mark.parametrize(("key", "name"), [("n", "sternal_notch"), ("x", "xiphoid"), ("p", "nipple")])
 def test_a_key_touches_its_landmark(key: str, name: str) -> None:
-    recorder = SimpleNamespace(touch=None)
+    recorder = SimpleNamespace(touch=None, tracker="a line")
     Keys(recorder, np.eye(4), wait=False, drawn=False)._press(key)
     assert recorder.touch.name == name
+
+
+def test_a_landmark_without_a_tracker_is_answered(capsys: pytest.CaptureFixture[str]) -> None:
+    """The key did nothing."""
+    recorder = SimpleNamespace(touch=None, tracker=None)
+    Keys(recorder, np.eye(4), wait=False, drawn=False)._press("n")
+    assert (recorder.touch, capsys.readouterr().err) == (None, "no landmark without a tracker\n")
 
 
 @pytest.mark.parametrize(
@@ -46,3 +56,22 @@ def test_a_recording_tells_the_age_of_its_array_calibration(monkeypatch: pytest.
     request = SimpleNamespace(array_calibration="array.json", **given)
     assert calibration_age(request, **day) == {"array_calibration_days": "3"}
     assert calibration_age(SimpleNamespace(array_calibration=None, **given), **day) == {}
+
+
+def test_readings_at_the_heads_own_full_scale_carry_no_pressure() -> None:
+    """A head of 10 bits was taken for one of 12: its saturated readings counted as pressure."""
+    hello = HelloReading("7", 2, 3, 1023, 100.0)
+    request = SimpleNamespace(head_url="/dev/x", accept_calibration=False)
+    nominal = calibration_for(hello, None, request)
+    assert nominal.saturation_count == 1023
+    assert np.isnan(nominal.to_kpa(np.full((1, 2, 3), 1023, np.uint16))).all()
+    assert calibration_for(hello, nominal, request) is nominal
+    twelve_bits = replace(nominal, saturation_count=4095)
+    with pytest.raises(
+        UsageError, match="saturated at 1023 counts, the calibration given at 4095; calibrate this head"
+    ):
+        calibration_for(hello, twelve_bits, request)
+    request.accept_calibration = True
+    assert calibration_for(hello, twelve_bits, request) is twelve_bits
+    with pytest.raises(DeviceError, match="saturation count 0"):
+        calibration_for(hello._replace(saturation_count=0), None, request)
