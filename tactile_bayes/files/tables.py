@@ -60,7 +60,7 @@ def _split_cells(path: Path, text: str) -> RawTable:
     before = 0
     try:
         for cells in reader:
-            if any(cells):
+            if any(map(str.strip, cells)):
                 rows.append((before + 1, cells))
             before = reader.line_num
     except csv.Error as error:
@@ -285,7 +285,7 @@ def _advice_on_column(name: str, header: Sequence[str], fields: Mapping[str, Any
             way_out = "give the other one here" if other_one else f"the columns here are {_names(fields)}"
             return f"this is a trial's table of {contents}: {way_out}"
     if set(fields).isdisjoint(header):
-        return f"this is another table; the columns here are {_names(fields)}"
+        return f"the first line names the columns, which are {_names(fields)}"
     name = name.strip().lower()
     stem, _, unit = name.rpartition("_")
     if unit in MM_PER_UNIT and unit != "mm" and f"{stem}_mm" in fields:
@@ -303,7 +303,8 @@ def _check_length(line: int, cells: Sequence[str], header: Sequence[str]) -> Non
     way_out = "give every row a cell for each column"
     if len(cells) > len(header):
         way_out += " (a decimal comma? write 12.5, not 12,5)"
-    raise BadDataError(f"line {line}: {len(cells)} cells under {len(header)} columns", way_out=way_out)
+    cells_words = "1 cell" if len(cells) == 1 else f"{len(cells)} cells"
+    raise BadDataError(f"line {line}: {cells_words} under {len(header)} columns", way_out=way_out)
 
 
 def _cell(line: int, text: str, field: Mapping[str, Any], *, decimal_comma: bool) -> Any:
@@ -318,7 +319,7 @@ def _parse_cell(text: str, field: Mapping[str, Any], *, decimal_comma: bool) -> 
     """Value of a cell by its field's type and rules; None where it is blank and may be."""
     if text == "":
         if _is_required(field):
-            raise BadDataError("is blank", way_out=f"fill it in: {field['description']}")
+            raise BadDataError("is blank", way_out=field.get("ifZero", f"fill it in: {field['description']}"))
         return None
     if text != text.strip() or not text.isprintable():
         what = f"{_shown(text)} has blanks or unprintable characters around or in it"
@@ -338,7 +339,9 @@ def _parse_cell(text: str, field: Mapping[str, Any], *, decimal_comma: bool) -> 
         guess = f"did you mean {near[0]}? " if near else ""
         raise BadDataError(f"{_shown(text)} is not known", way_out=f"{guess}it must be {' or '.join(rules['enum'])}")
     if "pattern" in rules and not re.fullmatch(rules["pattern"], text):
-        raise BadDataError(f"{_shown(text)} does not match {rules['pattern']}", way_out=field["description"])
+        small = text.lower() if re.fullmatch(rules["pattern"], text.lower()) else ""
+        way_out = f"write {small}, in small letters" if small else field["description"]
+        raise BadDataError(f"{_shown(text)} does not match {rules['pattern']}", way_out=way_out)
     return value
 
 

@@ -163,13 +163,13 @@ def shown(figure: Figure, spec: str) -> str:
     """Value with its interval in brackets."""
     if figure.value is None or figure.interval is None:
         return number(figure.value, spec)
-    low, high = figure.interval
-    return f"{figure.value:{spec}} [{low:{spec}}, {high:{spec}}]"
+    low, high = (number(end, spec) for end in figure.interval)
+    return f"{number(figure.value, spec)} [{low}, {high}]"
 
 
 def number(value: float | None, spec: str) -> str:
-    """A number, or a dash for none."""
-    return "-" if value is None else f"{value:{spec}}"
+    """A number, without the sign of what rounds to 0, or a dash for none."""
+    return "-" if value is None else format(value, spec.replace(".", "z."))
 
 
 # --- Text report of a trial: a sentence for each comparison, a table that fits 80 columns; then methods.
@@ -263,7 +263,7 @@ def figure_table(report: TrialReport, columns: Mapping[str, tuple[str, str]]) ->
 
 
 def _between(ends: Ends | None, spec: str) -> str:
-    return "" if ends is None else f"{ends[0]:{spec}} to {ends[1]:{spec}}"
+    return "" if ends is None else f"{number(ends[0], spec)} to {number(ends[1], spec)}"
 
 
 def _methods(report: TrialReport) -> Iterator[str]:
@@ -327,11 +327,10 @@ def ratio_line(name: str, one: ModalityRatio) -> str:
     masses = counted(one.masses, "common mass")
     if one.ratio is None:
         return f"{name}: no MAPE ratio on {masses}: {one.reasons['ratio']}"
-    ratio, of_found = shown(one.figure("ratio"), ".2f"), shown(one.figure("ratio_detected"), ".2f")
-    return (
-        f"{name}: MAPE {ratio} times the tactile one's on {masses}; {of_found} times on the {one.masses_detected} that "
-        "both found"
-    )
+    ratio, of_found = shown(one.figure("ratio"), ".2f"), "none on those that both found"
+    if one.ratio_detected is not None:
+        of_found = f"{shown(one.figure('ratio_detected'), '.2f')} times on the {one.masses_detected} that both found"
+    return f"{name}: MAPE {ratio} times the tactile one's on {masses}; {of_found}"
 
 
 def _reasons(name: str, report: ModalityReport, keys: Sequence[str]) -> Iterator[str]:

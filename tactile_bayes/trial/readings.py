@@ -6,7 +6,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import date
-from itertools import groupby, pairwise
+from itertools import groupby, pairwise, product
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -233,13 +233,18 @@ def unit_doubts(sizes: Mapping[str, ModalitySizes], ex_vivo_mm: FloatArray) -> l
     ):
         doubts += _outside(f"{name} sizes", np.concatenate(detected.replicates_mm))
         with np.errstate(over="ignore", under="ignore"):
-            ratio = float(np.median(detected.size_mm / detected.ex_vivo_mm))
-        comparison = f"{name} sizes are {ratio:.3g} times the ex-vivo sizes in the median"
-        for unit, factor in UNITS.items():
-            if factor / NEAR < ratio < factor * NEAR:
-                doubts.append(f"{comparison}: are the ex-vivo sizes in {unit}?")
-            elif factor / NEAR < 1 / max(ratio, 1e-300) < factor * NEAR:
-                doubts.append(f"{comparison}: are the {name} sizes in {unit}?")
+            ratios = np.maximum(detected.size_mm / detected.ex_vivo_mm, 1e-300)
+            sides = (("ex-vivo", ratios, "{:g} times"), (name, 1 / ratios, "1/{:g} of"))
+        in_median, of_some = list[str](), list[str]()
+        for (unit, factor), (wrong, quotients, words) in product(UNITS.items(), sides):
+            near = (factor / NEAR < quotients) & (quotients < factor * NEAR)
+            if factor / NEAR < np.median(quotients) < factor * NEAR:
+                comparison = f"{name} sizes are {np.median(ratios):.3g} times the ex-vivo sizes in the median"
+                in_median.append(f"{comparison}: are the {wrong} sizes in {unit}?")
+            elif near.any():
+                some = f"{near.sum()} of {len(near)} {name} sizes about {words.format(factor)} the ex-vivo size"
+                of_some.append(f"{some}: is the {wrong} size there in {unit}?")
+        doubts += in_median or of_some
     return doubts
 
 
@@ -247,8 +252,8 @@ def _outside(name: str, values_mm: FloatArray) -> list[str]:
     """Sentence on the values outside `LEAST_MM` to `MOST_MM`; empty without any."""
     outside = (values_mm < LEAST_MM) | (values_mm > MOST_MM)
     text = (
-        f"{int(outside.sum())} of {len(values_mm)} {name} lie outside {LEAST_MM:g} to {MOST_MM:g} mm "
-        f"(from {values_mm.min(initial=np.inf):.3g} to {values_mm.max(initial=0.0):.3g}): are they in mm?"
+        f"{int(outside.sum())} of {len(values_mm)} {name} outside {LEAST_MM:g} to {MOST_MM:g} mm "
+        f"(from {values_mm.min(initial=np.inf):.6g} to {values_mm.max(initial=0.0):.6g}): are they in mm?"
     )
     return [text] if outside.any() else []
 

@@ -377,6 +377,12 @@ def test_a_ratio_over_no_error_and_lines_through_one_mass_are_reasons(tmp_path: 
     assert "tactile and us are not compared on 3 masses: the error of us is 0" in text
     assert "us: no MAPE ratio on 3 common masses: " in text
     assert "- times" not in text
+    level = small(tmp_path, [(one, 1, "tactile", 15.0) for one in "ABC"], e)
+    assert "tactile: Passing-Bablok: slope 0.00, intercept 15.0 mm" in validate(*level, "-v").output
+    missed = small(tmp_path, [(one, 1, "us", 15.0) for one in "ABC"], e)
+    with missed[0].open("a") as file:
+        file.writelines(f"{one},1,tactile,1,,not_detected\n" for one in "ABC")
+    assert "on 3 common masses; none on those that both found" in validate(*missed, "-v").output
     one = validate(*small(tmp_path, [("A", 1, "tactile", 10.0), ("A", 1, "us", 15.0)], e[:1]), "--methods").output
     assert "tactile - us on 1 common mass: " in one
     assert "tactile: no lines or limits: too few masses were found, or their sizes do not differ" in one
@@ -387,9 +393,12 @@ def test_exchanged_tables_and_readings_without_excision_are_told_apart(tmp_path:
     assert "this is a trial's table of sizes after excision" in refusal(EXCISION, "--excision", EXCISION)
     words = small(tmp_path, [("A", 1, "tactile", 10.0), ("B", 1, "tactile", 12.0)], [("A", 1, 11.0)])
     assert "or leave its readings out" in refusal(*words)
+    with words[2].open("a") as file:
+        file.write("   \nB,1,\n")
+    assert "line 4, column ex_vivo_mm: is blank; was the mass not measured? then leave its row out" in refusal(*words)
     for table, contents in ((TRIAL, "readings"), (EXCISION, "sizes after excision")):
         with pytest.raises(BadDataError, match=f"this is a trial's table of {contents}: the columns here are "):
             tactile_bayes.calibrate_size(table)
-    assert "this is another table; the columns here are patient, mass, modality" in refusal(
+    assert "the first line names the columns, which are patient, mass, modality" in refusal(
         TRIAL.with_name("phantoms.csv"), "--excision", EXCISION
     )

@@ -85,6 +85,14 @@ def test_a_median_ratio_near_a_unit_is_doubted(ratio: float, words: str) -> None
     assert any(words in doubt for doubt in unit_doubts({"cbe": one}, one.ex_vivo_mm))
 
 
+def test_some_sizes_in_another_unit_are_doubted() -> None:
+    """Two of twelve masses read in cm leave the median as it is."""
+    one = sizes(1.1)
+    one.size_mm[[2, 5]] /= 10
+    doubts = unit_doubts({"cbe": one}, one.ex_vivo_mm)
+    assert doubts == ["2 of 12 cbe sizes about 1/10 of the ex-vivo size: is the cbe size there in cm?"]
+
+
 @pytest.mark.parametrize("ratio", [0.4, 1.0, 3.0])
 def test_other_ratios_are_not_doubted(ratio: float) -> None:
     one = sizes(ratio)
@@ -125,6 +133,7 @@ def with_first_row(folder: Path, **cells: str) -> tuple[object, ...]:
         ({"size_mm": "99"}, "line 2, column size_mm: is 99, outside its own interval"),
         ({"size_mm": '"1,200"'}, "write 1200 or 1.200, whichever is meant"),
         ({"size_mm": '"12,5"'}, "has a decimal comma; write 12.5"),
+        ({"modality": "Tactile"}, "write tactile, in small letters"),
         ({"size_mm": '"0,125"'}, "has a decimal comma; write 0.125"),
     ],
 )
