@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -38,6 +37,7 @@ if TYPE_CHECKING:
     import pandas
 
 _SOURCE: Final = "balls in a population of bodies, scanned by the solid model"
+TINY_MM: Final = 4.0  #: Tables of lumps all below are rather in cm: no palpable mass is so small.
 _MAPS: Final = ("normalise", "background", "fit_radius_mm", "noise")  #: How a table's maps were made, if it is silent.
 
 
@@ -126,7 +126,9 @@ def _eq6(table: Path | Sheet, options: LearnOptions, progress: Progress | None) 
 
 def table_cautions(columns: Mapping[str, Sequence[Any]], *, least_stiffness_ratio: float = 0.0) -> tuple[str, ...]:
     """Cautions on sizes by Eq 6 from a table of lumps; see docs/decisions/0093 for the figures."""
-    cautions, seats = [], set(columns["seat"])
+    cautions, seats, largest_mm = [], set(columns["seat"]), max(columns["d_mm"])
+    if largest_mm < TINY_MM:
+        cautions.append(f"its largest lump has {largest_mm:g} mm; if its diameters are in cm, sizes come out as cm too")
     if set(columns["sigma_y_mm"]) == {None}:
         cautions.append(
             "its lumps have one width; if they were cylinders, as in a study in two dimensions, "
@@ -237,18 +239,22 @@ def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> eq6.SizeT
     """Columns of a table as arrays, with Delta sigma where depths are stated; without softer lumps."""
     # only lumps marked as detectable: fits to the others describe a trough
     hard = [
-        flag is not False and (ratio is None or ratio >= least_stiffness_ratio)
-        for flag, ratio in zip(table.columns["detectable"], table.columns["stiffness_ratio"], strict=True)
+        row
+        for row, (flag, ratio) in enumerate(
+            zip(table.columns["detectable"], table.columns["stiffness_ratio"], strict=True)
+        )
+        if flag is not False and (ratio is None or ratio >= least_stiffness_ratio)
     ]
-    columns = {name: list(compress(values, hard)) for name, values in table.columns.items()}
+    columns = {name: [values[row] for row in hard] for name, values in table.columns.items()}
 
     def array(name: str) -> FloatArray | None:
         values = columns[name]
         if all(value is None for value in values):
             return None
         if any(value is None for value in values):
-            row = table.columns[name].index(None)
-            raise table.error(row, name, "is blank in some rows only", way_out="fill the column or leave it out")
+            raise table.error(
+                hard[values.index(None)], name, "is blank in some rows only", way_out="fill the column or leave it out"
+            )
         return np.asarray(values, dtype=np.float64)
 
     d_mm, amplitude, sigma_x, sigma_y = (array(n) for n in ("d_mm", "amplitude", "sigma_x_mm", "sigma_y_mm"))

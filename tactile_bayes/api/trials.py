@@ -249,7 +249,8 @@ class Pilot(Record, eq=False):
         errors = planning.pilot_errors(sizes["tactile"], sizes[against], map_sd=stated.get("map_sd"))
         if errors is None:
             way_out = "give the errors by options"
-            raise BadDataError("has fewer than 3 masses found by a modality", way_out=way_out, path=str(self.path))
+            what = f"has fewer than 3 masses found by tactile, or fewer than 3 by {against}"
+            raise BadDataError(what, way_out=way_out, path=str(self.path))
         if "map_sd" not in errors:
             what = "has no mass with two tactile readings, so the SD of single maps is unknown"
             raise BadDataError(what, way_out="give it with --map-sd", path=str(self.path))

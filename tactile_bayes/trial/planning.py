@@ -147,6 +147,8 @@ def first_guess(case: PlanCase, aim: Aim, target: float) -> int:
     other[rng.random(n) < case.other_miss] = 1.0
     z = float(ndtri(1 - LEVEL / 2))
     if aim == "precision":
+        if tactile.std() <= 1e-9:
+            raise UndefinedError("the tactile errors assumed do not scatter, so their interval has no width")
         root = 2 * z * float(tactile.std() / tactile.mean()) / math.log(target)
     else:
         gain = float((other - tactile).mean())

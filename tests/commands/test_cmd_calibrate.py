@@ -87,6 +87,10 @@ def test_a_small_table_without_depths_teaches_the_ratio(tmp_path: Path) -> None:
             "d_mm,amplitude,sigma_x_mm,sigma_y_mm\n" + "\n".join(f"{i + 5},0.{i + 1},{i + 3}," for i in range(8)) + "4",
             "blank in some rows",
         ),
+        (  # the first row takes no part, so that its blank is none of the fault
+            "d_mm,amplitude,sigma_x_mm,sigma_y_mm,detectable\n5,0.1,3,,false\n6,0.1,3,4,true\n7,0.1,3,,true\n",
+            "line 4, column sigma_y_mm: is blank in some rows only",
+        ),
     ],
 )
 def test_a_bad_table_is_named_by_its_fault(tmp_path: Path, text: str, words: str) -> None:

@@ -138,6 +138,8 @@ def test_refusals_name_the_way_out() -> None:
     assert "choose one with --against" in str(error)
     assert plan("--patients", 7).exit_code == 2
     assert "leave out --patients" in str(plan("--patients", 12, "--power", 0.9).exception)
+    exact = plan("--precision", 2, "--tactile-bias", 0, "--mass-sd", 0, "--map-sd", 0).exception
+    assert "do not scatter, so their interval has no width; change the errors assumed" in str(exact)
     assert "for 90 % give 0.9" in plan("--power", "90%").output
 
 

@@ -72,13 +72,15 @@ def test_a_calibration_of_cylinders_of_one_seat_says_so_first(folder: Path) -> N
 
 def test_lumps_of_one_kind_are_remembered_and_lumps_that_differ_are_not() -> None:
     mixed = {"seat": ["centred", "resting"], "sigma_y_mm": [3.0, 4.0], "stiffness_ratio": [8.0, 100.0]}
+    mixed |= {"d_mm": [5.0, 25.0]}
     assert table_cautions(mixed) == ()
+    assert "if its diameters are in cm" in table_cautions(mixed | {"d_mm": [0.5, 2.5]})[0]
     assert "one seat (centred)" in table_cautions(mixed | {"seat": ["centred"] * 2})[0]
     assert "one width" in table_cautions(mixed | {"sigma_y_mm": [None, None]})[0]
     soft = mixed | {"stiffness_ratio": [2.0, 100.0]}
     assert "soft lumps" in table_cautions(soft)[0]
     assert table_cautions(soft, least_stiffness_ratio=8.0) == ()
-    unknown = {name: [None, None] for name in mixed} | {"sigma_y_mm": [3.0, 4.0]}
+    unknown = {name: [None, None] for name in mixed} | {"sigma_y_mm": [3.0, 4.0], "d_mm": [5.0, 25.0]}
     assert table_cautions(unknown) == ()
 
 
