@@ -85,8 +85,9 @@ def repeatability_text(site: RepeatabilityFile) -> str:
         f"{100 * PAPER_SPREAD:.0f} %.",
     ]
     if (half := site.half_width) is not None:
-        ends = f"about +-{100 * half.with_it:.0f} % of the size with it, +-{100 * half.as_estimated:.0f} %"
-        lines.append(f"The 95 % interval of one exam: {ends} as estimated.")
+        ends = f"about +-{100 * half.with_it:.0f} % of the size with it"
+        own = f"the narrower one of its own report is +-{100 * half.as_estimated:.0f} %"
+        lines.append(f"The 95 % interval of one exam: {ends}; {own}.")
     lines += _names_lines("Took no part", site.left_out)
     lines.append("Use it: tactile-bayes estimate MAP.nc --repeatability SITE.json")
     return "\n".join([*lines, RESEARCH_USE]) + "\n"

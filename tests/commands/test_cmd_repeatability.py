@@ -43,7 +43,7 @@ def test_a_repeatability_is_learned_from_a_campaigns_folder(site: Path) -> None:
     said = (site / "said.txt").read_text()
     assert f"Exams of one mass differ by {100 * document['median']:.1f} % at this site (95 %: " in said
     assert "Learned from 10 masses and 30 exams, sized by solid (frames normalised by gain)." in said
-    assert "The 95 % interval of one exam: about +-" in said
+    assert "; the narrower one of its own report is +-" in said
     assert said.endswith("Research use only: not a diagnostic device.\n")
     assert (site / "site.json").stat().st_mode & 0o777 == 0o600
 

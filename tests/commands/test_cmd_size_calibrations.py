@@ -86,7 +86,7 @@ def test_lumps_of_one_kind_are_remembered_and_lumps_that_differ_are_not() -> Non
 
 def test_a_file_keeps_its_cautions(tmp_path: Path) -> None:
     shipped = read_size_calibration(size_calibration_path("plane-strain") or Path())
-    columns = {"seat": ["centred"], "sigma_y_mm": [None], "stiffness_ratio": [8.0]}
+    columns = {"seat": ["centred"], "sigma_y_mm": [None], "stiffness_ratio": [8.0], "d_mm": [10.0]}
     assert shipped.cautions == table_cautions(columns)
     write_size_calibration(tmp_path / "again.json", shipped, provenance=Provenance("test", {}, {}))
     assert read_size_calibration(tmp_path / "again.json").cautions == shipped.cautions
