@@ -274,8 +274,11 @@ class Campaign:
             match = Match(exam.mass, tuple(named), self.settings.match_mm)
             places = [[one.mass, one.name, self._file("map", one.name, MAP), one.centre_mm] for one in named]
             key["match"] = {"mass": exam.mass, "most_mm": match.most_mm, "places": places}
+        told = any(scan.get("side") for scan in self.result("map", exam.name).get("scans", ()))
+        side = "" if told else exam.side or ""
+        key |= {"side": side} if side else {}
         make = steps.make_estimate if step == "estimate" else steps.make_figures
-        return self._task(step, exam.name, key, partial(make, self._folder_of(exam), settings, match))
+        return self._task(step, exam.name, key, partial(make, self._folder_of(exam), settings, match, side))
 
     def _with_known_place(self, mapped: Sequence[Exam]) -> list[Exam]:
         """The exams except those whose mass is placed on a map that could not be made; these fail."""

@@ -35,11 +35,11 @@ from tactile_bayes.files.provenance import Provenance, scan_facts
 from tactile_bayes.files.reading import NETCDF_BYTES, downloaded, kind_of, read_bytes, upload
 from tactile_bayes.files.reports import EstimateReport, json_text
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
-from tactile_bayes.findings import by_severity
+from tactile_bayes.findings import Finding, by_severity
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.map import TactileMap
+from tactile_bayes.mapping.map import TactileMap, side_findings
 from tactile_bayes.options import CampaignOptions, CompareOptions, MapOptions
-from tactile_bayes.report.estimate_document import side_of, size_diagnostics
+from tactile_bayes.report.estimate_document import patient_mm, side_of, size_diagnostics
 from tactile_bayes.report.estimate_figures import draw_map, draw_size
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import PageLabels, ShownExam, exam_map
@@ -253,9 +253,9 @@ def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
     raise BadDataError(f"the table says {in_table}; the file says {in_file}", way_out=way_out)
 
 
-def make_estimate(folder: Path, settings: Settings, match: Match | None) -> Made:
+def make_estimate(folder: Path, settings: Settings, match: Match | None, side: str) -> Made:
     """Estimate, draws of its size, and the draws from which masses are pooled and sized by the site."""
-    estimate = _estimate_exam(folder, settings, match)
+    estimate = _estimate_exam(folder, settings, match, side)
     answer = estimate.answer
     report, shape = answer.report.checked(), answer.shape
     writes: Writes = {layout.ESTIMATE: lambda path: write_text(path, json_text(report), force=True)}
@@ -266,21 +266,30 @@ def make_estimate(folder: Path, settings: Settings, match: Match | None) -> Made
     return {"exit_code": answer.exit_code}, writes
 
 
-def _estimate_exam(folder: Path, settings: Settings, match: Match | None) -> SizeEstimate:
-    """The exam's estimate; with a match, of the mass that lies where other exams place it."""
+def _estimate_exam(folder: Path, settings: Settings, match: Match | None, side: str) -> SizeEstimate:
+    """The exam's estimate; with a match, of the mass that lies where other exams place it.
+
+    `side`: of the breast by the table, where no scan says it; the landmarks are held against it.
+    """
+    path, findings = folder / layout.MAP, list[Finding]()
     if match is None:
-        return estimate_file(folder / layout.MAP, settings)
-    estimate = estimate_matched(folder / layout.MAP, settings, match)
-    tactile_maps = (estimate.tactile_map, *(map_of_exam(folder / layout.MAP, one) for one in match.named))
-    if all(one.patient_from_plane is not None for one in tactile_maps):
-        return estimate
-    findings = by_severity((*estimate.estimate.findings, OWN_AXES))
-    return replace(estimate, estimate=replace(estimate.estimate, findings=findings))
+        sized = estimate_file(path, settings)
+    else:
+        sized = estimate_matched(path, settings, match)
+        tactile_maps = (sized.tactile_map, *(map_of_exam(path, one) for one in match.named))
+        findings += [OWN_AXES] if any(one.patient_from_plane is None for one in tactile_maps) else []
+    if side:
+        lump = next(((one.x_mm, one.y_mm) for one in sized.estimate.masses if one.reported), None)
+        place = patient_mm(sized.tactile_map, *(lump or (0.0, 0.0)))  # the plane's origin is the middle of the frames
+        findings += side_findings(side, place, "the lump" if lump else "the scanned place", in_table=True)
+    if not findings:
+        return sized
+    return replace(sized, estimate=replace(sized.estimate, findings=by_severity((*sized.estimate.findings, *findings))))
 
 
-def make_figures(folder: Path, settings: Settings, match: Match | None) -> Made:
+def make_figures(folder: Path, settings: Settings, match: Match | None, side: str) -> Made:
     """The figures of `estimate`; the estimate is made again, for it is not stored whole."""
-    sized = _estimate_exam(folder, settings, match)
+    sized = _estimate_exam(folder, settings, match, side)
     tactile_map, estimate, report = sized.tactile_map, sized.estimate, sized.answer.report
     name, size, writes = folder.name, estimate.size, Writes()
     if tactile_map.covered.any():

@@ -247,10 +247,13 @@ MIDDLE_MM: Final = 20.0
 """So far from the xiphoid a place is on that side of the body, whatever is wrong with the landmarks' direction."""
 
 
-def side_findings(side: str, patient_mm: Sequence[float] | None, what: str = "the lump") -> tuple[Finding, ...]:
+def side_findings(
+    side: str, patient_mm: Sequence[float] | None, what: str = "the lump", *, in_table: bool = False
+) -> tuple[Finding, ...]:
     """Caution where the landmarks put the lump, or `what`, on the other side of the body than the scans say.
 
-    `patient_mm`: from the xiphoid to the patient's right and up; None without landmarks or a lump.
+    `patient_mm`: from the xiphoid to the patient's right and up; None without landmarks or a lump. `in_table` is true
+    if the table of exams says the side.
     """
     if side not in ("left", "right") or patient_mm is None or abs(patient_mm[0]) < MIDDLE_MM:
         return ()
@@ -258,9 +261,10 @@ def side_findings(side: str, patient_mm: Sequence[float] | None, what: str = "th
     if other == side:
         return ()
     place = f"the landmarks put {what} {abs(patient_mm[0]):.0f} mm to the patient's {other} of the xiphoid"
-    text = f"the scan says {side} breast, and {place}: side or landmarks are wrong"
+    text = f"the {'table' if in_table else 'scan'} says {side} breast, and {place}: side or landmarks are wrong"
     check = "check which breast it was, and that sternal notch and xiphoid are not exchanged"
     correct = "`import SCAN.mcap -o NEW.mcap` corrects them by --session and --landmarks"
+    correct = "correct the row" if in_table else correct
     return (finding("side", text, f"{check}; {correct}", check),)
 
 

@@ -36,7 +36,7 @@ def written(
     values += 0.005 * correlated_field(rng, len(values), length_cells=3.0)
     tactile_map = grid_map(values + 0.005 * rng.standard_normal(values.shape), normalise="gain")
     turn = np.eye(4)
-    turn[:2, 3] = 60.0 - shift[0], 90.0 - shift[1]
+    turn[:2, 3] = -60.0 - shift[0], 90.0 - shift[1]  # in the left breast
     write_map(
         path, replace(tactile_map, patient_from_plane=turn if landmarks else None), provenance=Provenance("import", {})
     )
@@ -84,6 +84,18 @@ def test_without_a_place_the_largest_is_taken_and_the_other_is_reported(folder: 
     assert "exams with a mass that no row names, see their findings: P1.v1.m2.r2" in told
     (row,) = rows_of(folder / "out" / "exams_done.csv")
     assert re.search(r"a mass at \((20.9|21.0), -6.0\) mm on the map is named by no row", row["findings"])
+
+
+@pytest.mark.long
+def test_a_side_that_only_the_table_says_is_held_against_the_landmarks(folder: Path) -> None:
+    """The control is the first test: its rows say left, and nothing is found."""
+    campaign(folder, "a.nc,P1,1,1,1,right,,")
+    (row,) = rows_of(folder / "out" / "exams_done.csv")
+    assert row["verdict"] == "doubtful"
+    assert (
+        "CAUTION: the table says right breast, and the landmarks put the lump 77 mm to the patient's left"
+        in (row["findings"])
+    )
 
 
 @pytest.mark.long

@@ -37,8 +37,8 @@ def exam(path: str, *, out: str, steps: tuple[str, ...]) -> list[float]:
     folder, settings = Path(out), Settings(method="laplace")
     make = {
         "map": partial(make_map, source, source_sha256=sha256(source), expected={}, normalise="gain"),
-        "estimate": partial(make_estimate, folder, settings, None),
-        "figures": partial(make_figures, folder, settings, None),
+        "estimate": partial(make_estimate, folder, settings, None, ""),
+        "figures": partial(make_figures, folder, settings, None, ""),
     }
     with contextlib.suppress(TactileBayesError):  # damaged on purpose
         for step in ("map", *steps):
