@@ -89,6 +89,8 @@ class Outputs(Record):
             raise UsageError(f"no file was given to export{where}; give a map, an estimate or both")
         if self.dictionary is not None and self.to != "csv":
             raise UsageError("--dictionary is REDCap's; give it with --to csv")
+        if self.to == "dicom" and self.path is not None and self.path.suffix.lower() == ".dcm":
+            raise UsageError(f"{self.path} is to be a folder of several files; leave out the ending .dcm")
         if self.path is not None and self.dictionary is not None and same_file(self.path, self.dictionary):
             raise UsageError(f"{self.path} is to hold records and dictionary; choose another name for one of them")
         for path, written in ((self.dictionary, "CSV"), (self.path, _SINGLE_FILES.get(self.to))):
@@ -201,6 +203,10 @@ def export(
         identity = replace(identity, patient_id=subjects.pop())
     no_patient = "the patient ID is empty; --patient-id, --worklist or --patient-id-from-scan gives one"
     notes = [] if identity.patient_id else [no_patient]
+    if " " in identity.patient_name and "^" not in identity.patient_name:
+        notes.append(f"{identity.patient_name!r} is written as a family name; give FAMILY^GIVEN where it is not")
+    if to == "fhir" and identity.study is not None and identity.study.time and not identity.study.zone:
+        notes.append("FHIR takes a time of day only with its zone, so the date stands alone; give +HH:MM with the time")
     if to == "dicom":
         written, remarks = _dicom(maps, estimates, identity)
         return written, (*notes, *remarks)

@@ -181,6 +181,20 @@ def test_files_are_their_owners_and_not_overwritten(folder: Path, tmp_path: Path
     exported(folder, *words, "--force")
 
 
+def test_a_name_without_its_parts_a_time_without_its_zone_and_a_folder_called_dcm_are_told(
+    folder: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("fhir.resources")
+    words = ("map.json", "--to", "fhir", "--patient-name", "Jane Doe", "--study-date", "2026-11-24T10:30")
+    noted = run_here("export", *words, "-o", tmp_path / "f.json", cwd=folder).stderr
+    assert "'Jane Doe' is written as a family name; give FAMILY^GIVEN where it is not" in noted
+    assert "FHIR takes a time of day only with its zone" in noted
+    whole = (*words[:-3], "Doe^Jane", "--study-date", "2026-11-24T10:30+01:00", "-o", tmp_path / "g.json")
+    assert run_here("export", *whole, cwd=folder).stderr.count("note:") == noted.count("note:") - 2
+    refused = run_here("export", "map.nc", "--to", "dicom", *DATED, "-o", tmp_path / "out.dcm", cwd=folder)
+    assert "out.dcm is to be a folder of several files; leave out the ending .dcm" in refused.stderr
+
+
 @pytest.mark.long
 def test_a_folder_with_another_exports_report_is_refused(folder: Path, tmp_path: Path) -> None:
     """Without its report the second exam must not lie beside the first one's."""
