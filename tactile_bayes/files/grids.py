@@ -214,9 +214,10 @@ def _read_arrays(path: Path, array: str) -> Grid:
     if not array and "mean" in arrays:
         if "spacing_mm" not in arrays:
             return Grid(arrays, notes=notes)
-        sides = np.atleast_1d(arrays.pop("spacing_mm"))
-        if sides.dtype.kind not in "iuf" or sides.ndim != 1 or len(sides) not in (1, 2):
-            what = f"spacing_mm is {sides.dtype} of shape {sides.shape}"
+        stated = arrays.pop("spacing_mm")
+        sides = stated.reshape(-1)  # MATLAB's numbers have two axes
+        if sides.dtype.kind not in "iuf" or len(sides) not in (1, 2):
+            what = f"spacing_mm is {stated.dtype} of shape {stated.shape}"
             raise BadDataError(what, way_out="it must be one number")
         return Grid(arrays, (float(sides[0]), float(sides[-1])), notes=notes)
     named = {name: array_held for name, array_held in arrays.items() if array in ("", name)}

@@ -98,33 +98,55 @@ AXES: Final = ("x", "y")  #: Places of the columns and rows of a grid, or of eac
 
 
 def orient_by_axes(arrays: Arrays) -> tuple[str, ...]:
-    """Orient grids in place by the arrays `AXES`, which are removed: x rises along a row, y from row to row."""
-    x, y = (arrays.get(name, np.empty(0)) for name in AXES)
-    if x.ndim == y.ndim == 2 and x.size and x.shape == y.shape and len(arrays) > len(AXES):
-        x, y = (x[0], y[:, 0]) if x[0, 0] != x[0, -1] else (x[:, 0], y[0])
-    lines = zip(AXES, (x, y), strict=True)
-    places = {name: line for name, line in lines if line.ndim == 1 and line.dtype.kind in "iuf"}
-    for name in places:
-        arrays.pop(name, None)
+    """Orient grids in place by the arrays `AXES` of their group, else of the file, and say how.
+
+    The axes, which are removed, may be lines or, as MATLAB keeps them, matrices of one row or column. x then rises
+    along a row, y from row to row.
+    """
+    notes: list[str] = []
+    flat = {name: one for name, one in arrays.items() if one.ndim == 2 and min(one.shape) > 1}
+    grids = {name for name in flat if name.rpartition(".")[2] not in AXES}
+    for group in sorted(
+        {name.rpartition(".")[0] for name in grids} | {""}, reverse=True
+    ):  # that of the file comes last
+        prefix = f"{group}." if group else ""
+        within = {name for name in grids if name.startswith(prefix)}
+        names = [prefix + axis for axis in AXES]
+        lines = [arrays.get(name, np.empty(0)) for name in names]
+        x, y = (one.reshape(-1) if one.ndim == 2 and 1 in one.shape else one for one in lines)
+        if within and x.ndim == y.ndim == 2 and x.size and x.shape == y.shape:
+            x, y = (x[0], y[:, 0]) if x[0, 0] != x[0, -1] else (x[:, 0], y[0])
+        places = {
+            name: line for name, line in zip(names, (x, y), strict=True) if line.ndim == 1 and line.dtype.kind in "iuf"
+        }
+        for name in places:
+            arrays.pop(name, None)
+        if any(line.size for line in places.values()):
+            notes += _orient(arrays, within, places.get(names[0], np.empty(0)), places.get(names[1], np.empty(0)))
+            grids -= within
+    return tuple(dict.fromkeys(notes))
+
+
+def _orient(arrays: Arrays, grids: Iterable[str], x: np.ndarray, y: np.ndarray) -> list[str]:
+    """Orient grids in place by the places of their columns and rows, of which either may be empty, and say how."""
     notes = []
-    for name, line in places.items():
+    for key, line in zip(AXES, (x, y), strict=True):
         with np.errstate(all="ignore"):
             steps = np.diff(line.astype(np.float64))
         if len(steps) and not np.allclose(steps, steps.mean(), rtol=0.01, atol=0.0):
-            what = f"{name} runs in unequal steps ({steps.min():.4g} to {steps.max():.4g})"
+            what = f"{key} runs in unequal steps ({steps.min():.4g} to {steps.max():.4g})"
             raise BadDataError(what, way_out="a grid has square cells of one side: interpolate it")
         if len(steps):
-            notes.append(f"{name} runs in steps of {abs(steps[0]):g}")
-    for name, grid in arrays.items():
-        if grid.ndim == 2 and len(x) != len(y) and grid.shape == (len(x), len(y)):
-            arrays[name] = grid.T
+            notes.append(f"{key} runs in steps of {abs(steps[0]):g}")
+    for name in grids:
+        if len(x) != len(y) and arrays[name].shape == (len(x), len(y)):
+            arrays[name] = arrays[name].T
             notes.append("rows and columns were swapped: x runs from row to row")
-        for axis, key in ((1, "x"), (0, "y")):
-            line = places.get(key, np.empty(0))
-            if arrays[name].ndim == 2 and len(line) == arrays[name].shape[axis] > 1 and line[0] > line[-1]:
+        for axis, key, line in ((1, "x", x), (0, "y", y)):
+            if len(line) == arrays[name].shape[axis] and line[0] > line[-1]:
                 arrays[name] = np.flip(arrays[name], axis)
                 notes.append(f"turned round along {key}, which falls from {line[0]:g} to {line[-1]:g}")
-    return tuple(dict.fromkeys(notes))
+    return notes
 
 
 def _netcdf_3(path: Path) -> Arrays:

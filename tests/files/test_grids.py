@@ -439,6 +439,9 @@ def test_a_grid_lies_as_its_places_say(tmp_path: Path, arrays: dict[str, Any]) -
     found, notes = import_grid(tmp_path / "grid.npz", GridOptions(spacing_mm=1.0, normalise="gain"))
     np.testing.assert_array_equal(found.mean, lump())
     assert "x runs in steps of 1" in notes
+    savemat(tmp_path / "grid.mat", {"exam": arrays})  # lines have two axes, and a group
+    found, notes = import_grid(tmp_path / "grid.mat", GridOptions(spacing_mm=1.0, normalise="gain"))
+    np.testing.assert_array_equal(found.mean, lump())
     np.savez(tmp_path / "grid.npz", **{**arrays, "x": arrays["x"] ** 3})
     with pytest.raises(BadDataError, match="x runs in unequal steps"):
         import_grid(tmp_path / "grid.npz", GridOptions(spacing_mm=1.0, normalise="gain"))
