@@ -59,57 +59,57 @@ OF_TOML: dict[str, type[Record]] = {
 
 def schemas() -> dict[Path, str]:
     """What each generated schema has to hold."""
-    found = {name: schema_of(kind, meanings(kind), shared=True) for name, kind in OF_JSON.items()}
-    found |= {name: schema_of(kind, meanings(kind), nulls=False) for name, kind in OF_TOML.items()}
-    found["scan_session.schema.json"] = _session()
+    by_file = {name: schema_of(kind, meanings(kind), shared=True) for name, kind in OF_JSON.items()}
+    by_file |= {name: schema_of(kind, meanings(kind), nulls=False) for name, kind in OF_TOML.items()}
+    by_file["scan_session.schema.json"] = _session()
     for name, tables in OPEN_TABLES.items():
         for key, kind in tables.items():
-            _add_known(found[name]["properties"][key], schema_of(kind, meanings(kind)))
-    return {SCHEMAS / name: json.dumps(one, indent=2, ensure_ascii=False) + "\n" for name, one in found.items()}
+            _add_known(by_file[name]["properties"][key], schema_of(kind, meanings(kind)))
+    return {SCHEMAS / name: json.dumps(one, indent=2, ensure_ascii=False) + "\n" for name, one in by_file.items()}
 
 
 def meanings(kind: Any) -> dict[str, dict[str, str]]:
     """What the sources of all records in a declaration say of their fields, by the records' names and the keys."""
-    found: dict[str, dict[str, str]] = {}
+    by_record: dict[str, dict[str, str]] = {}
 
-    def look(one: Any) -> None:
-        if isinstance(one, type) and issubclass(one, Record) and one.__name__ not in found:
+    def collect(one: Any) -> None:
+        if isinstance(one, type) and issubclass(one, Record) and one.__name__ not in by_record:
             fields = msgspec.structs.fields(one)
-            told = {name: text for part in reversed(one.__mro__) for name, text in _said(part).items()}
-            told |= {part.name: text for part in fields if (text := meaning_of(part.type))}
-            found[one.__name__] = {part.encode_name: told[part.name] for part in fields if part.name in told}
-            for part in fields:
-                look(part.type)
-        for part in get_args(one):
-            look(part)
+            texts = {name: text for base in reversed(one.__mro__) for name, text in _comments(base).items()}
+            texts |= {field.name: text for field in fields if (text := meaning_of(field.type))}
+            by_record[one.__name__] = {field.encode_name: texts[field.name] for field in fields if field.name in texts}
+            for field in fields:
+                collect(field.type)
+        for argument in get_args(one):
+            collect(argument)
 
-    look(kind)
-    return found
+    collect(kind)
+    return by_record
 
 
 _NAMES = re.compile(r"((?:`\w+`(?:, | and )?)+): (.*)")
 
 
-def _said(record: type) -> dict[str, str]:
-    """Meaning of a class's own fields: ``#: Text`` behind one, or a text below, which may name several."""
+def _comments(record: type) -> dict[str, str]:
+    """Meanings of a class's own fields: ``#: Text`` behind one, or a text below, which may name several."""
     try:
         source = inspect.getsource(record)
     except (OSError, TypeError):  # made of another's fields
         return {}
-    found: dict[str, str] = {}
-    lines, last = source.splitlines(), ""
+    texts: dict[str, str] = {}
+    lines, field = source.splitlines(), ""
     for node in ast.parse(source).body[0].body:  # type: ignore[attr-defined]
         if isinstance(node, ast.AnnAssign):
-            last = ast.unparse(node.target)
+            field = ast.unparse(node.target)
             _, sign, text = lines[(node.end_lineno or 1) - 1].partition("#: ")
-            found |= {last: text} if sign else {}
-        elif isinstance(node, ast.Expr) and last:
+            texts |= {field: text} if sign else {}
+        elif isinstance(node, ast.Expr) and field:
             text = " ".join(ast.literal_eval(node.value).split())
             several = _NAMES.fullmatch(text)
-            found |= dict.fromkeys(re.findall(r"\w+", several[1]), several[2]) if several else {last: text}
+            texts |= dict.fromkeys(re.findall(r"\w+", several[1]), several[2]) if several else {field: text}
         else:
-            last = ""
-    return found
+            field = ""
+    return texts
 
 
 def _add_known(table: dict[str, Any], known: dict[str, Any]) -> None:

@@ -22,13 +22,13 @@ def schema_of(
     Files of TOML hold no `nulls`. With `shared` a record that stands in several places is described once, among
     ``definitions``. `meanings`: of keys by the names of their records, where no `Meta` says them.
     """
-    found = msgspec.json.schema(kind, schema_hook=_custom_schema)
-    definitions = found.pop("$defs", {})
-    for name, told in meanings.items():
+    reference = msgspec.json.schema(kind, schema_hook=_custom_schema)
+    definitions = reference.pop("$defs", {})
+    for name, texts in meanings.items():
         keys = definitions.get(name, {}).get("properties", {})
-        keys |= {key: {"description": told[key], **one} for key, one in keys.items() if key in told}
-    several = _repeated([found, definitions]) if shared else {}
-    body = _inlined(found, {**definitions, **several})
+        keys |= {key: {"description": texts[key], **one} for key, one in keys.items() if key in texts}
+    several = _repeated([reference, definitions]) if shared else {}
+    body = _inlined(reference, {**definitions, **several})
     if several:
         body["definitions"] = {name: _inlined(definitions[name], {**definitions, **several}) for name in several}
     title, _, meaning = body.pop("description", "").partition("\n")
@@ -44,13 +44,13 @@ def _without_nulls(schema: Any) -> Any:
         return [_without_nulls(one) for one in schema]
     if not isinstance(schema, dict):
         return schema
-    found = {key: _without_nulls(one) for key, one in schema.items() if key != "default" or one is not None}
-    if "anyOf" in found:
-        forms = [one for one in found.pop("anyOf") if one != {"type": "null"}]
-        found = {**(forms[0] if len(forms) == 1 else {"anyOf": forms}), **found}
-    if None in found.get("enum", ()):
-        found["enum"] = [one for one in found["enum"] if one is not None]
-    return found
+    kept = {key: _without_nulls(one) for key, one in schema.items() if key != "default" or one is not None}
+    if "anyOf" in kept:
+        forms = [one for one in kept.pop("anyOf") if one != {"type": "null"}]
+        kept = {**(forms[0] if len(forms) == 1 else {"anyOf": forms}), **kept}
+    if None in kept.get("enum", ()):
+        kept["enum"] = [one for one in kept["enum"] if one is not None]
+    return kept
 
 
 def _repeated(schema: Any) -> dict[str, Any]:
@@ -69,34 +69,35 @@ def _inlined(schema: Any, definitions: Mapping[str, Any]) -> Any:
         return schema
     if "$ref" in schema:
         named = definitions[schema["$ref"].rsplit("/", 1)[-1]]
+        beside = {key: one for key, one in schema.items() if key != "$ref"}
         if "$ref" in named:  # what stands beside a reference is not read
-            return {"allOf": [named], **rest} if (rest := {k: v for k, v in schema.items() if k != "$ref"}) else named
-        schema = {**definitions[schema["$ref"].rsplit("/", 1)[-1]], **{k: v for k, v in schema.items() if k != "$ref"}}
-    found = {key: _inlined(one, definitions) for key, one in schema.items()}
+            return {"allOf": [named], **beside} if beside else named
+        schema = {**named, **beside}
+    inlined = {key: _inlined(one, definitions) for key, one in schema.items()}
     if isinstance(schema.get("description"), str):  # Python 3.13 takes off the indents of docstrings, 3.11 does not
-        found["description"] = inspect.cleandoc(schema["description"])
-    if "properties" in found:
-        found.pop("title", None)
-        found["properties"] = {key: _inlined(one, definitions) for key, one in schema["properties"].items()}
-    if "prefixItems" in found:
-        parts = found.pop("prefixItems")
+        inlined["description"] = inspect.cleandoc(schema["description"])
+    if "properties" in inlined:
+        inlined.pop("title", None)
+        inlined["properties"] = {key: _inlined(one, definitions) for key, one in schema["properties"].items()}
+    if "prefixItems" in inlined:
+        parts = inlined.pop("prefixItems")
         if all(part == parts[0] for part in parts):
-            found["items"] = parts[0]
+            inlined["items"] = parts[0]
         elif all("const" in part for part in parts):
-            kept = ("title", "description", "default")
-            found = {"const": [part["const"] for part in parts], **{key: found[key] for key in kept if key in found}}
+            kept = {key: inlined[key] for key in ("title", "description", "default") if key in inlined}
+            inlined = {"const": [part["const"] for part in parts], **kept}
         else:
-            found |= {"items": parts, "additionalItems": False}
-    if len(found.get("enum", ())) == 1:
-        found = {"const" if key == "enum" else key: one[0] if key == "enum" else one for key, one in found.items()}
-    if not found.get("required", True):
-        del found["required"]
-    if len(found.get("anyOf", ())) == 2 and {"type": "null"} in found["anyOf"]:
-        for one in found["anyOf"]:
-            found |= {"description": one.pop("description")} if "description" in one else {}
-    if "discriminator" in found:
-        del found["discriminator"]
-    return found
+            inlined |= {"items": parts, "additionalItems": False}
+    if len(inlined.get("enum", ())) == 1:
+        inlined = {"const" if key == "enum" else key: one[0] if key == "enum" else one for key, one in inlined.items()}
+    if not inlined.get("required", True):
+        del inlined["required"]
+    if len(inlined.get("anyOf", ())) == 2 and {"type": "null"} in inlined["anyOf"]:
+        for one in inlined["anyOf"]:
+            inlined |= {"description": one.pop("description")} if "description" in one else {}
+    if "discriminator" in inlined:
+        del inlined["discriminator"]
+    return inlined
 
 
 def _custom_schema(kind: Any) -> dict[str, Any]:
