@@ -381,22 +381,22 @@ def compare(
     first, second, *more
         A visit each, in order of time: a map, a path or an estimate, or a list of them.
     days
-        Days from the first visit to each later one; with them growth rates are reported.
+        Days from the first visit to each later one; adds growth rates.
     dates
-        The visits' dates in place of days, such as ``["2026-01-15", "2026-04-20"]``.
+        The visits' dates, in place of days, such as ``["2026-01-15", "2026-04-20"]``.
     grown_by
-        Shares of the diameter (0.2 for 20 %) for which the probability of a larger growth is reported.
+        Growths of the diameter, as shares (0.2 for 20 %): adds the probability of having grown by more.
     same_mass
         Say that the visits are of one mass where landmarks are missing, or place it too far apart.
     registration_mm
-        SD along each axis of one mass's place between visits.
+        SD along each axis of one mass's place between visits, by posture and landmarks.
     **settings
-        As of `estimate`; estimates keep their own.
+        As of `estimate`, for visits that are not estimated yet.
 
     Raises
     ------
     UsageError
-        When a visit has no map, a map is given twice, or days do not fit.
+        When a visit has no map, a map or a scan is given twice, or days do not fit.
     BadDataError
         As of `estimate`, and when the maps were normalised in several ways.
     """
