@@ -25,6 +25,8 @@ from tactile_bayes.size.visits import VOLUME, Change, JointSizes, VisitCompariso
 # --- The report, as `compare --json` prints it.
 
 COMPARE: Final = "tactile-bayes/compare/1"
+VERDICT_PROBABILITY: Final = 0.95
+"""Probability of the interval that leaves out no change where a growth, or a shrinkage, is called one."""
 
 
 class VisitMap(Record):
@@ -132,9 +134,13 @@ class ChangeReport(Record):
 
     @property
     def for_alike_exams_only(self) -> bool:
-        """True if the change is shown only where exams repeat as simulated ones do."""
-        shown, another = self.verdict != "no_change_shown", self.another_exam
-        return shown and another is not None and another.percent.low <= 0 <= another.percent.high
+        """True if the change is shown only where exams repeat as simulated ones do: the verdict is by 95 %."""
+        if self.verdict == "no_change_shown" or self.another_exam is None:
+            return False
+        q, tail = self.another_exam.percent, (1 - VERDICT_PROBABILITY) / 2
+        if q.probability == VERDICT_PROBABILITY:
+            return q.low <= 0 <= q.high
+        return tail <= self.another_exam.probability_grown <= 1 - tail
 
 
 class CompareReport(Report, kw_only=True):
@@ -184,9 +190,6 @@ def growths(patient: str, mass: str, visits: Sequence[str], report: CompareRepor
 
 
 # --- The report of a comparison made.
-
-VERDICT_PROBABILITY: Final = 0.95
-"""Probability of the interval that leaves out no change where a growth, or a shrinkage, is called one."""
 
 
 def compare_report(
@@ -403,13 +406,16 @@ def _direction(grown: float) -> str:
 
 
 def _verdict_line(change: ChangeReport) -> str:
-    if change.verdict != "no_change_shown":
-        return f"The mass has {change.verdict}{f', {_IF_EXAMS_REPEAT}' if change.for_alike_exams_only else ''}."
     least = change.smallest_detectable_percent
-    growth, shrinkage = f"{least.growth:.0f} %", f"{least.shrinkage:.0f} %"
-    larger = "" if change.another_exam is None else "; larger ones too, if exams differ as those of patients did"
-    smaller = f"a growth of less than {growth} or a shrinkage of less than {shrinkage} can stay unseen"
-    return f"No change shown; {smaller}{larger}."
+    text = f"the mass has {change.verdict}{f', {_IF_EXAMS_REPEAT}' if change.for_alike_exams_only else ''}."
+    if change.verdict == "no_change_shown":
+        text = (
+            f"no change shown; a growth of less than {least.growth:.0f} % or a shrinkage of less than "
+            f"{least.shrinkage:.0f} % can stay unseen"
+        )
+        text += "." if change.another_exam is None else "; larger ones too, if exams differ as those of patients did."
+    asked = change.percent.probability == VERDICT_PROBABILITY
+    return capitalised(text) if asked else f"By the {100 * VERDICT_PROBABILITY:g} % interval: {text}"
 
 
 def _rate_lines(change: ChangeReport) -> list[str]:

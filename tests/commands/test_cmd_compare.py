@@ -369,3 +369,13 @@ def test_a_change_that_exams_of_patients_would_not_show_says_on_what_it_rests(gr
     for another, outcome in ((around_0, words), (wide, "grown"), (None, "grown")):
         (row,) = growths("P1", "1", "12", with_change(grown, another_exam=another), "")
         assert row.outcome == outcome
+
+
+def test_the_verdict_and_what_it_rests_on_are_by_95_percent_whatever_interval_is_asked_for(grown: dict) -> None:
+    percent, wide = (
+        one["percent"] | {"probability": 0.5} for one in (grown["changes"][0], grown["changes"][0]["another_exam"])
+    )
+    for chance, more in ((0.968, ", if exams repeat as simulated ones do;"), (0.98, ".\n")):
+        another = {"between_map_sd": 0.1, "percent": wide | {"low": 1.0}, "probability_grown": chance}
+        text = reworded(grown, percent=percent, another_exam=another)
+        assert text.startswith(f"By the 95 % interval: the mass has grown{more}")
