@@ -126,6 +126,13 @@ def figure_file(
     write_bytes(path, buffer.getvalue(), force=force)
 
 
+def label(axes: Axes, title: str, across: str, up: str) -> None:
+    """Title and labels."""
+    axes.set_title(title, loc="left", fontsize=10)
+    axes.set_xlabel(across, fontsize=9)
+    axes.set_ylabel(up, fontsize=9)
+
+
 def finish(axes: Axes, title: str, across: str, up: str, *, headroom: float = 0.0, **looks: Any) -> None:
     """Title, labels, and a legend where something is named.
 
@@ -134,9 +141,7 @@ def finish(axes: Axes, title: str, across: str, up: str, *, headroom: float = 0.
     if headroom:
         low, high = axes.get_ylim()
         axes.set_ylim(low, high + headroom * (high - low))
-    axes.set_title(title, loc="left", fontsize=10)
-    axes.set_xlabel(across, fontsize=9)
-    axes.set_ylabel(up, fontsize=9)
+    label(axes, title, across, up)
     axes.tick_params(labelsize=8)
     axes.spines[["top", "right"]].set_visible(False)
     if axes.get_legend_handles_labels()[0]:

@@ -11,14 +11,9 @@ import numpy as np
 from tactile_bayes.forward.contact import HeadSection
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE
-from tactile_bayes.report.figure_file import figure_file, finish
+from tactile_bayes.report.figure_file import figure_file, finish, label
 from tactile_bayes.report.study import COLOURS
-from tactile_bayes.studies.model_comparison import (
-    NEAR_MM,
-    MeasuredScan,
-    ModelComparison,
-    centre_row,
-)
+from tactile_bayes.studies.model_comparison import NEAR_MM, MeasuredScan, ModelComparison, centre_row
 from tactile_bayes.studies.paper import HomogeneousTissue, Uniformity, centre_line, most_even, narrowest
 
 if TYPE_CHECKING:
@@ -41,31 +36,22 @@ def _arc(head: HeadSection) -> str:
 def uniformity_text(head: Uniformity, tissue: HomogeneousTissue, *, limit: float) -> str:
     """One head: a table of moduli and pressures, and whether it meets the limit."""
     words = "within" if head.worst <= limit else "beyond"
-    return "\n".join(
-        [
-            f"largest departure {100 * head.worst:.1f} %, {words} {100 * limit:g} %",
-            f"head: {head_words(head.head)}, face {head.face_mm:.1f} mm wide",
-            _tissue_line(tissue),
-            *_pressure_table(head, tissue),
-        ]
-    )
+    lines = [f"largest departure {100 * head.worst:.1f} %, {words} {100 * limit:g} %"]
+    lines.append(f"head: {head_words(head.head)}, face {head.face_mm:.1f} mm wide")
+    return "\n".join([*lines, _tissue_line(tissue), *_pressure_table(head, tissue)])
 
 
 def design_text(heads: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit: float) -> str:
     """The whole search: the answer with its own table, then a table for each place of the shoulders."""
-    count = sum(one.worst <= limit for one in heads)
-    lines = [f"{count} of {len(heads)} heads stay within {100 * limit:g} % of the mean"]
 
     def words(one: Uniformity, worst: float) -> str:
         return f"{head_words(one.head)}, {100 * worst:.1f} %, face {one.face_mm:.1f} mm wide"
 
-    best = most_even(heads)
+    count, best = sum(one.worst <= limit for one in heads), most_even(heads)
+    lines = [f"{count} of {len(heads)} heads stay within {100 * limit:g} % of the mean"]
     lines.append(f"most even: {words(best, best.worst)}")
     if (answer := narrowest(heads, limit=limit)) is not None:
-        lines += [
-            f"narrowest within the limit: {words(answer, answer.worst)}",
-            *_pressure_table(answer, tissue),
-        ]
+        lines += [f"narrowest within the limit: {words(answer, answer.worst)}", *_pressure_table(answer, tissue)]
     if (by_rms := narrowest(heads, limit=limit, by_rms=True)) is not None:
         lines.append(f"narrowest whose root mean square is within it: {words(by_rms, by_rms.worst_rms)}")
     lines.append(_tissue_line(tissue))
@@ -206,15 +192,8 @@ def _draw_grid(
     axes.plot(*place, "x", color="white", markersize=9, markeredgewidth=2.5)
     axes.set_xticks(range(len(radii)), ["flat" if np.isinf(r) else f"{r:g}" for r in radii], fontsize=7, rotation=60)
     axes.set_yticks(range(len(shoulders)), [f"{s:g}" for s in shoulders], fontsize=7)
-    _label(axes, title, "radius of the arc (mm)", "radius of the shoulders (mm)")
+    label(axes, title, "radius of the arc (mm)", "radius of the shoulders (mm)")
     return mesh
-
-
-def _label(axes: Axes, title: str, across: str, up: str) -> None:
-    """Title and labels of a picture of cells, which has a frame."""
-    axes.set_title(title, loc="left", fontsize=10)
-    axes.set_xlabel(across, fontsize=9)
-    axes.set_ylabel(up, fontsize=9)
 
 
 def _draw_shares(axes: Axes, one: Uniformity, tissue: HomogeneousTissue, limit: float, title: str) -> None:
@@ -261,18 +240,14 @@ _BUMPS = {
 
 def comparison_text(measured: MeasuredScan, models: Sequence[ModelComparison]) -> str:
     """How far each model is off, then frames, maps and the bumps on them, with a few models side by side."""
-    place = measured.place_mm
     lines = [
-        *(
-            f"{one.fidelity}: frames differ by {100 * one.figures['frames_all']:.2f} % MSD, "
-            f"the map by {100 * one.figures['map_all']:.2f} %"
-            for one in models
-        ),
-        f"{len(measured.level_kpa)} frames, mean pressure {measured.level_kpa.mean():.2f} kPa; "
-        f"lump at {place[0]:.1f}, {place[1]:.1f} mm of the map",
-        DEFINITION,
-        "",
+        f"{one.fidelity}: frames differ by {100 * one.figures['frames_all']:.2f} % MSD, "
+        f"the map by {100 * one.figures['map_all']:.2f} %"
+        for one in models
     ]
+    x, y = measured.place_mm
+    pressed = f"{len(measured.level_kpa)} frames, mean pressure {measured.level_kpa.mean():.2f} kPa"
+    lines += [f"{pressed}; lump at {x:.1f}, {y:.1f} mm of the map", DEFINITION, ""]
     for first in range(0, len(models), _BESIDE):
         lines += _columns(measured, models[first : first + _BESIDE])
     return "\n".join(line.rstrip() for line in lines)
@@ -360,9 +335,8 @@ def _draw_frames(
     """The centre line of frames whose middle lies at a distance from the lump across it, averaged."""
     off = measured.origin_mm[:, :2] - measured.place_mm
     near = (np.abs(off[:, 0] - place_mm) <= _BESIDE_MM) & (np.abs(off[:, 1]) <= _ALONG_MM)
-    pitch = measured.scan.head.pitch_mm
     count = measured.pressure_kpa.shape[1]
-    s: FloatArray = pitch * (np.arange(count) - 0.5 * (count - 1))
+    s: FloatArray = measured.scan.head.pitch_mm * (np.arange(count) - 0.5 * (count - 1))
     if near.any():
         axes.plot(s, centre_line(measured.pressure_kpa)[near].mean(axis=0), color="0.55", lw=3.5, label="measured")
         for one, colour, style in zip(models, COLOURS, _LINES, strict=False):
@@ -378,13 +352,8 @@ def _draw_line(axes: Axes, measured: MeasuredScan, models: Sequence[ModelCompari
     for one, colour, style in zip(models, COLOURS, _LINES, strict=False):
         x, mean = centre_row(measured, one.tactile_map)
         near = np.abs(x) <= NEAR_MM
-        axes.plot(
-            x[near],
-            mean[near],
-            style,
-            color=colour,
-            label=f"{one.fidelity} (MSD {100 * one.figures['map_centre']:.2f} %)",
-        )
+        text = f"{one.fidelity} (MSD {100 * one.figures['map_centre']:.2f} %)"
+        axes.plot(x[near], mean[near], style, color=colour, label=text)
     across, up = "distance from the lump (mm)", "pressure / mean of its frame"
     finish(axes, "(c) the map across the lump", across, up, headroom=0.35)
 
@@ -396,5 +365,5 @@ def _draw_map(
     mesh = axes.pcolormesh(made.x_mm, made.y_mm, values, cmap=colours, vmin=ends[0], vmax=ends[1], shading="nearest")
     axes.plot(*measured.place_mm, "+", color="black", markersize=10)
     axes.set_aspect("equal")
-    _label(axes, title, "x of the map (mm)", "y of the map (mm)")
+    label(axes, title, "x of the map (mm)", "y of the map (mm)")
     return mesh

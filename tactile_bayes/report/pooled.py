@@ -247,12 +247,8 @@ def pooled_text(report: PooledReport) -> str:
         return "\n".join([*lines, _no_size_line(report), RESEARCH_USE]) + "\n"
     sizes, figures = _sizes(report), report.figures
     worst, places = max(sizes, key=lambda q: q.mc_error), estimate_text.size_decimals(sizes)
-    lines += [
-        "",
-        *estimate_text.size_table(report),
-        "",
-        *estimate_text.width_lines(report.leading.variance_share or {}),
-    ]
+    lines += ["", *estimate_text.size_table(report), ""]
+    lines += estimate_text.width_lines(report.leading.variance_share or {})
     lines += supposed_lines(report.supposing, report.max_size_mm.median, places=places)
     lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} %.")
     if report.one_size_probability is not None:
@@ -261,9 +257,8 @@ def pooled_text(report: PooledReport) -> str:
     if report.site_words:
         lines.append(estimate_text.site_interval_text(report.site_words))
     lines.append(estimate_text.shape_text(figures))
-    lines.append(
-        f"Monte-Carlo error of the interval ends: {estimate_text.ends_text('sizes', worst.mc_error, worst.sd)}."
-    )
+    ends = estimate_text.ends_text("sizes", worst.mc_error, worst.sd)
+    lines.append(f"Monte-Carlo error of the interval ends: {ends}.")
     lines.append(f"{capitalised(fat_text(report.fat_mm) + unknowns_text(report.unknowns))}.")
     lines += [f"Sizes by {report.site}."] if report.site else []
     lines += [f"Left out: {'; '.join(report.left_out)}."] if report.left_out else []
