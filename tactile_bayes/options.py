@@ -192,7 +192,8 @@ class CompareOptions(Options):
             return
         if len(self.days) != visits:
             times, later = len(self.days) - 1, visits - 1
-            raise UsageError(f"times are given for {times} later visits, and there are {later}; give one for each")
+            fault = f"times are given for {times} later visits, and there are {later}"
+            raise UsageError(f"{fault}; give one for each, and of dates the first visit's, too")
         if any(after <= before for before, after in zip(self.days, self.days[1:], strict=False)):
             listed = ", ".join(f"{day:g}" for day in self.days)
             raise UsageError(f"the visits' days are {listed}; give them in order, each later than the one before")

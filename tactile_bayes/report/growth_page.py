@@ -153,12 +153,12 @@ class Course(Record):
     dates: tuple[str, ...] = ()  #: Likewise.
 
     def of(self, visit: Visit) -> str:
-        """A visit in words, with its date or its day."""
-        number = visit.visit - 1
-        code = self.visits[number] if self.visits else f"{visit.visit}"
-        day = "" if visit.day is None or not number else f"day {visit.day:g}"
-        when = self.dates[number] if self.dates else day
-        return f"Visit {code}, {when}" if when else f"Visit {code}"
+        """A visit in words: its number, by which sentences and findings name it, its code, and its date or its day."""
+        index, number = visit.visit - 1, str(visit.visit)
+        code = self.visits[index] if self.visits else number
+        day = "" if visit.day is None or not index else f"day {visit.day:g}"
+        when = self.dates[index] if self.dates else day
+        return f"Visit {number}{'' if code == number else f' (coded {code})'}{when and f', {when}'}"
 
 
 def growth_page(
@@ -284,19 +284,19 @@ def _size_axis(top_mm: float, scale: float) -> Iterator[str]:
 
 
 def _mark(one: _VisitPoint, scale: float, *, row: int, named: bool) -> Iterator[str]:
-    """Median and intervals of a visit above its code and its date."""
+    """Median and intervals of a visit above its number and its date."""
     for q, thick in ((one.wide, 0.25), (one.size, 0.9)):
         if q is not None:
             low, high = (_up(end, scale) for end in (q.low, q.high))
             yield svg.line(f"M{one.x:.2f} {low:.2f}V{high:.2f}", thick)
     y, floor = _up(one.size.median, scale), _up(0.0, scale)
     yield f'<circle cx="{one.x:.2f}" cy="{y:.2f}" r="1.1" fill="#111"/>'
-    code, _, when = one.words.removeprefix("Visit ").partition(", ")
+    visit, _, when = one.words.partition(", ")
     if named:
         edge = ' stroke="#fff" stroke-width="1" paint-order="stroke"'  # the line of the trend passes here
         yield svg.text(one.x + 1.4, y - 1.2, f"{one.size.median:.1f}", anchor="start", more=edge)
         yield svg.text(one.x, floor + 7 + 3 * row, when[:14], size=2.5)
-    yield svg.text(one.x, floor + 4, code[:14] if named else code[:4])
+    yield svg.text(one.x, floor + 4, visit.split()[1])
 
 
 # --- Picture of a comparison: the visits' maps on common axes and colours, their difference, and the change of size.

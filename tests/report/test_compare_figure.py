@@ -163,7 +163,13 @@ def test_the_page_has_a_ring_as_large_as_each_size_and_the_texts_verdict(three: 
     assert three.growth == "grown"
     assert "The mass has grown, if exams repeat as simulated ones do;" in three.text
     assert "The mass has grown, if exams repeat as simulated ones do;" in words
-    for told in ("Patient P07", "Side right", "Visit v1, 2026-01-10", "Visit v3, 2026-07-20", RESEARCH_USE):
+    for told in (
+        "Patient P07",
+        "Side right",
+        "Visit 1 (coded v1), 2026-01-10",
+        "Visit 3 (coded v3), 2026-07-20",
+        RESEARCH_USE,
+    ):
         assert told in words
     for line in three.text.splitlines():
         if line.startswith(("Change", "Probability", "Trend", "If exams")):
