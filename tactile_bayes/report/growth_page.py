@@ -168,6 +168,7 @@ def growth_page(
     laid, view = on_common_axes(report, visits, middle=True)
     limits, words = common_limits(laid), visits[0][0].tactile_map.recipe.value_words
     shown = _drawn_visits(laid)
+    changes = list(_changes(report, replace(course, visits=())))  # without codes, for which there is no room
     facts = (("Name", course.name), ("Patient", course.patient), ("Side", course.side), ("Mass", course.mass))
     return page(
         "growth",
@@ -183,9 +184,7 @@ def growth_page(
         side_mm=2 * HALF_MM,
         chart=_chart(compared, report, course),
         another=compared.another,
-        change=svg.size_ruler(
-            list(_changes(report, course)), unit="%", label="Change of the largest diameter in percent"
-        ),
+        change=svg.size_ruler(changes, unit="%", label="Change of the largest diameter in percent"),
         sentences=change_sentences(report),
         rates=rate_sentences(report),
         report=report,
@@ -228,41 +227,31 @@ _ROOM_MM: Final = (17.0, 8.0)
 """Visits nearer than the first have their dates in two rows, nearer than the second none, and no numbers."""
 
 
-class _VisitPoint(Record):
-    """One visit on the chart."""
-
-    x: float  #: mm from the left.
-    words: str
-    size: Quantity
-    wide: Quantity | None  #: The same if exams differ as patients' do; None where one spread is stated.
-
-
 def _chart(compared: VisitComparison, report: CompareReport, course: Course) -> str:
     """Largest diameter with its interval at each visit, and the trend where there is one; empty without sizes."""
-    joint, (width, height) = compared.joint, _BOX_MM
+    joint, another, (width, height) = compared.joint, compared.another, _BOX_MM
     if joint is None:
         return ""
     days = [visit.day for visit in report.visits]
     times = [float(i if day is None or None in days else day) for i, day in enumerate(days)]
     run = (width - _LEFT_MM - _RIGHT_MM - 2 * _INSET_MM) / (times[-1] - times[0])
-    points = []
-    for visit, time in zip(report.visits, times, strict=True):
-        size = visit.max_size_mm
-        assert size is not None
-        wide = None if compared.another is None else compared.another.size_mm(visit.visit - 1, size.probability)
-        points.append(_VisitPoint(_LEFT_MM + _INSET_MM + run * (time - times[0]), course.of(visit), size, wide))
-    top = 1.08 * max(q.high for one in points for q in (one.size, one.wide or one.size))
+    places = [_LEFT_MM + _INSET_MM + run * (time - times[0]) for time in times]
+    sizes = [visit.max_size_mm for visit in report.visits if visit.max_size_mm is not None]
+    wide = [] if another is None else [another.size_mm(i, q.probability) for i, q in enumerate(sizes)]
+    top = 1.08 * max(q.high for q in (*sizes, *wide))
     scale = (height - _ABOVE_MM - _BELOW_MM) / top
     parts = [*_size_axis(top, scale)]
     if report.trend is not None:
         trend = straight_line(*joint.moments, times)
-        sizes = np.exp(trend.level + trend.per_day * (np.array(times) - np.mean(times)))
-        path = svg.through((one.x, _up(size, scale)) for one, size in zip(points, sizes, strict=True))
+        on_line = np.exp(trend.level + trend.per_day * (np.array(times) - np.mean(times)))
+        path = svg.through((x, _up(size, scale)) for x, size in zip(places, on_line, strict=True))
         dash = 'stroke-width="0.4" stroke-dasharray="1.5 1"'
         parts.append(f'<path class="trend" d="{path}" fill="none" stroke="#555" {dash}/>')
-    gap = float(min(np.diff([one.x for one in points])))
-    for i, one in enumerate(points):
-        parts += _mark(one, scale, row=i % 2 if gap < _ROOM_MM[0] else 0, named=gap >= _ROOM_MM[1])
+    gap = float(min(np.diff(places)))
+    for i, (x, visit) in enumerate(zip(places, report.visits, strict=True)):
+        bars = [(one[i], thick) for one, thick in ((wide, 0.25), (sizes, 0.9)) if one]
+        row = i % 2 if gap < _ROOM_MM[0] else 0
+        parts += _mark(x, bars, course.of(visit), scale, row=row, named=gap >= _ROOM_MM[1])
     return svg.drawing("ruler", "Largest diameter at each visit with its intervals", (0.0, 0.0, width, height), parts)
 
 
@@ -283,20 +272,21 @@ def _size_axis(top_mm: float, scale: float) -> Iterator[str]:
     yield svg.text(_LEFT_MM + 1, _ABOVE_MM + 1, "mm", anchor="start")
 
 
-def _mark(one: _VisitPoint, scale: float, *, row: int, named: bool) -> Iterator[str]:
-    """Median and intervals of a visit above its number and its date."""
-    for q, thick in ((one.wide, 0.25), (one.size, 0.9)):
-        if q is not None:
-            low, high = (_up(end, scale) for end in (q.low, q.high))
-            yield svg.line(f"M{one.x:.2f} {low:.2f}V{high:.2f}", thick)
-    y, floor = _up(one.size.median, scale), _up(0.0, scale)
-    yield f'<circle cx="{one.x:.2f}" cy="{y:.2f}" r="1.1" fill="#111"/>'
-    visit, _, when = one.words.partition(", ")
+def _mark(
+    x: float, bars: Sequence[tuple[Quantity, float]], words: str, scale: float, *, row: int, named: bool
+) -> Iterator[str]:
+    """Intervals of a visit, each so thick, and the last one's median, above the visit's number and its date."""
+    for q, thick in bars:
+        yield svg.line(f"M{x:.2f} {_up(q.low, scale):.2f}V{_up(q.high, scale):.2f}", thick)
+    size_mm, floor = bars[-1][0].median, _up(0.0, scale)
+    y = _up(size_mm, scale)
+    yield f'<circle cx="{x:.2f}" cy="{y:.2f}" r="1.1" fill="#111"/>'
+    visit, _, when = words.partition(", ")
     if named:
         edge = ' stroke="#fff" stroke-width="1" paint-order="stroke"'  # the line of the trend passes here
-        yield svg.text(one.x + 1.4, y - 1.2, f"{one.size.median:.1f}", anchor="start", more=edge)
-        yield svg.text(one.x, floor + 7 + 3 * row, when[:14], size=2.5)
-    yield svg.text(one.x, floor + 4, visit.split()[1])
+        yield svg.text(x + 1.4, y - 1.2, f"{size_mm:.1f}", anchor="start", more=edge)
+        yield svg.text(x, floor + 7 + 3 * row, when[:14], size=2.5)
+    yield svg.text(x, floor + 4, visit.split()[1])
 
 
 # --- Picture of a comparison: the visits' maps on common axes and colours, their difference, and the change of size.

@@ -146,9 +146,8 @@ _NUMBERS = 36  #: Columns of a size with its interval and how far that is off.
 
 def tradeoff_text(ladders: Mapping[str, Tradeoff]) -> str:
     """The whole report, ending with the research-use line; several ladders each under their title."""
-    if len(ladders) == 1:
-        return "\n".join([*map(ladder_text, ladders.values()), RESEARCH_USE])
-    parts = [f"{title}\n{ladder_text(ladder)}\n" for title, ladder in ladders.items()]
+    texts = {title: ladder_text(ladder) for title, ladder in ladders.items()}
+    parts = [text if len(texts) == 1 else f"{title}\n{text}\n" for title, text in texts.items()]
     return "\n".join([*parts, RESEARCH_USE])
 
 
