@@ -470,38 +470,30 @@ def _head(head: Any) -> Source:
     if isinstance(head, Mapping):
         document = {"schema": _HEAD_SCHEMA, **to_plain(dict(head), digits=EXACT)}
         return imports.head_source(head_geometry(document, path=Path("head")))
-    return _source_of("head", head, HeadGeometry, imports.head_source, lambda other: other.head)
+    return _source_of("head", head, HeadGeometry, imports.head_source)
 
 
 def _calibration(calibration: Any) -> Source:
     if isinstance(calibration, tuple | list) and len(calibration) == 2:
         return Source({"gain_kpa_per_count": _array(calibration[0]), "offset_kpa": _array(calibration[1])})
-    return _source_of(
-        "calibration",
-        calibration,
-        ElementCalibration,
-        imports.calibration_source,
-        lambda other: other.element_calibration,
-    )
+    part = "element_calibration"
+    return _source_of("calibration", calibration, ElementCalibration, imports.calibration_source, part=part)
 
 
 def _landmarks(landmarks: Any) -> Source:
     points = None if landmarks is None or isinstance(landmarks, str | Path | Landmarks | Scan) else _array(landmarks)
     if points is not None and points.shape in ((2, 3), (3, 3)):
         return Source({"landmarks_mm": points[:2], **({"nipple_mm": points[2]} if len(points) == 3 else {})})
-    return _source_of("landmarks", landmarks, Landmarks, imports.landmark_source, lambda other: other.landmarks)
+    return _source_of("landmarks", landmarks, Landmarks, imports.landmark_source)
 
 
-def _source_of(
-    name: str, source: Any, kind: type, make: Callable[[Any], Source], part: Callable[[Scan], Any]
-) -> Source:
-    """Convert a path, a record, or the scan that holds such a record; None is an empty source."""
+def _source_of(name: str, source: Any, kind: type, make: Callable[[Any], Source], *, part: str = "") -> Source:
+    """Convert a path, a record, or the scan that holds such a record as `part`; None is an empty source."""
     if source is None:
         return Source({})
     if isinstance(source, str | Path):
         return make(path_of(source))
-    if isinstance(source, kind):
-        return make(source)
-    if not isinstance(source, Scan | SimulatedScan):
-        raise UsageError(f"{name} is {type(source).__name__}; give a path, or that of another scan")
-    return make(part(as_scan(source)))
+    record = getattr(as_scan(source), part or name) if isinstance(source, Scan | SimulatedScan) else source
+    if not isinstance(record, kind):
+        raise UsageError(f"{name} is {type(record).__name__}; give a path, or that of another scan")
+    return make(record)

@@ -13,6 +13,7 @@ import pytest
 
 import tactile_bayes as tb
 from tactile_bayes.api.arguments import options_as_keywords
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 
 DEMO = Path(tb.__file__).parent / "demo"
@@ -93,6 +94,10 @@ CALLS: dict[str, tuple[Callable[..., Any], str]] = {
     "a head of no kind": (
         lambda _: tb.scan(np.ones((2, 3, 3)), head=3),
         "head is int; give a path, or that of another",
+    ),
+    "landmarks of a scan without": (
+        lambda _: tb.scan(np.ones((2, 3, 3)), landmarks=replace(tb.demo_scan(), landmarks=None)),
+        "landmarks is NoneType; give a path, or that of another scan",
     ),
     "landmarks of no kind": (lambda _: tb.scan(np.ones((2, 3, 3)), landmarks=3), "landmarks is int; give a path, or"),
     "a correction as text": (
