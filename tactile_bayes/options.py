@@ -280,7 +280,7 @@ class CampaignOptions(Options, kw_only=True):
     protocol: Annotated[
         Path | None, cli_meta("FILE.toml"), "Pre-specified analysis of the trial, as for `validate`."
     ] = None
-    normalise: Annotated[Normalise, "As `map`."] = presets.DEFAULT_NORMALISE
+    normalise: Annotated[Normalise, "Normalisation of the frames, as in `map`."] = presets.DEFAULT_NORMALISE
     match_mm: Annotated[
         float,
         cli_meta("MM", gt=0),

@@ -9,11 +9,12 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from functools import wraps
 from html import escape
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any, Final, ParamSpec, TypeVar, overload
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, default_of, names_of
+from tactile_bayes.declarations import Record, default_of, field_types, meaning_of, names_of
 from tactile_bayes.errors import BY_OPTIONS, BadDataError, TactileBayesError, UsageError, suggestion
 from tactile_bayes.files.atomic import Format, check_suffix
 from tactile_bayes.files.tables import Sheet
@@ -101,11 +102,25 @@ def takes(
                     raise TypeError(f"{function.__name__} has no keyword {name!r}; {suggestion(name, names)}")
             return call(*args, **keywords)
 
+        called.__doc__ = _with_options(function.__doc__ or "", records, fields)
         options = (inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=fields[name]) for name in fields)
         called.__signature__ = inspect.Signature([*parameters, *options])  # type: ignore[attr-defined]
         return called
 
     return decorate
+
+
+def _with_options(doc: str, records: Sequence[type[Record]], names: Collection[str]) -> str:
+    """The docstring with the meaning of each option of the records that it names, below its entry for them."""
+    lines = []
+    for record in (one for one in records if f"{one.__name__}`" in doc):
+        for name, kind in field_types(record).items():
+            if name in names and (meaning := options_as_keywords(meaning_of(kind))):
+                text = fill(meaning.rstrip("."), 100, initial_indent=" " * 8, subsequent_indent=" " * 8)
+                lines.append(f"\n    {name}\n{text}.")
+    before, stars, entry = doc.partition("\n    **")
+    entry, gap, after = entry.partition("\n\n")
+    return f"{before}{stars}{entry}{''.join(lines)}{gap}{after}"
 
 
 def list_of(name: str, value: Any, kind: str) -> Sequence[Any]:

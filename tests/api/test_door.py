@@ -86,6 +86,25 @@ def test_the_defaults_are_the_command_lines() -> None:
     assert MapOptions(**{name: shown[name] for name in names_of(MapOptions)}) == MapOptions()
 
 
+@pytest.mark.parametrize(
+    ("function", "option", "meaning"),
+    [
+        (tb.build_map, "cell_mm", "Side of the square cells, mm."),
+        (
+            tb.estimate,
+            "accuracy_mm",
+            "Wanted Monte-Carlo error of interval ends, in mm; the finer of this and accuracy_sd",
+        ),
+        (tb.plan, "map_sd", "SD of ln size of single maps."),
+        (tb.pool, "settings", "As of `estimate`"),
+    ],
+)
+def test_the_help_of_a_function_says_what_each_option_is(function: Any, option: str, meaning: str) -> None:
+    """It named them, and a record that no page of the reference has."""
+    assert f"\n    {option}\n        {meaning}" in function.__doc__.replace("**", "")
+    assert function.__doc__.count("\n    interval\n") == (function is tb.estimate)
+
+
 def test_a_map_from_python_names_its_scans_as_the_command_lines_does(folder: Path, tmp_path: Path) -> None:
     built = tb.build_map(DEMO / "scan.mcap")
     built.save(tmp_path / "map.nc")
