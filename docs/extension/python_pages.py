@@ -45,9 +45,9 @@ def _public_page() -> str:
     """What `import tactile_bayes as tb` offers: functions first, then what they return."""
     found = {name: getattr(tactile_bayes, name) for name in tactile_bayes.__all__}
     functions = [f".. autofunction:: tactile_bayes.{name}\n" for name, one in found.items() if inspect.isfunction(one)]
-    classes = [
-        f".. autoclass:: tactile_bayes.{name}\n   :members:\n" for name, one in found.items() if inspect.isclass(one)
-    ]
+    # also what several results share: sizes, draws, findings
+    options = "   :members:\n   :inherited-members: Record\n   :exclude-members: __init__, __new__\n"
+    classes = [f".. autoclass:: tactile_bayes.{name}\n{options}" for name, one in found.items() if inspect.isclass(one)]
     title = "import tactile_bayes as tb"
     parts = [f"{title}\n{'=' * len(title)}\n", f"{_words(tactile_bayes)}\n"]
     for heading, entries in (("Functions", functions), ("Results", classes)):

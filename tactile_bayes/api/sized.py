@@ -365,7 +365,7 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
 
     @cached_property
     def answer(self) -> Answer:
-        """Report and text: `document` is printed by ``estimate --json``, `text` by ``estimate``."""
+        """The report with its text; its `document` is printed by ``estimate --json``, `text` by ``estimate``."""
         tactile_map, estimate, settings = self.tactile_map, self.estimate, self.settings
         prior, provenance, probability = settings.prior, self.provenance, settings.interval
         report = estimate_report(estimate, tactile_map, probability=probability, prior=prior, provenance=provenance)
