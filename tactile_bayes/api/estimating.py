@@ -10,7 +10,7 @@ import numpy as np
 
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, Failure, SizeEstimate, size_priors
-from tactile_bayes.declarations import names_of, replace
+from tactile_bayes.declarations import as_dict, names_of, replace
 from tactile_bayes.errors import NO_LUMP, BadDataError, TactileBayesError, in_file
 from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.npz import CheckpointFile
@@ -23,7 +23,7 @@ from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import OTHER_HEAD, calibration_for, estimate_map, recipe_differences
 from tactile_bayes.posterior.masses import with_masses
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.posterior.verdict import smallest_lumps
+from tactile_bayes.posterior.verdict import shows_no_lump, smallest_lumps
 from tactile_bayes.posterior.white import default_errors
 from tactile_bayes.presets import FIT_RADIUS_MM
 from tactile_bayes.progress import Progress
@@ -136,7 +136,11 @@ def estimate_one(
         estimate = replace(estimate, reason=reason, advice=advice, on_paper=NO_CALIBRATION_ON_PAPER)
     if estimate.code in NO_LUMP and tactile_map.covered.any():
         fat_mm = None if calibration is None else calibration.fat_mm
-        estimate = replace(estimate, smallest=smallest_lumps(tactile_map, fat_mm=fat_mm))
+        smallest = smallest_lumps(tactile_map, fat_mm=fat_mm)
+        if (hidden := shows_no_lump(smallest)) is not None:
+            estimate = replace(estimate, **as_dict(hidden), weighed=None)
+        else:
+            estimate = replace(estimate, smallest=smallest)
     posterior = estimate.map_posterior
     applied = None if posterior is None or calibration is None else calibration.at_depth_or_fallback(*posterior.medians)
     if posterior is not None and applied is not None and estimate.size is not None:

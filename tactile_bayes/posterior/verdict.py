@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import exp, lgamma, log, log1p, pi
+from math import exp, floor, lgamma, log, log1p, pi
 from typing import Final
 
 import numpy as np
@@ -25,7 +25,14 @@ from tactile_bayes.posterior.bump import (
 )
 from tactile_bayes.posterior.draw import DETECTED, ModalBump
 from tactile_bayes.posterior.marginal import CollapsedTarget, Scene
-from tactile_bayes.posterior.white import AT_RIM, LEAST_COVERED_SHARE, LEAST_WIDTH_IN_CELLS, MOST_AXIS_RATIO, Candidate
+from tactile_bayes.posterior.white import (
+    AT_RIM,
+    FEW_CELLS,
+    LEAST_COVERED_SHARE,
+    LEAST_WIDTH_IN_CELLS,
+    MOST_AXIS_RATIO,
+    Candidate,
+)
 from tactile_bayes.posterior.window import Problem, Window, independent_variance
 from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM
 
@@ -154,6 +161,16 @@ def cannot_show(why: str, advice: str = "", on_paper: str = "") -> Abstention:
     return Abstention(CANNOT_SHOW, f"the data cannot show whether there is a lump: {why}", advice, on_paper)
 
 
+def shows_no_lump(smallest: SmallestLumps) -> Abstention | None:
+    """Reason why a map excludes no lump, where its errors hide the largest one at every place and depth; else None."""
+    if np.isfinite(smallest.d_mm).any():
+        return None
+    largest = (
+        f"not even one of {largest_tried_mm(float(smallest.depths_mm.max())):g} mm would rise above the map's errors"
+    )
+    return cannot_show(largest, MORE_LINES, MORE_LINES_ON_PAPER)
+
+
 def chance_text(probability: float, digits: int = 2) -> str:
     """Text of a probability to so many digits: "0.32", "below 0.01" or "above 0.99"."""
     least = 10.0**-digits
@@ -171,12 +188,12 @@ def no_bump_reason(
         reason = f"the rise {_near_text(candidate.centre_mm)} cannot be measured: {candidate.fault}"
         return _reason_for_fault(tactile_map, candidate, reason)
     first = candidates[0]
-    if likeliest is None and "covered cells" in first.fault:
+    if likeliest is None and first.fault.startswith(FEW_CELLS):
         if tactile_map.recipe.cell_mm > COARSEST_MM and (why := no_verdict(tactile_map)) is not None:
             return why
         shortfall = coverage_shortfall(tactile_map, first.centre_mm, reach_mm=10.0)
         advice = stroke_advice(shortfall) or "cover the place with more strokes"
-        return Abstention("window", f"no lump found {where}: {first.fault}", advice, advice, first.centre_mm)
+        return Abstention("window", f"nothing can be measured {where}: {first.fault}", advice, advice, first.centre_mm)
     if candidate is not None and likeliest is not None and likeliest.detection.log_bayes_factor > 0:
         rise = f"what rises {_near_text(candidate.centre_mm)} is a ridge"
         why = _reason_for_fault(tactile_map, candidate, f"no lump found {where}: {rise}")
@@ -372,6 +389,11 @@ def _places(tactile_map: TactileMap) -> tuple[FloatArray, float]:
     grid = [(a, b) for b in along for a in across]
     kept = [centre for centre in grid if covered_share(tactile_map, centre, radius_mm=NEAR_MM) >= LEAST_SHARE]
     return np.array(kept or [middle]), spacing
+
+
+def largest_tried_mm(depth_mm: float) -> float:
+    """Diameter of the largest ball that is tried with its middle at a depth."""
+    return float(min(SIZES_MM[-1], floor(2 * depth_mm / LEAST_DEPTH_RATIO) / 2))
 
 
 def _smallest_shown(needed: FloatArray, depth_mm: float, fat_mm: float) -> FloatArray:

@@ -109,7 +109,7 @@ WIDEST_IN_RADII = 0.75
 MOST_AXIS_RATIO = 4.0
 CLOSE_IN_RADII = 0.6  #: Radius of a small window, over the usual one: 12 mm hold less of a rib 16 mm away.
 PATIENCE = 16  #: Iterations: a clear lump takes 4 to 15.
-OUTGROWN, AT_RIM = "wider than the window", "at the rim of the map"
+OUTGROWN, AT_RIM, FEW_CELLS = "wider than the window measures", "at the rim of the map", "too few covered cells"
 FIT_TOLERANCE = 1e-8
 """Tolerance of the least squares, in units of `Bump.step_scale`: far below any error that a map has."""
 PLACE_TOLERANCE = 1e-2  #: The same where least squares only gives a start for the posterior's mode.
@@ -226,8 +226,10 @@ def fit_bump(
     widths = START_WIDTHS_MM if options.start_width_mm is None else (options.start_width_mm,)
     for _ in range(6):
         cells = window_cells(tactile_map, centre, radius_mm=options.fit_radius_mm)
-        if len(cells) < len(bump.names) + 2:
-            return None, f"{len(cells)} covered cells for {len(bump.names)} parameters"
+        if len(cells) < (least := len(bump.names) + 2):
+            return None, f"{FEW_CELLS} ({len(cells)}, at least {least} needed)"
+        if min(np.ptp(cells.row), np.ptp(cells.column)) == 0:
+            return None, f"{FEW_CELLS} (all in one line)"
         weight = np.ones(len(cells)) if weight_variance is None else count_weights(cells, weight_variance)
         starts = (
             [start]
@@ -237,7 +239,7 @@ def fit_bump(
         fit = _best_fit(bump, cells, starts, weight=weight, centre=centre, options=options)
         shift = float(np.hypot(fit.theta[1] - centre[0], fit.theta[2] - centre[1]))
         if not fit.converged or shift > options.fit_radius_mm / 2:
-            return None, "no bump that the window holds: the fit ran away"
+            return None, f"no bump with a flank on every side within {options.fit_radius_mm:g} mm"
         settled = weight_variance is not None and shift < 0.25 * cells.cell_mm
         centre, start = (float(fit.theta[1]), float(fit.theta[2])), fit.theta
         weight_variance = float(np.mean(fit.residual**2))
@@ -344,11 +346,11 @@ def lump_fault(result: BumpFit, options: SamplerSettings) -> str:
     if not result.theta[0] > 0:
         return f"a depression (amplitude {result.theta[0]:.3g})"
     if not np.isfinite(result.covariance).all():
-        return "the map does not determine the bump (singular fit)"
+        return "its cells do not determine a bump"
     if narrow < LEAST_WIDTH_IN_CELLS * cell:
         return f"narrower than a cell (sigma {narrow:.2g} mm on {cell:g} mm cells): not resolved"
     if wide > WIDEST_IN_RADII * options.fit_radius_mm:
-        return f"{OUTGROWN} (sigma {wide:.3g} mm in a radius of {options.fit_radius_mm:g} mm)"
+        return f"{OUTGROWN} (sigma {wide:.3g} mm, at most {WIDEST_IN_RADII * options.fit_radius_mm:g} mm)"
     if result.covered_share < LEAST_COVERED_SHARE:
         return f"{AT_RIM} ({100 * result.covered_share:.0f} % of the bump is covered)"
     if wide / narrow > MOST_AXIS_RATIO:

@@ -12,7 +12,7 @@ from tactile_bayes.findings import capitalised, finding_lines, finding_summary, 
 from tactile_bayes.inference.draws import ParameterDraws, Quantity
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.posterior.verdict import SHARE_WITH_LUMP, chance_text
+from tactile_bayes.posterior.verdict import SHARE_WITH_LUMP, chance_text, largest_tried_mm
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report import estimate_document
 from tactile_bayes.size.draws import EXTREMES, SIZES
@@ -25,13 +25,9 @@ def smallest_text(smallest: SmallestLump) -> str:
     ends = zip(smallest.depths_mm, smallest.best_mm, smallest.worst_mm, strict=True)
     ranges = []
     for depth, best, worst in ends:
-        if best is None:
-            across = "more than 30 mm"
-        elif worst is None:
-            across = f"{best:.3g} to more than 30 mm"
-        else:
-            across = f"{best:.3g} mm" if best == worst else f"{best:.3g} to {worst:.3g} mm"
-        ranges.append(f"{across} at a depth of {depth:g} mm")
+        more = f"more than {largest_tried_mm(depth):g}"
+        across = " to ".join(dict.fromkeys(more if one is None else f"{one:.3g}" for one in (best, worst)))
+        ranges.append(f"{across} mm at a depth of {depth:g} mm")
     of_100 = f"{100 * smallest.probability:g} times of 100"
     return (
         f"In this map a round lump would have been seen ({of_100}) from these diameters on, by where it lies: "

@@ -51,7 +51,7 @@ def test_a_lower_lump_is_found_behind_a_rise_at_the_edge():
     assert found.map_posterior is not None
     assert np.median(found.map_posterior.x_mm) == pytest.approx(-12.0, abs=1.0)
     assert np.median(found.map_posterior.sigma_x_mm) == pytest.approx(4.0, rel=0.15)
-    assert any("rim" in candidate.fault or "ran away" in candidate.fault for candidate in found.candidates)
+    assert any("rim" in candidate.fault or "flank" in candidate.fault for candidate in found.candidates)
 
 
 def test_no_place_is_weighed_twice_for_an_empty_map(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -261,7 +261,7 @@ def test_no_lump_found_is_told_with_what_was_covered_and_what_would_have_shown()
         "No lump found in the area covered",
         "No lump was found in the area that was covered: ",
         "cm² read 10 times or more",
-        "5.5 to 7 mm at a depth of 8 mm; 13 to more than 30 mm at a depth of 15 mm",
+        "5.5 to 7 mm at a depth of 8 mm; 13 to more than 26.5 mm at a depth of 15 mm",
         "A lump may be smaller, deeper or softer than these, or lie outside the area that was covered.",
         "What would help: scan the place again.",
         "8 mm deep",

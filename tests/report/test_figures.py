@@ -117,7 +117,7 @@ def test_a_map_is_drawn_in_the_same_bytes_each_time(tmp_path, fit, normalise):
 def test_a_map_of_any_form_leaves_no_band_of_its_figure_empty(tmp_path, shape, fit, places):
     whole, (ny, nx) = bump_map(), shape
     part = {name: getattr(whole, name)[:ny, :nx] for name in ("mean", "variance", "count")}
-    looked_at = [PassedOver(0.0, float(n), "no bump that the window holds: the fit ran away") for n in range(places)]
+    looked_at = [PassedOver(0.0, float(n), "no bump with a flank on every side within 20 mm") for n in range(places)]
     report = replace(fit or estimate_report(), candidates=tuple(looked_at))
     cut = replace(whole, **part, x_mm=whole.x_mm[:nx], y_mm=whole.y_mm[:ny])
     map_figure(cut, tmp_path / "map.png", report=report)

@@ -129,7 +129,7 @@ def test_what_cannot_be_a_lump_is_named(bump: dict[str, float], fault: str) -> N
 def test_too_few_cells_for_the_parameters_is_no_fit() -> None:
     fit, fault = fit_bump(bump_map(half_mm=1.0), (0.0, 0.0), options=replace(OFF, fit_radius_mm=1.0))
     assert fit is None
-    assert fault == "5 covered cells for 5 parameters"
+    assert fault == "too few covered cells (5, at least 7 needed)"
 
 
 def test_the_highest_bump_that_can_be_a_lump_is_taken() -> None:
