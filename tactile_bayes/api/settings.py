@@ -67,6 +67,9 @@ class Settings(FitSettings, kw_only=True):
         super().__post_init__()
         if self.between_map_sd is not None and self.repeatability is not None:
             raise UsageError("between_map_sd states the spread that the repeatability has learned; give one of them")
+        names = [name for name, _ in self.known]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise UsageError(f"{twice} is known twice; give it one value")
         if self.repeatability is not None and self.size_calibration == "none":
             raise UsageError("a repeatability is for sizes; leave it out, or name a size calibration")
 

@@ -74,6 +74,13 @@ class Report(Sized, kw_only=True):
         return from_plain(Origin, getattr(self, "provenance", {}))
 
     @property
+    def known_words(self) -> str:
+        """Properties of the body that the size takes as known, in words; empty without any."""
+        known = self.origin.settings.get("known") or {}
+        words = ", ".join(f"{name} {value:g}" for name, value in known.items())
+        return f"taken as known: {words}" if known else ""
+
+    @property
     def site_words(self) -> str:
         """The site's spread between exams, in words; empty without one."""
         words = getattr(self, "repeatability", UNSET)

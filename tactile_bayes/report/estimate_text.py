@@ -278,7 +278,8 @@ def _detail_lines(estimate: Estimate, report: EstimateReport) -> list[str]:
         lines += estimate_document.supposed_lines(report.supposing, largest.median, places=size_decimals([largest]))
         if "oval_probability" in figures:
             lines.append(shape_text(figures))
-        lines += [f"{text}." for text in (figures.get("size_calibration"), *invalid_draws(report)) if text]
+        texts = (figures.get("size_calibration"), report.known_words.capitalize(), *invalid_draws(report))
+        lines += [f"{text}." for text in texts if text]
     if share := tracker_share(figures):
         lines.append(f"{share}.")
     lines += [f"Passed over: {text}." for text in figures.get("passed_over", ())]
@@ -407,6 +408,7 @@ def _quality_line(estimate: Estimate, report: EstimateReport, shown: Sequence[Qu
     ends = f"interval ends to {worst.mc_error / worst.sd:.3f} SD" if worst.sd > 0 else "interval ends exact"
     parts = [
         f"sizes by the {estimate.sized_by}" if estimate.sized_by else "",
+        report.known_words if estimate.sized_by else "",
         f"method {draws.method}, {ends}",
         report.diagnostics.get("repeatability", ""),
         convergence_text(draws),

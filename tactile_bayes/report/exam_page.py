@@ -39,6 +39,7 @@ def exam_page(exam: ShownExam) -> str:
         findings = [*findings[:most], f"And {len(findings) - most} more, which the full report tells."]
     masses = sorted(exam.main.masses, key=lambda one: one.number)
     made = f"method {report.origin.settings.get('method', 'unknown')}"
+    made += f"; {exam.report.known_words}" if size and exam.report.known_words else ""
     shown = exam.maps[:MOST_REPEATS] if several else ()
     alone = ["no size" if (q := one.report.leading.max_size_mm) is None else size_words(q) for one in shown]
     return page(

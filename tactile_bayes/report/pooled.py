@@ -206,6 +206,7 @@ def pooled_summary(report: PooledReport) -> str:
         lines += estimate_text.size_table(report) + estimate_text.width_lines(report.leading.variance_share or {})
         parts = [
             f"sizes by {report.site}" if report.site else "",
+            report.known_words,
             f"interval ends to {largest.mc_error / largest.sd:.3f} SD" if largest.sd > 0 else "",
             f"the maps of this mass differ by {100 * figures['between_map_sd']:.0f} %",
             report.site_words,
@@ -261,6 +262,7 @@ def pooled_text(report: PooledReport) -> str:
     lines.append(f"Monte-Carlo error of the interval ends: {ends}.")
     lines.append(f"{capitalised(fat_text(report.fat_mm) + unknowns_text(report.unknowns))}.")
     lines += [f"Sizes by {report.site}."] if report.site else []
+    lines += [f"{report.known_words.capitalize()}."] if report.known_words else []
     lines += [f"Left out: {'; '.join(report.left_out)}."] if report.left_out else []
     lines += [f"{report.reason}."] if report.reason else []
     return "\n".join([*lines, RESEARCH_USE]) + "\n"

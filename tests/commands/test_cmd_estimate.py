@@ -392,6 +392,7 @@ def test_options_that_do_not_go_together_are_refused(
         (("--centre-mm", "nan", 2), "is not a number"),
         (("--interval", "nan"), "is not a number"),
         (("--known", "depth_mm", "inf"), "is not a number"),
+        (("--known", "seat", 0, "--known", "seat", 1), "seat is known twice; give it one value"),
     ],
 )
 def test_a_place_or_a_range_that_makes_no_sense_is_a_usage_error(

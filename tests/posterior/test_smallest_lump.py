@@ -8,10 +8,17 @@ from posterior_maps import bump_values, grid_map
 
 from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.settings import Settings
+from tactile_bayes.declarations import replace
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.posterior.verdict import WIDTHS_MM, needed_amplitudes, shows_no_lump, smallest_lumps
+from tactile_bayes.posterior.verdict import (
+    WIDTHS_MM,
+    SmallestLumps,
+    needed_amplitudes,
+    shows_no_lump,
+    smallest_lumps,
+)
 from tactile_bayes.report.estimate_document import smallest_lump
 
 FIELD = SamplerSettings(method="laplace", draws=400, background="free", noise="field")
@@ -48,13 +55,20 @@ def test_as_plain_data_a_lump_that_nothing_shows_is_null() -> None:
     assert told.probability == 0.95
 
 
+def test_a_lump_is_excluded_where_one_would_have_shown_somewhere() -> None:
+    nowhere = SmallestLumps(np.zeros((1, 2)), np.array([8.0, 15.0]), np.full((1, 2), np.inf), 12.0)
+    hidden = shows_no_lump(nowhere)
+    assert hidden is not None
+    assert hidden.reason.endswith("not even one of 26.5 mm would rise above the map's errors")
+    assert shows_no_lump(replace(nowhere, d_mm=np.array([[9.0, np.inf]]))) is None
+
+
+@pytest.mark.long
 def test_a_map_whose_errors_hide_every_lump_is_no_verdict_on_the_breast() -> None:
     loud = grid_map(1.0 + noise(300.0)[:13, :13], cell_mm=2.0)
     found = estimate_one(loud, Settings(size_calibration="none", method="optimise")).estimate
     assert found.code == "cannot_show"
-    assert found.reason.endswith("not even one of 26.5 mm would rise above the map's errors")
     assert (found.smallest, found.probability) == (None, None)
-    assert shows_no_lump(smallest_lumps(empty(), fat_mm=15.0)) is None
 
 
 @pytest.mark.long_repeats

@@ -209,6 +209,14 @@ def test_a_calibration_is_named_whole_whatever_its_name_holds() -> None:
     assert "sizes by" not in estimate_summary(full, report)  # the control: no calibration
 
 
+def test_what_a_size_takes_as_known_of_the_body_stands_beside_it() -> None:
+    full, report = crowded()
+    named = replace(full, sized_by="shipped calibration solid")
+    informed = replace(report, provenance={"settings": {"known": {"seat": 0.0, "depth_mm": 12.0}}})
+    assert "solid; taken as known: seat 0, depth_mm 12; method" in estimate_summary(named, informed)
+    assert "known:" not in estimate_summary(named, report)
+
+
 @pytest.mark.long
 def test_no_report_says_that_something_changed_by_nothing(folder: Path) -> None:
     """The control is the number that was printed so: minus 0.04 SD."""
