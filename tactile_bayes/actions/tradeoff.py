@@ -30,7 +30,7 @@ from tactile_bayes.forward.plane import outside_range
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.report.paper_head import finite
-from tactile_bayes.report.tradeoff import DIGITS, Varied, draw_ladders, ladder_file, tradeoff_text
+from tactile_bayes.report.tradeoff import DIGITS, Varied, draw_tradeoffs, tradeoff_file, tradeoff_text
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.pooling import PooledEstimate
 from tactile_bayes.studies import paper, tradeoffs
@@ -102,7 +102,7 @@ def forecast(seconds: float) -> None:
 
 
 def _show(
-    ladders: Mapping[str, Tradeoff],
+    by_title: Mapping[str, Tradeoff],
     *,
     varied: Varied,
     figure: Path | None,
@@ -110,20 +110,20 @@ def _show(
     force: bool,
     provenance: Sequence[Provenance],
 ) -> int:
-    """Draw and print ladders by their titles, each with its provenance; return the exit code."""
+    """Draw and print trade-offs by their titles, each with its provenance; return the exit code."""
     try:
         if figure is not None:
-            draw_ladders(ladders, figure, force=force)
+            draw_tradeoffs(by_title, figure, force=force)
     finally:  # a figure that cannot be written loses no result
         if as_json:
             documents = [
-                to_plain(ladder_file(ladder, varied=varied, provenance=record.as_dict()), digits=DIGITS)
-                for ladder, record in zip(ladders.values(), provenance, strict=True)
+                to_plain(tradeoff_file(tradeoff, varied=varied, provenance=record.as_dict()), digits=DIGITS)
+                for tradeoff, record in zip(by_title.values(), provenance, strict=True)
             ]
             click.echo(dump_json(documents[0] if len(documents) == 1 else documents), nl=False)
         else:
-            click.echo(tradeoff_text(ladders))
-    return EXIT_DONE if all(one.reference.answer for one in ladders.values()) else EXIT_NO_ESTIMATE
+            click.echo(tradeoff_text(by_title))
+    return EXIT_DONE if all(one.reference.answer for one in by_title.values()) else EXIT_NO_ESTIMATE
 
 
 LEARNED = "learned"
@@ -149,24 +149,24 @@ def tradeoff_forward_action(
     # a raster's frames are divided by their means
     default_rules = {tradeoffs.PLANE: "plane-strain", tradeoffs.SOLID: "solid-mean"}
     rules = {model: _rule(case, model, size_calibration or name) for model, name in default_rules.items()}
-    ladder_by_model = {
+    by_model = {
         model: _measure_forward(case, model, rule, tolerance_percent / 100, runs) for model, rule in rules.items()
     }
-    plane = ladder_by_model[tradeoffs.PLANE]
-    notes = (*plane.notes, tradeoffs.dimensions_note(case, plane, ladder_by_model[tradeoffs.SOLID], rules))
+    plane = by_model[tradeoffs.PLANE]
+    notes = (*plane.notes, tradeoffs.dimensions_note(case, plane, by_model[tradeoffs.SOLID], rules))
     warning = outside_range(case.d_mm, case.depth_ratio)
-    ladder_by_model[tradeoffs.PLANE] = replace(plane, notes=(*notes, f"{warning}.") if warning else notes)
+    by_model[tradeoffs.PLANE] = replace(plane, notes=(*notes, f"{warning}.") if warning else notes)
     lump = {name: getattr(case, name) for name in ("d_mm", "depth_ratio", "stiffness_ratio", "seat")}
     words = f"lump of {case.d_mm:g} mm, h/d {case.depth_ratio:g}, {case.stiffness_ratio:g} times as stiff as fat"
-    ladders, provenance, inputs = {}, [], hash_inputs(scene=scene)
-    for model, ladder in ladder_by_model.items():
+    by_title, provenance, inputs = {}, [], hash_inputs(scene=scene)
+    for model, tradeoff in by_model.items():
         shoulders, rule = case.settings(model).head.shoulders, rules[model]
-        ladders[f"{model}: {words}, {paper.seat_name(case.seat)}; head: {shoulders}"] = ladder
+        by_title[f"{model}: {words}, {paper.seat_name(case.seat)}; head: {shoulders}"] = tradeoff
         settings = {"model": model, **lump, "head": shoulders, "size_calibration": size_calibration}
         settings |= {"sizes_by": rule.source, "sd_ln_d": finite(rule.scatter)}
         settings |= {"tolerance_percent": tolerance_percent, "runs": runs}
         provenance.append(Provenance("tradeoff forward", settings, inputs))
-    return _show(ladders, varied="forward", figure=figure, as_json=as_json, force=force, provenance=provenance)
+    return _show(by_title, varied="forward", figure=figure, as_json=as_json, force=force, provenance=provenance)
 
 
 def _measure_forward(
@@ -215,21 +215,21 @@ def tradeoff_estimate_action(
         tactile_map = read_map(maps[0])
         with in_file(maps[0]):
             calibration, sampler = estimate_inputs(settings, tactile_map)
-            ladder = measure(tactile_map, calibration=calibration, options=sampler, work=work)
+            tradeoff = measure(tactile_map, calibration=calibration, options=sampler, work=work)
         if len(maps) > 1:
-            ladder = replace(ladder, pooled=pooled_rows(maps, settings, clock=time.process_time))
+            tradeoff = replace(tradeoff, pooled=pooled_rows(maps, settings, clock=time.process_time))
     words = ["estimate", str(maps[0])]  # the command of the default row
     words += [] if size_calibration is None else ["--size-calibration", size_calibration]
     words += [] if centre_mm is None else ["--centre-mm", *map(repr, centre_mm)]
     words += [] if settings_file is None else ["--settings", str(settings_file)]
     if (cold_s := fresh_cpu_s(words)) is not None:
-        shared = {"start of the program and reading the map": max(cold_s - ladder.default.seconds, 0.0)}
-        ladder = replace(ladder, shared_cpu_s=shared)
+        shared = {"start of the program and reading the map": max(cold_s - tradeoff.default.seconds, 0.0)}
+        tradeoff = replace(tradeoff, shared_cpu_s=shared)
     inputs = hash_inputs(**{f"map_{number}": path for number, path in enumerate(maps, start=1)})
     options = {"size_calibration": size_calibration, "tolerance_mm": tolerance_mm, "runs": runs}
     provenance = [Provenance("tradeoff estimate", options, inputs, seed=seed)]
-    ladders = {f"{maps[0].stem}: what more time for `estimate` buys": ladder}
-    return _show(ladders, varied="estimate", figure=figure, as_json=as_json, force=force, provenance=provenance)
+    by_title = {f"{maps[0].stem}: what more time for `estimate` buys": tradeoff}
+    return _show(by_title, varied="estimate", figure=figure, as_json=as_json, force=force, provenance=provenance)
 
 
 def tradeoff_map_action(
@@ -243,9 +243,9 @@ def tradeoff_map_action(
     settings = Settings(seed=seed)
     with progress_bar("settings") as progress:
         work = StudyRun(time.process_time, tolerance_mm, runs, forecast, progress, seed, settings.interval)
-        ladder = tradeoffs.measure_map(loaded, inputs=partial(estimate_inputs, settings), work=work)
-    ladder = replace(ladder, shared_cpu_s={"reading the scan": read_s})
+        tradeoff = tradeoffs.measure_map(loaded, inputs=partial(estimate_inputs, settings), work=work)
+    tradeoff = replace(tradeoff, shared_cpu_s={"reading the scan": read_s})
     options = {"tolerance_mm": tolerance_mm, "runs": runs}
     provenance = [Provenance("tradeoff map", options, hash_inputs(scan=scan), seed=seed)]
-    ladders = {f"{scan.stem}: what finer cells and more frames buy": ladder}
-    return _show(ladders, varied="map", figure=figure, as_json=as_json, force=force, provenance=provenance)
+    by_title = {f"{scan.stem}: what finer cells and more frames buy": tradeoff}
+    return _show(by_title, varied="map", figure=figure, as_json=as_json, force=force, provenance=provenance)

@@ -208,11 +208,11 @@ def draw_parameters(
 def methods(options: SamplerSettings) -> Sequence[Method]:
     """The requested method, and the next of `METHOD_ORDER` where `step_up` allows it; not two further, for chains take
     minutes. Under independent errors ``laplace`` has no next method, and ``importance`` always has."""
-    ladder = METHOD_ORDER if options.correlated else METHOD_ORDER[1:]
-    if options.method not in ladder:
+    order = METHOD_ORDER if options.correlated else METHOD_ORDER[1:]
+    if options.method not in order:
         return (options.method,)
-    first = ladder.index(options.method)
-    return ladder[first : first + 1 + (options.step_up or not options.correlated)]
+    first = order.index(options.method)
+    return order[first : first + 1 + (options.step_up or not options.correlated)]
 
 
 def accuracy_in_sd(options: SamplerSettings, width_sd_mm: float | None) -> float | None:

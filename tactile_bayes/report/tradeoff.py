@@ -33,19 +33,19 @@ if TYPE_CHECKING:
 # --- One paragraph at the end of a trade-off: which setting is enough, and what would help instead.
 
 
-def advice(ladder: Tradeoff) -> list[str]:
+def advice(tradeoff: Tradeoff) -> list[str]:
     """The cheapest sufficient setting, and settings and pooled maps that change the answer more than accuracy does."""
-    answer, limit = ladder.reference.answer, ladder.tolerance_mm
+    answer, limit = tradeoff.reference.answer, tradeoff.tolerance_mm
     if answer is None:
-        return [_advice_without_size(ladder), *ladder.notes]
-    lines = [f"Advice: {_cheapest_setting(ladder, answer)}"]
-    far = [f"{one.label} {one.ends_off_mm:.1f} mm" for one in ladder.rows if ladder.exceeds_tolerance(one)]
+        return [_advice_without_size(tradeoff), *tradeoff.notes]
+    lines = [f"Advice: {_cheapest_setting(tradeoff, answer)}"]
+    far = [f"{one.label} {one.ends_off_mm:.1f} mm" for one in tradeoff.rows if tradeoff.exceeds_tolerance(one)]
     if far:
         lines.append(f"What moves the ends more than {limit:g} mm: {'; '.join(far)}.")
-    silent = [one.label for one in ladder.rows if one.answer.reported is None]
+    silent = [one.label for one in tradeoff.rows if one.answer.reported is None]
     if silent:
         lines.append(f"No size by {', '.join(silent)}.")
-    sized = [one for one in ladder.pooled if one.answer.reported is not None]
+    sized = [one for one in tradeoff.pooled if one.answer.reported is not None]
     if len(sized) > 1:
         first, last = sized[0], sized[-1]
         ends, another = (first.another_half_width_mm, last.another_half_width_mm), ""
@@ -56,16 +56,16 @@ def advice(ladder: Tradeoff) -> list[str]:
             f"{first.answer.half_width_mm:.1f} to {last.answer.half_width_mm:.1f} mm for "
             f"{last.cpu_s - first.cpu_s:.2f} s of CPU{another}."
         )
-    return [*lines, *ladder.notes]
+    return [*lines, *tradeoff.notes]
 
 
-def _cheapest_setting(ladder: Tradeoff, reference: SizeAnswer) -> str:
-    best, default, shares = ladder.cheapest_sufficient(), ladder.default, reference.variance_share
+def _cheapest_setting(tradeoff: Tradeoff, reference: SizeAnswer) -> str:
+    best, default, shares = tradeoff.cheapest_sufficient(), tradeoff.default, reference.variance_share
     half = f"the interval's half width is {reference.half_width_mm:.1f} mm"
     if best is None or best.ends_off_mm is None:
         off = math.nan if default.ends_off_mm is None else default.ends_off_mm
         return (
-            f"no setting has its interval ends within {ladder.tolerance_mm:g} mm of the reference; the default's are "
+            f"no setting has its interval ends within {tradeoff.tolerance_mm:g} mm of the reference; the default's are "
             f"{off:.2g} mm off, and {half}."
         )
     took = f"{best.label}{' (the default)' if best.default else ''}: {best.seconds:.2f} s"
@@ -79,17 +79,17 @@ def _cheapest_setting(ladder: Tradeoff, reference: SizeAnswer) -> str:
     return f"{text}, and {rest:.0f} % of its variance is no error of the map ({share:.0f} % is {SOURCES[source]})."
 
 
-def _advice_without_size(ladder: Tradeoff) -> str:
+def _advice_without_size(tradeoff: Tradeoff) -> str:
     """Advice where the default gives no size: settings that give one, and the probabilities of a lump."""
-    sized = [one.label for one in ladder.rows if one.answer.reported is not None]
-    chances = [one for row in ladder.rows if (one := row.answer.detected_probability) is not None]
+    sized = [one.label for one in tradeoff.rows if one.answer.reported is not None]
+    chances = [one for row in tradeoff.rows if (one := row.answer.detected_probability) is not None]
     span = ""
     if chances:
         ends = (chance_text(one, 3) for one in (min(chances), max(chances)))
         span = f" (probability of one {' to '.join(dict.fromkeys(ends))})"
     if not sized:
         return f"Advice: no setting gives a size{span}; more accuracy changes no answer, another scan may."
-    some = f"{len(sized)} of {len(ladder.rows)} settings do ({', '.join(sized)})"
+    some = f"{len(sized)} of {len(tradeoff.rows)} settings do ({', '.join(sized)})"
     return (
         f"Advice: the default gives no size, {some}{span}: the map is at the limit of what can be sized. "
         "Believe none of them; scan the place again."
@@ -118,19 +118,19 @@ class TradeoffFile(Record):
     research_use: Annotated[str, Meta(min_length=1)]
 
 
-def ladder_file(ladder: Tradeoff, *, varied: Varied, provenance: Mapping[str, Any]) -> TradeoffFile:
-    """A ladder as its file."""
-    enough = ladder.cheapest_sufficient()
+def tradeoff_file(tradeoff: Tradeoff, *, varied: Varied, provenance: Mapping[str, Any]) -> TradeoffFile:
+    """A trade-off as its file."""
+    enough = tradeoff.cheapest_sufficient()
     return TradeoffFile(
         "tactile-bayes/tradeoff/1",
         varied,
-        ladder.tolerance_mm,
-        ladder.reference,
-        ladder.rows,
+        tradeoff.tolerance_mm,
+        tradeoff.reference,
+        tradeoff.rows,
         None if enough is None else enough.label,
-        ladder.pooled,
-        ladder.shared_cpu_s,
-        tuple(advice(ladder)),
+        tradeoff.pooled,
+        tradeoff.shared_cpu_s,
+        tuple(advice(tradeoff)),
         dict(provenance),
         RESEARCH_USE,
     )
@@ -144,51 +144,51 @@ _SHORT = {"estimate": "est."}
 _NUMBERS = 36  #: Columns of a size with its interval and how far that is off.
 
 
-def tradeoff_text(ladders: Mapping[str, Tradeoff]) -> str:
-    """The whole report, ending with the research-use line; several ladders each under their title."""
-    texts = {title: ladder_text(ladder) for title, ladder in ladders.items()}
+def tradeoff_text(by_title: Mapping[str, Tradeoff]) -> str:
+    """The whole report, ending with the research-use line; several trade-offs each under their title."""
+    texts = {title: settings_text(tradeoff) for title, tradeoff in by_title.items()}
     parts = [text if len(texts) == 1 else f"{title}\n{text}\n" for title, text in texts.items()]
     return "\n".join([*parts, RESEARCH_USE])
 
 
-def ladder_text(ladder: Tradeoff) -> str:
+def settings_text(tradeoff: Tradeoff) -> str:
     """Advice, the table of settings, and notes."""
-    parts, width = [_SHORT.get(name, name) for name in ladder.default.cpu_s], _label_width(ladder)
+    parts, width = [_SHORT.get(name, name) for name in tradeoff.default.cpu_s], _label_width(tradeoff)
     costs, units = ("".join(f"{word:>{_COST}}" for word in words) for words in (parts, ["s"] * len(parts)))
-    quantity = "size" if gives_sizes(ladder) else "sigma"
+    quantity = "size" if gives_sizes(tradeoff) else "sigma"
     lines = [
-        *advice(ladder),
+        *advice(tradeoff),
         "",
         f"{'':<{width}}{costs}{quantity:>7}{'95 % interval':>15}{'ends':>7}{'widths':>7}",
         f"{'':<{width}}{units}{'mm':>7}{'mm':>15}{'off':>7}{'off':>7}",
     ]
-    for axis, rows in groupby(ladder.rows, key=lambda one: one.axis):
-        lines += [axis, *(line for one in rows for line in _row(one, ladder))]
-    if ladder.pooled:
-        lines += ["maps pooled", *(line for one in ladder.pooled for line in _pooled(one, ladder))]
-    lines += _exact_maps(ladder)
-    return "\n".join([*lines, "", *_notes(ladder)])
+    for axis, rows in groupby(tradeoff.rows, key=lambda one: one.axis):
+        lines += [axis, *(line for one in rows for line in _row(one, tradeoff))]
+    if tradeoff.pooled:
+        lines += ["maps pooled", *(line for one in tradeoff.pooled for line in _pooled(one, tradeoff))]
+    lines += _exact_maps(tradeoff)
+    return "\n".join([*lines, "", *_notes(tradeoff)])
 
 
-def _label_width(ladder: Tradeoff) -> int:
+def _label_width(tradeoff: Tradeoff) -> int:
     """Columns of a setting's name."""
-    return _COLUMNS - _NUMBERS - _COST * len(ladder.default.cpu_s)
+    return _COLUMNS - _NUMBERS - _COST * len(tradeoff.default.cpu_s)
 
 
-def gives_sizes(ladder: Tradeoff) -> bool:
+def gives_sizes(tradeoff: Tradeoff) -> bool:
     """True if sizes are reported, False if widths, for lack of a calibration."""
-    return any(SIZE in one.answer.quantities for one in ladder.rows) or ladder.reference.answer is None
+    return any(SIZE in one.answer.quantities for one in tradeoff.rows) or tradeoff.reference.answer is None
 
 
-def _row(one: MeasuredSetting, ladder: Tradeoff) -> list[str]:
+def _row(one: MeasuredSetting, tradeoff: Tradeoff) -> list[str]:
     """The setting's name with its numbers beside it, or below where it is long, and notes."""
-    name, width = f"{'*' if one.default else ' '} {one.label}", _label_width(ladder)
+    name, width = f"{'*' if one.default else ' '} {one.label}", _label_width(tradeoff)
     numbers = "".join(f"{seconds:>{_COST}.3f}" for seconds in one.cpu_s.values()) + _number(one.answer)
     notes = []
     if one.answer.reported is not None:
         for off in (one.ends_off_mm, one.width_ends_off_mm):
             numbers += f"{'-' if off is None else f'{off:.3f}':>7}"
-        if SIZE not in one.answer.quantities and gives_sizes(ladder):
+        if SIZE not in one.answer.quantities and gives_sizes(tradeoff):
             notes.append("    (a width: this map has no size)")
         if one.answer.method == "ensemble" and "ensemble" not in one.label:
             notes.append("    (by MCMC: importance sampling failed)")
@@ -208,9 +208,9 @@ def _number(answer: SizeAnswer) -> str:
     return f"  {reason}" if named else f"  probability of a lump {chance:.2g}: {reason}"
 
 
-def _pooled(one: PooledRow, ladder: Tradeoff) -> list[str]:
+def _pooled(one: PooledRow, tradeoff: Tradeoff) -> list[str]:
     name = f"  {one.maps} map{'s' if one.maps > 1 else ''}"
-    line = f"{name:<{_label_width(ladder)}}{one.cpu_s:>{_COST}.3f}{_number(one.answer)}"
+    line = f"{name:<{_label_width(tradeoff)}}{one.cpu_s:>{_COST}.3f}{_number(one.answer)}"
     if one.answer.reported is None:
         return [line]
     half = f"    half width {one.answer.half_width_mm:.2f} mm"
@@ -224,15 +224,15 @@ def _is_model_map(answer: SizeAnswer) -> bool:
     return AMPLITUDE in answer.quantities
 
 
-def _exact_maps(ladder: Tradeoff) -> Iterator[str]:
+def _exact_maps(tradeoff: Tradeoff) -> Iterator[str]:
     """Table of a forward model's maps, which have no errors: bump, and signed deviation from the reference."""
-    best = ladder.reference.answer
+    best = tradeoff.reference.answer
     if best is None or not _is_model_map(best):
         return
     columns = ((ELEMENT, 6, 2), (AMPLITUDE, 7, 4), (WIDTHS[0], 7, 3), (WIDTHS[1], 7, 3))
     yield from ("", f"{'the map':<25}{'mesh':>6}{'a':>7}{'sig. x':>7}{'sig. y':>7}   off, %")
     yield f"{'':<25}{'mm':>6}{'':>7}{'mm':>7}{'mm':>7}{'a':>7}{'x':>7}{'y':>7}{'size':>7}"
-    for label, answer in (("the finest", best), *((one.label, one.answer) for one in ladder.rows)):
+    for label, answer in (("the finest", best), *((one.label, one.answer) for one in tradeoff.rows)):
         shown, line = answer.quantities, f"{label:<25}"
         for name, width, digits in columns:
             line += f"{f'{shown[name].median:.{digits}f}' if name in shown else '':>{width}}"
@@ -242,14 +242,14 @@ def _exact_maps(ladder: Tradeoff) -> Iterator[str]:
         yield line.rstrip()
 
 
-def _notes(ladder: Tradeoff) -> Iterator[str]:
-    reference, interval, error = ladder.reference, "of this exam", ""
+def _notes(tradeoff: Tradeoff) -> Iterator[str]:
+    reference, interval, error = tradeoff.reference, "of this exam", ""
     if reference.answer is not None and _is_model_map(reference.answer):
         interval = "what the calibration leaves"
     elif reference.answer is not None:
         error = f"its own Monte-Carlo error is {reference.mc_error_mm:.2g} mm, "
     yield f"* is the default. CPU seconds of this machine, warm, the least of the runs; the interval is {interval}."
-    if any("optimise" in one.label or one.axis == "fit window" for one in ladder.rows) and gives_sizes(ladder):
+    if any("optimise" in one.label or one.axis == "fit window" for one in tradeoff.rows) and gives_sizes(tradeoff):
         yield "Least squares and other windows: sized as if the calibration were learned so; `estimate` refuses that."
     if reference.answer is not None:
         yield (
@@ -258,7 +258,7 @@ def _notes(ladder: Tradeoff) -> Iterator[str]:
         )
     else:
         yield "There is no reference to compare with: what it would be made from has no size."
-    for name, seconds in ladder.shared_cpu_s.items():
+    for name, seconds in tradeoff.shared_cpu_s.items():
         yield f"{name}: {seconds:.2f} s of CPU besides."
 
 
@@ -271,36 +271,36 @@ Box = tuple[float, float, float, float]
 _LEAST_MM = 1e-3  #: Smaller distances are drawn here: below rounding of what anybody reads.
 
 
-def draw_ladders(ladders: Mapping[str, Tradeoff], path: Path, *, force: bool = False) -> None:
-    """Draw every setting as a point, with the frontier and the lines that say what matters; ladders by their titles.
+def draw_tradeoffs(by_title: Mapping[str, Tradeoff], path: Path, *, force: bool = False) -> None:
+    """Draw every setting as a point, with the frontier and the lines that say what matters; trade-offs by their titles.
 
     Without a reference there is no distance: then the probability of a lump is drawn.
     """
-    with figure_file(path, size_in=(10.0, 6.0 * len(ladders)), force=force) as figure:
-        parts: Any = [figure] if len(ladders) == 1 else figure.subfigures(len(ladders), 1)
-        for part, (title, ladder) in zip(parts, ladders.items(), strict=True):
+    with figure_file(path, size_in=(10.0, 6.0 * len(by_title)), force=force) as figure:
+        parts: Any = [figure] if len(by_title) == 1 else figure.subfigures(len(by_title), 1)
+        for part, (title, tradeoff) in zip(parts, by_title.items(), strict=True):
             axes = part.subplots()
-            _draw_ladder(figure, axes, ladder)
+            _draw_settings(figure, axes, tradeoff)
             axes.set_title(title, fontsize=10)
             part.legend(loc="outside right upper", fontsize=8, frameon=False)
 
 
-def _draw_ladder(figure: Figure, axes: Axes, ladder: Tradeoff) -> None:
-    shown = [one for one in ladder.rows if math.isfinite(_height(one, ladder))]
+def _draw_settings(figure: Figure, axes: Axes, tradeoff: Tradeoff) -> None:
+    shown = [one for one in tradeoff.rows if math.isfinite(_height(one, tradeoff))]
     for i, axis in enumerate(dict.fromkeys(one.axis for one in shown)):
         rows = [one for one in shown if one.axis == axis]
-        axes.plot(*_points(rows, ladder), _MARKS[i % 6], color=_COLOURS[i % 6], label=axis, zorder=3)
+        axes.plot(*_points(rows, tradeoff), _MARKS[i % 6], color=_COLOURS[i % 6], label=axis, zorder=3)
     default = [one for one in shown if one.default]
-    axes.plot(*_points(default, ladder), "o", ms=15, mfc="none", mec="k", mew=1.5, label="the default", zorder=4)
-    reference = ladder.reference
+    axes.plot(*_points(default, tradeoff), "o", ms=15, mfc="none", mec="k", mew=1.5, label="the default", zorder=4)
+    reference = tradeoff.reference
     if reference.answer is not None:
-        frontier = _points(ladder.frontier(), ladder)
+        frontier = _points(tradeoff.frontier(), tradeoff)
         axes.step(*frontier, where="post", color="0.3", lw=1.0, label="frontier", zorder=2)
         axes.set_ylabel("distance of the interval's ends from the reference, mm (rms)")
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")
         _draw_level(axes, reference.half_width_mm, "k", "-", "half width of the interval")
-        _draw_level(axes, ladder.tolerance_mm, "0.5", "--", "tolerance")
+        _draw_level(axes, tradeoff.tolerance_mm, "0.5", "--", "tolerance")
         _draw_level(axes, reference.mc_error_mm, "0.5", ":", "the reference's own error")
     else:
         axes.set_ylabel("probability of a lump (no size to compare)")
@@ -311,19 +311,19 @@ def _draw_ladder(figure: Figure, axes: Axes, ladder: Tradeoff) -> None:
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:e}"[0] in "235" else "")
         axes.margins(x=0.12, y=0.08)
-        _draw_names(figure, axes, shown, ladder)
+        _draw_names(figure, axes, shown, tradeoff)
     axes.set_xlabel("CPU time, s")
 
 
-def _height(one: MeasuredSetting, ladder: Tradeoff) -> float:
+def _height(one: MeasuredSetting, tradeoff: Tradeoff) -> float:
     """Distance from the reference, mm; without a reference the probability of a lump."""
-    if ladder.reference.answer is not None:
+    if tradeoff.reference.answer is not None:
         return math.nan if one.ends_off_mm is None else max(one.ends_off_mm, _LEAST_MM)
     return math.nan if one.answer.detected_probability is None else one.answer.detected_probability
 
 
-def _points(rows: Sequence[MeasuredSetting], ladder: Tradeoff) -> tuple[list[float], list[float]]:
-    return [max(one.seconds, 1e-4) for one in rows], [_height(one, ladder) for one in rows]
+def _points(rows: Sequence[MeasuredSetting], tradeoff: Tradeoff) -> tuple[list[float], list[float]]:
+    return [max(one.seconds, 1e-4) for one in rows], [_height(one, tradeoff) for one in rows]
 
 
 def _draw_level(axes: Axes, value: float | None, colour: str, style: str, name: str) -> None:
@@ -335,17 +335,17 @@ def _draw_level(axes: Axes, value: float | None, colour: str, style: str, name: 
         axes.annotate(text, place, xytext=(-4, 3), fontsize=8, ha="right", color=colour, **coordinates)
 
 
-def _draw_names(figure: Figure, axes: Axes, shown: Sequence[MeasuredSetting], ladder: Tradeoff) -> None:
+def _draw_names(figure: Figure, axes: Axes, shown: Sequence[MeasuredSetting], tradeoff: Tradeoff) -> None:
     """A name beside each point, moved up or down until it covers no other name and no point."""
     figure.draw_without_rendering()
     scale = 72.0 / figure.dpi
     right = axes.get_window_extent().x1 * scale
-    points = zip(*_points(shown, ladder), strict=True)
+    points = zip(*_points(shown, tradeoff), strict=True)
     places = [[float(v) * scale for v in axes.transData.transform(point)] for point in points]
     occupied: list[Box] = [(x - 4, y - 4, x + 4, y + 4) for x, y in places]
     patch = {"facecolor": "w", "edgecolor": "none", "alpha": 0.7, "pad": 0.3}
     for one, (x, y) in sorted(zip(shown, places, strict=True), key=lambda pair: pair[1][1]):
-        text, point = one.label.removeprefix("--method ").removeprefix("--"), (one.seconds, _height(one, ladder))
+        text, point = one.label.removeprefix("--method ").removeprefix("--"), (one.seconds, _height(one, tradeoff))
         occupied.append(_free_place(x, y, _LETTER * len(text), occupied, right=right))
         offset = (occupied[-1][0] - x, occupied[-1][1] + 2 - y)
         axes.annotate(text, point, xytext=offset, textcoords="offset points", fontsize=7, zorder=5, bbox=patch)

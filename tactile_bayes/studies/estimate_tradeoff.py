@@ -281,9 +281,9 @@ def run_tradeoff(
     for number, one in enumerate(choices, start=1):
         rows.append(measure_setting(one, run, compared_with, runs=work.runs))
         work.progress(number, len(choices))
-    ladder = Tradeoff(tuple(rows), compared_with, work.tolerance_mm)
-    best = set(map(id, ladder.frontier()))
-    return replace(ladder, rows=tuple(replace(one, frontier=id(one) in best) for one in rows))
+    tradeoff = Tradeoff(tuple(rows), compared_with, work.tolerance_mm)
+    best = set(map(id, tradeoff.frontier()))
+    return replace(tradeoff, rows=tuple(replace(one, frontier=id(one) in best) for one in rows))
 
 
 # --- Cost of accuracy on one map: whole estimates at many settings against a long run of the default's posterior.

@@ -160,8 +160,8 @@ def measure_forward(case: LumpCase, model: str, rule: SizeRule, *, share: float,
         seconds, answer = run(finest.options, 0)
         return make_reference(f"{model}, {finest.label}", answer, sum(seconds.values()))
 
-    ladder = run_tradeoff(choices, run, reference, work)
-    answer = ladder.reference.answer
+    tradeoff = run_tradeoff(choices, run, reference, work)
+    answer = tradeoff.reference.answer
     assert answer is not None
     assert answer.reported is not None  # a width at least
     accuracy_words = (
@@ -170,7 +170,7 @@ def measure_forward(case: LumpCase, model: str, rule: SizeRule, *, share: float,
     notes = [f"Sizes by {rule.source}, which itself {accuracy_words}."]
     if outside := rule.outside(*amplitude_and_widths(answer)):
         notes.append(f"The map is none of the calibration's: {', '.join(outside)}.")
-    return replace(ladder, tolerance_mm=float(f"{share * answer.reported.median:.3g}"), notes=tuple(notes))
+    return replace(tradeoff, tolerance_mm=float(f"{share * answer.reported.median:.3g}"), notes=tuple(notes))
 
 
 def _element_mm(body: Body, settings: paper.StudySettings | SolidSettings) -> float:

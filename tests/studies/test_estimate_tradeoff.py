@@ -25,7 +25,7 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.inference import importance as importance_module
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.draw import SamplerSettings
-from tactile_bayes.report.tradeoff import advice, draw_ladders, ladder_file, ladder_text, tradeoff_text
+from tactile_bayes.report.tradeoff import advice, draw_tradeoffs, settings_text, tradeoff_file, tradeoff_text
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
 from tactile_bayes.size.pooling import Calibration
 from tactile_bayes.size.terms import Recipe
@@ -64,8 +64,8 @@ def estimator_of(tactile_map: TactileMap, calibration: Calibration | None = None
     return MapEstimator(tactile_map, calibration or inputs_of(tactile_map)[0], StudyRun(time.process_time, 0.2))
 
 
-def ladder_of(tactile_map: TactileMap, **chosen: object) -> Tradeoff:
-    """A ladder of few settings, each run once, under a clock that ticks once a look."""
+def measured_on(tactile_map: TactileMap, **chosen: object) -> Tradeoff:
+    """A trade-off of few settings, each run once, under a clock that ticks once a look."""
     ticks = itertools.count()
     calibration, options = inputs_of(tactile_map)
     with pytest.MonkeyPatch.context() as patch:
@@ -82,12 +82,12 @@ def ladder_of(tactile_map: TactileMap, **chosen: object) -> Tradeoff:
 
 
 @cache
-def ladder() -> Tradeoff:
-    return ladder_of(field_map())
+def measured() -> Tradeoff:
+    return measured_on(field_map())
 
 
 def row(label: str) -> MeasuredSetting:
-    (found,) = (one for one in ladder().rows if one.label == label)
+    (found,) = (one for one in measured().rows if one.label == label)
     return found
 
 
@@ -123,11 +123,11 @@ def test_the_reference_agrees_with_markov_chains():
     """
     found = row("--method ensemble")
     assert found.answer.method == "ensemble"
-    assert ladder().reference.answer.method == "importance"
+    assert measured().reference.answer.method == "importance"
     size = found.answer.quantities[SIZE]
-    assert ladder().reference.mc_error_mm < 0.005 * (size.high - size.low)  # what it was asked for
+    assert measured().reference.mc_error_mm < 0.005 * (size.high - size.low)  # what it was asked for
     assert found.ends_off_mm < max(
-        4 * np.hypot(size.mc_error, ladder().reference.mc_error_mm), 0.005 * (size.high - size.low)
+        4 * np.hypot(size.mc_error, measured().reference.mc_error_mm), 0.005 * (size.high - size.low)
     )
 
 
@@ -149,8 +149,8 @@ def test_wrong_settings_come_out_as_wrong():
     right = [row(label) for label in ("--method importance", "--method laplace", "--accuracy-sd 0.01")]
     assert row("field_cosines 8").ends_off_mm > 3 * max(one.ends_off_mm for one in right)
     assert row("fit_radius_mm 8").answer.reported is None
-    assert ladder().cheapest_sufficient() in right
-    said = " ".join(advice(ladder()))
+    assert measured().cheapest_sufficient() in right
+    said = " ".join(advice(measured()))
     assert re.search(rf"more than 0.2 mm: .*field_cosines 8 {row('field_cosines 8').ends_off_mm:.1f} mm\.", said)
     assert "No size by fit_radius_mm 8." in said
 
@@ -183,7 +183,7 @@ def test_the_frontier_and_what_is_enough():
         made("slow and no better", 6.0, 0.03),
         made("another model", 0.01, 0.1, usable=False),
     )
-    found = Tradeoff(rows, ladder().reference, 0.2)
+    found = Tradeoff(rows, measured().reference, 0.2)
     assert [one.label for one in found.frontier()] == ["another model", "default", "slow"]
     assert found.cheapest_sufficient().label == "quick"
     hardly_quicker = replace(found, rows=(rows[0], made("quick", 0.9, 0.15)))
@@ -209,17 +209,17 @@ def test_it_can_be_read_printed_and_drawn(tmp_path: Path):
         PooledRow(1, 0.2, row("--method laplace").answer, 5.0),
         PooledRow(2, 0.4, answer_without_number("1 of 2"), None),
     )
-    found = replace(ladder(), pooled=pooled, shared_cpu_s={"start": 0.2})
+    found = replace(measured(), pooled=pooled, shared_cpu_s={"start": 0.2})
     text = tradeoff_text({"a map": found})
     assert "* --method importance" in text
     assert "5.00 if exams differ as in the paper" in text
     assert text.splitlines()[-1] == "Research use only: not a diagnostic device."
     assert sum(line.startswith("Advice: ") for line in text.splitlines()) == 1
-    document = json.loads(json.dumps(to_plain(ladder_file(found, varied="estimate", provenance={}))))
+    document = json.loads(json.dumps(to_plain(tradeoff_file(found, varied="estimate", provenance={}))))
     check_document(document, "tradeoff.schema.json")
     assert [one["default"] for one in document["settings"]].count(True) == 1
     for name in ("a.png", "b.png"):
-        draw_ladders({"a map": found}, tmp_path / name)
+        draw_tradeoffs({"a map": found}, tmp_path / name)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
@@ -240,20 +240,20 @@ NO_SIZE = {
 @pytest.mark.parametrize("case", NO_SIZE)
 def test_without_a_size_it_says_what_each_setting_answers(case: str, tmp_path: Path):
     make, why = NO_SIZE[case]
-    found = ladder_of(make(), FIELDS=(), RADII_MM=(10.0,))
+    found = measured_on(make(), FIELDS=(), RADII_MM=(10.0,))
     assert found.reference.answer is None
-    text = ladder_text(found)
+    text = settings_text(found)
     assert "Advice: " in text
     default = next(line for line in text.splitlines() if line.startswith("* --method importance"))
     assert re.search(why, default), default
-    check_document(to_plain(ladder_file(found, varied="estimate", provenance={})), "tradeoff.schema.json")
-    draw_ladders({case: found}, tmp_path / "f.png")
+    check_document(to_plain(tradeoff_file(found, varied="estimate", provenance={})), "tradeoff.schema.json")
+    draw_tradeoffs({case: found}, tmp_path / "f.png")
 
 
 @pytest.mark.long
 def test_a_row_says_that_chains_took_over():
     taken_over = replace(row("--method importance"), answer=row("--method ensemble").answer)
-    said = ladder_text(replace(ladder(), rows=(taken_over, row("--method ensemble"))))
+    said = settings_text(replace(measured(), rows=(taken_over, row("--method ensemble"))))
     assert said.count("(by MCMC: importance sampling failed)") == 1
 
 

@@ -23,7 +23,7 @@ from tactile_bayes.files.size_json import read_size_calibration, size_calibratio
 from tactile_bayes.forward.scene import Head, Lump, Scene
 from tactile_bayes.forward.tissue import Rib, SceneBody, SolidLump
 from tactile_bayes.presets import HEADS, SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
-from tactile_bayes.report.tradeoff import draw_ladders, ladder_file, tradeoff_text
+from tactile_bayes.report.tradeoff import draw_tradeoffs, tradeoff_file, tradeoff_text
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws, ShapePrior
 from tactile_bayes.size.eq6 import SizeCalibration
@@ -59,7 +59,7 @@ def off_of(settings: StudySettings | SolidSettings) -> float:
     return {1: 0.05, 2: 0.002, 3: 0.001, finest: 0.0}[settings.fineness]
 
 
-def ladders(case: LumpCase = CASE, rule: SizeRule = RULE, share: float = 0.005) -> dict[str, Tradeoff]:
+def by_model(case: LumpCase = CASE, rule: SizeRule = RULE, share: float = 0.005) -> dict[str, Tradeoff]:
     """Made-up measurements: the finer, the dearer and the nearer to a = 0.3, sigma = 5 mm."""
     spent = [0.0]
 
@@ -144,7 +144,7 @@ def test_the_head_without_its_edge_is_another_head(head: str | None, edge: str) 
 
 @pytest.mark.parametrize("head", [None, *HEADS])
 def test_the_command_hands_its_head_on_and_names_it(head: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = ladders()
+    made = by_model()
     monkeypatch.setattr(tradeoff_forward, "_measure_forward", lambda _case, model, *_: made[model])
     words = [] if head is None else ["--head", head]
     found = {form: CliRunner().invoke(tradeoff_forward_command, [*words, *form]) for form in ((), ("--json",))}
@@ -212,7 +212,7 @@ def test_each_form_says_what_it_leaves_and_where_it_ends() -> None:
 
 
 def test_the_change_in_size_is_told_in_mm_and_percent() -> None:
-    found = ladders()[SOLID]
+    found = by_model()[SOLID]
     assert found.default.median_off_mm == pytest.approx(15.0 * 0.002)
     size = found.default.answer.quantities[SIZE]
     assert size.high / size.median == pytest.approx(np.exp(1.96 * 0.12), rel=1e-4)
@@ -232,24 +232,24 @@ def test_a_calibration_without_sizes_or_not_there_is_refused(run_cli: Run, tmp_p
 
 
 def test_the_advice_names_the_cheapest_that_is_enough() -> None:
-    made = ladders()
+    made = by_model()
     assert (made[PLANE].tolerance_mm, made[SOLID].tolerance_mm) == (0.075, 0.075)
     text = tradeoff_text(made)
     assert "Advice: fineness 2 (the default): 0.50 s, interval ends within 0.032 mm" in text
     assert "What moves the ends more than 0.075 mm: fineness 1 0.8 mm; head without rim 6.3 mm." in text
     assert "Sizes by a rule, which itself leaves 12 % (SD of ln d)" in text
     assert text.count("the interval is what the calibration leaves") == 2
-    strict = ladders(share=1e-9)
+    strict = by_model(share=1e-9)
     assert strict[SOLID].cheapest_sufficient() is None
     assert "no setting has its interval ends within" in tradeoff_text(strict)
-    none = ladders(rule=replace(RULE, largest=lambda *_: float("nan")))[SOLID]
+    none = by_model(rule=replace(RULE, largest=lambda *_: float("nan")))[SOLID]
     assert SIZE not in none.default.answer.quantities
     assert none.default.median_off_mm == pytest.approx(5.0 * 0.002)  # then the width is what is compared
     assert re.search(r"sigma +95 % interval", tradeoff_text({"": none}))
 
 
 def test_what_two_dimensions_get_wrong_is_reported() -> None:
-    made = ladders()
+    made = by_model()
     said = dimensions_note(CASE, made[PLANE], made[SOLID], {PLANE: RULE, SOLID: RULE})
     assert "+0.0 % in width against a ball; a cylinder's map read by the same calibration gives 15.0 mm for 15" in said
     other = replace(RULE, source="another rule", largest=lambda _a, x, _y: 6 * x)
@@ -258,8 +258,8 @@ def test_what_two_dimensions_get_wrong_is_reported() -> None:
 
 
 def test_the_document_is_the_one_of_all_trade_offs() -> None:
-    for model, made in ladders().items():
-        document = json.loads(json.dumps(to_plain(ladder_file(made, varied="forward", provenance={}))))
+    for model, made in by_model().items():
+        document = json.loads(json.dumps(to_plain(tradeoff_file(made, varied="forward", provenance={}))))
         check_document(document, "tradeoff.schema.json")
         assert len(document["settings"]) == len(settings_of(CASE, model)[0])
         assert document["reference"]["words"].startswith(f"{model}, fineness")
@@ -267,7 +267,7 @@ def test_the_document_is_the_one_of_all_trade_offs() -> None:
 
 def test_the_figure_is_the_same_bytes_each_time(tmp_path: Path) -> None:
     for name in ("one.png", "two.png"):
-        draw_ladders(ladders(), tmp_path / name)
+        draw_tradeoffs(by_model(), tmp_path / name)
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
 
 

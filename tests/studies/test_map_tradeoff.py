@@ -17,7 +17,7 @@ from tactile_bayes.declarations import to_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.mapping.select import first_seconds
-from tactile_bayes.report.tradeoff import ladder_file, ladder_text
+from tactile_bayes.report.tradeoff import settings_text, tradeoff_file
 from tactile_bayes.scans import Scan
 from tactile_bayes.studies import estimate_tradeoff
 from tactile_bayes.studies import tradeoffs as study
@@ -33,7 +33,7 @@ def demo() -> Scan:
 
 
 @cache
-def ladder() -> Tradeoff:
+def measured() -> Tradeoff:
     ticks = itertools.count()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study, "CELLS_MM", (0.5, 8.0))
@@ -45,7 +45,7 @@ def ladder() -> Tradeoff:
 
 
 def row(label: str) -> MeasuredSetting:
-    (found,) = (one for one in ladder().rows if one.label == label)
+    (found,) = (one for one in measured().rows if one.label == label)
     return found
 
 
@@ -55,8 +55,8 @@ def test_the_finest_map_is_the_reference():
     finest = row("--cell-mm 0.5")
     size = finest.answer.quantities[SIZE]
     assert finest.ends_off_mm < max(4 * size.mc_error, 0.01 * (size.high - size.low))
-    assert "cells of 0.5 mm" in ladder().reference.words
-    assert ladder().reference.mc_error_mm < 0.02
+    assert "cells of 0.5 mm" in measured().reference.words
+    assert measured().reference.mc_error_mm < 0.02
 
 
 @pytest.mark.long
@@ -69,12 +69,12 @@ def test_cells_too_large_come_out_as_wrong():
     """The negative control: the lump's sigma is 5 mm, cells of 8 mm do not resolve it."""
     wrong = row("--cell-mm 8")
     assert wrong.answer.reported is None or wrong.median_off_mm > 5 * row("--cell-mm 1").median_off_mm
-    assert ladder().cheapest_sufficient() is not wrong
+    assert measured().cheapest_sufficient() is not wrong
 
 
 @pytest.mark.long
 def test_what_cannot_be_built_or_sized_is_a_row_too():
-    short = next(one for one in ladder().rows if one.axis == study.TIME)
+    short = next(one for one in measured().rows if one.axis == study.TIME)
     for one in (short, row("--every 1000")):
         assert one.answer.reported is None
         assert one.answer.reason
@@ -82,10 +82,10 @@ def test_what_cannot_be_built_or_sized_is_a_row_too():
     pressure = row("--normalise none")
     assert set(pressure.answer.quantities) == set(WIDTHS)
     assert pressure.ends_off_mm is None
-    text = ladder_text(ladder())
+    text = settings_text(measured())
     assert "a width: this map has no size" in text
     assert re.search(r" map +est\. +size", text)
-    check_document(to_plain(ladder_file(ladder(), varied="map", provenance={})), "tradeoff.schema.json")
+    check_document(to_plain(tradeoff_file(measured(), varied="map", provenance={})), "tradeoff.schema.json")
 
 
 def test_a_scan_without_a_map_is_refused():
