@@ -220,15 +220,13 @@ def _read_arrays(path: Path, array: str) -> Grid:
             what = f"spacing_mm is {stated.dtype} of shape {stated.shape}"
             raise BadDataError(what, way_out="it must be one number")
         return Grid(arrays, (float(sides[0]), float(sides[-1])), notes=notes)
-    named = {name: array_held for name, array_held in arrays.items() if array in ("", name)}
-    flat = {
-        name: array_held for name, array_held in named.items() if array_held.ndim == 2 and min(array_held.shape) > 1
-    }
+    named = {name: one for name, one in arrays.items() if array in ("", name)}
+    flat = {name: one for name, one in named.items() if one.ndim == 2 and min(one.shape) > 1}
     if len(flat) == 1:
         ((name, values),) = flat.items()
         choice = () if array or len(arrays) == 1 else (f"the array {name!r} was taken",)
         return Grid({"mean": values}, notes=(*choice, *notes))
-    has = ", ".join(f"{name} {array_held.shape}" for name, array_held in sorted(arrays.items())[:12]) or "nothing"
+    has = ", ".join(f"{name} {one.shape}" for name, one in sorted(arrays.items())[:12]) or "nothing"
     if len(flat) > 1:
         raise BadDataError(f"holds several arrays of rows and columns ({has})", way_out="name one with --array NAME")
     called = f" called {array!r}" if array else ""

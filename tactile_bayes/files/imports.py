@@ -6,7 +6,7 @@ Arrays are in mm, kPa and s and read without pickle; `arrays_layout.LAYOUT` desc
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 from unicodedata import normalize
@@ -43,10 +43,11 @@ _OTHER_ORDER: Final = (
 )
 _LOOKED_AT: Final = 500  # frames
 _TIME_OPTIONS: Final = {"frame_time_s": ("time-unit", "rate-hz"), "pose_time_s": ("pose-time-unit", "pose-rate-hz")}
+_CALIBRATION: Final = ("gain_kpa_per_count", "offset_kpa")
 _BESIDE: Final = {
     "--poses FILE": ("position_mm", "quaternion_wxyz", "pose_time_s"),
     "--head-geometry HEAD.json": ("pitch_mm", "array_from_tracker", "head_surface_mm"),
-    "--unit or --array-calibration CAL.json": ("gain_kpa_per_count", "offset_kpa"),
+    "--unit or --array-calibration CAL.json": _CALIBRATION,
     "--rate-hz": ("frame_time_s",),
 }
 """Options that give the arrays which a file may lack."""
@@ -87,22 +88,15 @@ def _read_source(path: Path, options: ArrayMap, others: Sequence[Source]) -> Sou
     unknown: set[str] = set()
 
     def choose(names: Sequence[str]) -> list[str]:
-        contents = ", ".join(sorted(names)[:_MOST_NAMES]) or "nothing"
         by_nfc = {normalize("NFC", name): name for name in names}  # a letter and its mark may be one sign or two
         for layout_name, stated in options.arrays.items():
             name = stated if stated in names else by_nfc.get(normalize("NFC", stated), "")
             if not name:
+                contents = ", ".join(sorted(names)[:_MOST_NAMES]) or "nothing"
                 raise BadDataError(f"has no array {stated!r} for {layout_name}", way_out=f"it has {contents}")
             names_in_file[layout_name] = name
         names_in_file.update({name: name for name in KNOWN if name in names and name not in names_in_file})
         names_in_file.update(plain_names(names, names_in_file, options.values))
-        if not names_in_file:
-            beside = {name for source in others for name in source.arrays}
-            if options.unit not in (None, "counts"):
-                beside |= {"gain_kpa_per_count", "offset_kpa"}
-            needed = _described(name for name in LAYOUT if name not in OPTIONAL and name not in beside)
-            more = " (for a grid of values give --as map)" if "mean" in names else ""
-            raise BadDataError(f"lacks {needed} (it has {contents})", way_out=f"{_TEMPLATE}{more}; {_HELP}")
         unknown.update(set(names) - set(names_in_file.values()))
         return list(dict.fromkeys(names_in_file.values()))
 
@@ -196,10 +190,10 @@ def combine_sources(sources: Sequence[Source], options: Stated) -> tuple[Scan, l
         axes = len(LAYOUT[name].shape)
         if axes < 2 and array.ndim > axes and array.size == max(array.shape):
             arrays[name] = array.reshape(-1) if axes else array.reshape(())
-    for name in ("gain_kpa_per_count", "offset_kpa"):
+    for name in _CALIBRATION:
         if name in arrays and arrays[name].size == 1 and arrays.get("counts", np.empty(0)).ndim == 3:
             arrays[name] = np.full(arrays["counts"].shape[1:], float(arrays[name].item()))  # one for all taxels
-    _refuse_missing(arrays, [name for source in sources for name in source.others])
+    _refuse_missing(arrays, [name for source in sources for name in source.others], pressure=pressure)
     _check_layout(arrays)
     _check_units(arrays, calibrated=pressure)
     facts = {"frames_unit": str(stated.unit)} if pressure else {}
@@ -208,21 +202,19 @@ def combine_sources(sources: Sequence[Source], options: Stated) -> tuple[Scan, l
     return _scan_of_arrays(arrays, facts, checked_on), notes
 
 
-def _refuse_missing(arrays: Arrays, unknown: Sequence[str]) -> None:
-    missing = [name for name in LAYOUT if name not in arrays and name not in OPTIONAL]
+def _refuse_missing(arrays: Arrays, unknown: Sequence[str], *, pressure: bool) -> None:
+    needless = {*OPTIONAL, *(_CALIBRATION if pressure else ())}
+    missing = [name for name in LAYOUT if name not in arrays and name not in needless]
     if not missing:
         return
-    lacks = f"lacks {_described(missing)}"
+    lacks = f"lacks {', '.join(f'{name} ({in_words(LAYOUT[name].shape)})' for name in missing)}"
     options = [option for option, gives in _BESIDE.items() if set(gives) & set(missing)]
     way_out = f"add them, or give {', '.join(options)}" if options else "add them"
     if unknown:
+        grid = " (for a grid of values give --as map)" if "mean" in unknown else ""
         what = f"{lacks}; not known: {', '.join(unknown[:_MOST_NAMES])}"
-        raise BadDataError(what, way_out=f"{_TEMPLATE}; or {way_out}")
+        raise BadDataError(what, way_out=f"{_TEMPLATE}{grid}; or {way_out}")
     raise BadDataError(f"{lacks} (it has {', '.join(sorted(arrays))})", way_out=f"{way_out}; {_HELP}")
-
-
-def _described(names: Iterable[str]) -> str:
-    return ", ".join(f"{name} ({in_words(LAYOUT[name].shape)})" for name in names)
 
 
 def _leave_out_gaps(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
@@ -343,7 +335,6 @@ def _check_order(counts: np.ndarray, stated: Stated, notes: list[str]) -> None:
     frames = counts[pressed[:: max(1, len(pressed) // _LOOKED_AT)]].astype(np.float64)
     frames /= frames.mean(axis=(1, 2), keepdims=True)
     frames -= frames.mean(axis=0)
-    as_stated = _roughness(frames)
     rough = {}
     for name, lines in (("row", frames), ("column", frames.swapaxes(1, 2))):
         backwards, apart = lines.copy(), np.empty_like(lines)
@@ -352,10 +343,9 @@ def _check_order(counts: np.ndarray, stated: Stated, notes: list[str]) -> None:
         rough[f"every second {name} runs backwards"] = _roughness(backwards)
         rough[f"every second {name} stands behind all the others"] = _roughness(apart)
     other, roughness = min(rough.items(), key=operator.itemgetter(1))
-    transposed = _roughness(
-        frames.reshape(-1, *frames.shape[:0:-1]).swapaxes(1, 2)
-    )  # the check of arrangements says so
-    if not roughness < min(_OTHER_ORDER * as_stated, transposed):
+    as_stated = _roughness(frames)
+    transposed = _roughness(frames.reshape(-1, *frames.shape[:0:-1]).swapaxes(1, 2))
+    if roughness >= min(_OTHER_ORDER * as_stated, transposed):  # of transposed frames the check of arrangements speaks
         return
     what = f"frames have neighbours that differ by {100 * (1 - np.sqrt(roughness / as_stated)):.0f} % less if {other}"
     if stated.frame_order is None:
@@ -390,7 +380,7 @@ def _arrange_times(arrays: Arrays, stated: Stated) -> None:
 def _as_counts(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
     """Make counts of frames of pressures, with the gain and offset that give the pressures back."""
     unit = str(stated.unit)
-    for name in ("gain_kpa_per_count", "offset_kpa"):
+    for name in _CALIBRATION:
         if name in arrays:
             raise BadDataError(f"{name} is for counts, and frames are in {unit}", way_out="leave it or --unit out")
     if "counts" not in arrays:

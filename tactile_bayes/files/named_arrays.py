@@ -104,25 +104,20 @@ def orient_by_axes(arrays: Arrays) -> tuple[str, ...]:
     along a row, y from row to row.
     """
     notes: list[str] = []
-    flat = {name: one for name, one in arrays.items() if one.ndim == 2 and min(one.shape) > 1}
-    grids = {name for name in flat if name.rpartition(".")[2] not in AXES}
-    for group in sorted(
-        {name.rpartition(".")[0] for name in grids} | {""}, reverse=True
-    ):  # that of the file comes last
-        prefix = f"{group}." if group else ""
+    tables = {name for name, one in arrays.items() if one.ndim == 2 and min(one.shape) > 1}
+    grids = {name for name in tables if name.rpartition(".")[2] not in AXES}
+    groups = {name.rpartition(".")[0] for name in grids}
+    for prefix in (*(f"{group}." for group in groups if group), ""):  # the file's own come last
         within = {name for name in grids if name.startswith(prefix)}
-        names = [prefix + axis for axis in AXES]
-        lines = [arrays.get(name, np.empty(0)) for name in names]
-        x, y = (one.reshape(-1) if one.ndim == 2 and 1 in one.shape else one for one in lines)
-        if within and x.ndim == y.ndim == 2 and x.size and x.shape == y.shape:
+        x, y = (np.squeeze(arrays.get(prefix + axis, np.empty(0))) for axis in AXES)
+        if within and x.ndim == y.ndim == 2 and x.shape == y.shape:
             x, y = (x[0], y[:, 0]) if x[0, 0] != x[0, -1] else (x[:, 0], y[0])
-        places = {
-            name: line for name, line in zip(names, (x, y), strict=True) if line.ndim == 1 and line.dtype.kind in "iuf"
-        }
-        for name in places:
-            arrays.pop(name, None)
-        if any(line.size for line in places.values()):
-            notes += _orient(arrays, within, places.get(names[0], np.empty(0)), places.get(names[1], np.empty(0)))
+        x, y = (line if line.ndim == 1 and line.dtype.kind in "iuf" else np.empty(0) for line in (x, y))
+        for axis, line in zip(AXES, (x, y), strict=True):
+            if line.size:
+                del arrays[prefix + axis]
+        if x.size or y.size:
+            notes += _orient(arrays, within, x, y)
             grids -= within
     return tuple(dict.fromkeys(notes))
 
@@ -133,11 +128,12 @@ def _orient(arrays: Arrays, grids: Iterable[str], x: np.ndarray, y: np.ndarray) 
     for key, line in zip(AXES, (x, y), strict=True):
         with np.errstate(all="ignore"):
             steps = np.diff(line.astype(np.float64))
-        if len(steps) and not np.allclose(steps, steps.mean(), rtol=0.01, atol=0.0):
+        if not len(steps):
+            continue
+        if not np.allclose(steps, steps.mean(), rtol=0.01, atol=0.0):
             what = f"{key} runs in unequal steps ({steps.min():.4g} to {steps.max():.4g})"
             raise BadDataError(what, way_out="a grid has square cells of one side: interpolate it")
-        if len(steps):
-            notes.append(f"{key} runs in steps of {abs(steps[0]):g}")
+        notes.append(f"{key} runs in steps of {abs(steps[0]):g}")
     for name in grids:
         if len(x) != len(y) and arrays[name].shape == (len(x), len(y)):
             arrays[name] = arrays[name].T

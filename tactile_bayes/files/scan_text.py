@@ -1,20 +1,7 @@
-"""Poses of a tracker and frames of a pressure array, each in a text of its own.
+"""Poses of a tracker and frames of a pressure array, each in a text of its own; docs/guides/import.md lists the makers.
 
-Layouts of poses that are known by their columns:
-
-- NDI's (ToolBox, and the examples of the Combined API): ``Frame#, PortHandle, Face#, TransformStatus, Q0, Qx, Qy, Qz,
-  Tx, Ty, Tz, Error``, mm, scalar first, a row without numbers where the tool is not seen; several tools side by side,
-  each with its markers' places behind it. Loggers on its library write ``R00`` to ``R22`` in place of a quaternion
-- azimuth, elevation and roll in degrees, as Polhemus trackers send them: ``x, y, z, az, el, roll``, in cm or inches
-- OptiTrack's (Motive): ``Frame, Time (Seconds), X, Y, Z, W, X, Y, Z`` below ``Length Units,Meters``, rotation first
-- homogeneous matrices: 12 or 16 numbers a row, with a time before them
-
-Layouts of frames that are known by what stands in them:
-
-- one row a frame: numbers alone, or below a header that names times, counters and sums (pedar and pliance of novel:
-  ``time[secs]``, then a column a sensor; ``S_1_1`` of XSENSOR, ``elem1 [psi.]`` of PPS, behind the figures of a frame)
-- one block of rows a frame, with a line such as ``Frame 12`` or a blank one between (Tekscan's ASCII movie with
-  ``ROWS``, ``SECONDS_PER_FRAME`` and ``UNITS``; XSENSOR's CSV with ``Time`` and ``Units``)
+Poses are known by the names of their columns, frames by what stands in them: one row a frame, numbers alone or below a
+header that names times, counters and sums, or one block of rows a frame, with a line or a blank one between.
 """
 
 from __future__ import annotations
@@ -393,10 +380,9 @@ def read_frames(path: Path, stated: Stated) -> Source:
 
 def _without_word_columns(lines: Sequence[Line]) -> Sequence[Line]:
     """The lines without the words in their columns of words, such as a status beside the readings."""
-    several = [line for line in lines if len(line.fields) > 1]
-    widths = Counter(len(line.fields) for line in several)
-    width = max(widths.items(), key=lambda one: one[0] * one[1], default=(0, 0))[0]
-    table_lines = [line for line in several if len(line.fields) == width]
+    widths = Counter(len(line.fields) for line in lines if len(line.fields) > 1)
+    width = max(widths, key=lambda one: one * widths[one], default=0)
+    table_lines = [line for line in lines if len(line.fields) == width > 1]
     sample = table_lines[:: max(1, len(table_lines) // _SAMPLED)]
     words = [i for i in range(width) if 2 * sum(one.values[i] is None for one in sample) > len(sample)]
     if not words or 2 * len(words) > width:

@@ -98,7 +98,6 @@ def test_an_unfinished_scan_is_mended_and_the_loss_told(run_cli: Run, tmp_path: 
         (["g.csv", "-o", "a.mcap", "--as", "scan"], 3, "frames of 2 numbers"),
         (["g.npz", "-o", "a.mcap"], 3, "give --as map"),
         (["g.npz", "-o", "a.mcap"], 3, "position_mm (m, 3), quaternion_wxyz (m, 4)"),
-        (["g.npz", "-o", "a.mcap"], 3, "`tactile-bayes import --help` says what they are"),
         (["x.mat", "-o", "a.nc"], 3, "cannot be read"),
         (["g.csv", "-o", "a.nc", "--spacing-mm", "1", "--array", "P"], 2, "--array is for files of arrays"),
         (["x.xlsx", "-o", "a.nc"], 3, "save the grid as .csv"),

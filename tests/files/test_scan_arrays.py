@@ -493,7 +493,7 @@ def test_what_is_called_otherwise_is_listed_beside_what_is_missing(pressed: Arra
     with pytest.raises(BadDataError, match=r"lacks position_mm .* not known: T, t_pose; .*--template"):
         import_arrays(tmp_path / "exam.npz", ArrayMap(unit="kPa"))
     as_npz(tmp_path / "other.npz", {"P": pressed["frames"]})
-    with pytest.raises(BadDataError, match=r"pose_time_s \(m\) \(it has P\)"):  # the head and the unit are there
+    with pytest.raises(BadDataError, match=r"pose_time_s \(m\); not known: P"):  # the head and the unit are there
         import_arrays(tmp_path / "other.npz", ArrayMap(unit="kPa"), [head_source(scan.head)])
     found = parse_toml(array_template(tmp_path / "exam.npz"), way_out="")["arrays"]
     assert found == {"frame_time_s": "t", "pose_time_s": "t_pose", "pose_matrix": "T"}
