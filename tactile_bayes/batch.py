@@ -247,9 +247,8 @@ class LocalWorkers(Executor):
     def _run_item(self, fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Run an item in this thread's process, which is started if it has none."""
         if getattr(self._local, "process", None) not in self._running:
-            self._local.process = self._start(
-                of_script=any(getattr(one, "__module__", "") == "__main__" for one in args)
-            )
+            of_script = any(getattr(one, "__module__", "") == "__main__" for one in args)
+            self._local.process = self._start(of_script=of_script)
         process = self._local.process
         pipe = self._running[process]
         try:

@@ -439,8 +439,7 @@ def record(
     session
         File of facts of the exam.
     **options
-        As of `tactile_bayes.options.RecordOptions`, by default as of `tactile-bayes record`:
-        tracker_protocol, like, head_geometry, array_calibration, side, subject, force...
+        As of `tactile_bayes.options.RecordOptions`, by default as of `tactile-bayes record`; `force` overwrites.
 
     Returns
     -------

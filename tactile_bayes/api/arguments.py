@@ -33,11 +33,16 @@ _CHOICES: Final = (
 _FLAGS: Final = ("force", "same-mass", "register-strokes", "flat-field", "patient-id-from-scan", "invert-rotation")
 
 
-def options_as_keywords(text: str) -> str:
+Renamed = Sequence[tuple[str, str]]  #: Options written as keywords, and a function's own words for them.
+
+
+def options_as_keywords(text: str, renamed: Renamed = ()) -> str:
     """Replace the command line's options in a text by keywords; commands between backticks stay."""
     parts = text.split("`")
     for i in range(0, len(parts), 2):
         parts[i] = _OPTION.sub(_keyword_for, _SETTINGS_FILE.sub("", parts[i]))
+        for words, own in renamed:
+            parts[i] = parts[i].replace(words, own)
     return "`".join(parts)
 
 
@@ -53,17 +58,8 @@ def _keyword_for(match: re.Match[str]) -> str:
     return f'{name}="{value}"' if chosen else f"{name} {value}"
 
 
-def door(function: Callable[_Given, _Returned], renamed: Sequence[tuple[str, str]] = ()) -> Callable[_Given, _Returned]:
-    """Decorate a public function: its errors name keywords, or options where the command line calls it.
-
-    `renamed`: options written as keywords, and the function's own words for them.
-    """
-
-    def in_keywords(text: str) -> str:
-        text = options_as_keywords(text)
-        for words, own in renamed:
-            text = text.replace(words, own)
-        return text
+def door(function: Callable[_Given, _Returned], renamed: Renamed = ()) -> Callable[_Given, _Returned]:
+    """Decorate a public function: its errors name keywords, or options where the command line calls it."""
 
     @wraps(function)
     def called(*args: _Given.args, **keywords: _Given.kwargs) -> _Returned:
@@ -73,16 +69,17 @@ def door(function: Callable[_Given, _Returned], renamed: Sequence[tuple[str, str
             if BY_OPTIONS.get():
                 raise
             if isinstance(error, BadDataError):
-                error.what, error.way_out = in_keywords(error.what), in_keywords(error.way_out)
+                error.what = options_as_keywords(error.what, renamed)
+                error.way_out = options_as_keywords(error.way_out, renamed)
             else:
-                error.args = (in_keywords(str(error)),)
+                error.args = (options_as_keywords(str(error), renamed),)
             raise
 
     return called
 
 
 def takes(
-    *records: type[Record], without: Collection[str] = (), renamed: Sequence[tuple[str, str]] = ()
+    *records: type[Record], without: Collection[str] = (), renamed: Renamed = ()
 ) -> Callable[[Callable[_Given, _Returned]], Callable[_Given, _Returned]]:
     """Decorate a public function as `door` does; its further keywords are the fields of these records.
 

@@ -327,8 +327,7 @@ def export(
     dictionary
         With ``"csv"``: also write the data dictionary of the REDCap form there.
     **identity
-        patient_id, patient_name, birth_date, sex, issuer, accession, referring_physician, study_id, study_description,
-        study_uid, study_date and content_date, each a text; a format refuses what it does not hold.
+        As of `tactile_bayes.options.IdentityOptions`, each a text; a format refuses what it does not hold.
 
     Raises
     ------

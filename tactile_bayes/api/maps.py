@@ -31,7 +31,6 @@ from tactile_bayes.files.grids import GRID_SUFFIXES, grid_map, import_grid
 from tactile_bayes.files.instrument import head_geometry, read_scene, scene_of
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
 from tactile_bayes.files.named_arrays import Grid, Source, read_array_map
-from tactile_bayes.files.npz import Arrays
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.forward.scene import SimulatedScan
@@ -347,16 +346,7 @@ def _refuse_turned(given: Any) -> None:
 # --- A scan of arrays that Python holds, as `import` makes one of a file.
 
 
-_OWN_WORDS = (
-    ("head_geometry HEAD.json", "head"),
-    ("array_calibration CAL.json", "calibration"),
-    ("poses FILE", "poses"),
-    ("landmarks FILE", "landmarks"),
-    ("frame_shape ROWS COLUMNS", "frame_shape=(rows, columns)"),
-)
-
-
-@takes(Stated, renamed=_OWN_WORDS)
+@takes(Stated, renamed=(("head_geometry", "head"), ("array_calibration", "calibration")))
 def scan(
     frames: Any,
     time: Any = None,
@@ -447,23 +437,17 @@ def _poses(poses: Any, stated: ArrayMap) -> Source:
     if isinstance(poses, str | Path):
         return imports.pose_source(path_of(poses), stated)
     if isinstance(poses, TrackerPoses):
-        return Source(_named(poses.time_s, poses.position_mm, poses.quaternion_wxyz))
-    if isinstance(poses, tuple | list) and len(poses) == 3:
-        return Source(_named(*poses))
-    if isinstance(poses, tuple | list) and len(poses) == 2:
-        return Source({"pose_time_s": _array(poses[0]), "pose_matrix": _array(poses[1])})
-    numbers = _array(poses)
-    if numbers.ndim != 2 or numbers.shape[1] != 8:
-        raise UsageError(
-            f"poses is {type(poses).__name__} of shape {numbers.shape}; give (time, matrices), (time, position, "
-            "quaternion) or (m, 8) numbers"
-        )
-    return Source(_named(numbers[:, 0], numbers[:, 1:4], numbers[:, 4:]))
-
-
-def _named(time: Any, position: Any, quaternion: Any) -> Arrays:
-    values = {"pose_time_s": time, "position_mm": position, "quaternion_wxyz": quaternion}
-    return {name: _array(value) for name, value in values.items()}
+        poses = poses.time_s, poses.position_mm, poses.quaternion_wxyz
+    elif not isinstance(poses, tuple | list) or len(poses) not in (2, 3):
+        numbers = _array(poses)
+        if numbers.ndim != 2 or numbers.shape[1] != 8:
+            raise UsageError(
+                f"poses is {type(poses).__name__} of shape {numbers.shape}; give (time, matrices), (time, position, "
+                "quaternion) or (m, 8) numbers"
+            )
+        poses = numbers[:, 0], numbers[:, 1:4], numbers[:, 4:]
+    names = ("pose_time_s", "pose_matrix") if len(poses) == 2 else ("pose_time_s", "position_mm", "quaternion_wxyz")
+    return Source({name: _array(value) for name, value in zip(names, poses, strict=True)})
 
 
 def _head(head: Any) -> Source:

@@ -416,9 +416,7 @@ def calibrate_size(
     path
         Also write the calibration there.
     **options
-        As of `tactile_bayes.options.LearnOptions`, by default as on the command line: form, fit, seed,
-        least_stiffness_ratio, and normalise, background, fit_radius_mm, noise of the table's maps where it does not
-        say; of a table of `population`, normalise: which rows to learn from.
+        As of `tactile_bayes.options.LearnOptions`, by default as on the command line.
 
     Returns
     -------

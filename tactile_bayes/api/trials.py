@@ -294,9 +294,8 @@ def plan(
     progress
         Called with the numbers of designs done and in all.
     **options
-        As of `tactile_bayes.options.PlanOptions` and `PlanErrors`, by default as on the command line: patients, maps,
-        power, precision, against, trials, map_sd... Every pair of patients and maps is a design; with a power or a
-        precision `report.needed` holds the numbers of patients that reach it.
+        As of `tactile_bayes.options.PlanOptions` and `PlanErrors`, by default as on the command line. Every pair of
+        patients and maps is a design; with a power or a precision `report.needed` holds the patients that reach it.
 
     Raises
     ------

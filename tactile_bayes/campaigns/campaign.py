@@ -100,8 +100,7 @@ def campaign(
     bar
         Gives, for what is counted, a context with a callback for those done and wanted.
     **options
-        As of `tactile_bayes.options.CampaignOptions` and of `estimate`: excision, columns, protocol, normalise,
-        match_mm, figures, dry_run, copy_to, workers, scheduler, method, size_calibration...
+        As of `tactile_bayes.options.CampaignOptions` and of `estimate`.
 
     Raises
     ------

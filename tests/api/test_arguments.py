@@ -211,7 +211,7 @@ def test_options_become_keywords_and_commands_stay(told: str, wanted: str) -> No
 def test_a_scan_that_lacks_something_is_told_its_own_keywords() -> None:
     frames = np.ones((2, 3, 3))
     lacking = tb.errors.BadDataError
-    with pytest.raises(lacking, match="or give poses, head, unit or calibration, rate_hz; "):
+    with pytest.raises(lacking, match=r"or give poses FILE, head HEAD.json, unit or calibration CAL"):
         tb.scan(frames)
     with pytest.raises(lacking, match=r"columns\.raet_hz is not known; did you mean rate_hz"):
         tb.scan(frames, columns={"raet_hz": 9})
