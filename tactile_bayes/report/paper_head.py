@@ -47,9 +47,12 @@ def design_text(heads: Sequence[Uniformity], tissue: HomogeneousTissue, *, limit
     def words(one: Uniformity, worst: float) -> str:
         return f"{head_words(one.head)}, {100 * worst:.1f} %, face {one.face_mm:.1f} mm wide"
 
-    count, best = sum(one.worst <= limit for one in heads), most_even(heads)
-    lines = [f"{count} of {len(heads)} heads stay within {100 * limit:g} % of the mean"]
-    lines.append(f"most even: {words(best, best.worst)}")
+    count = sum(one.worst <= limit for one in heads)
+    best = most_even(heads)
+    lines = [
+        f"{count} of {len(heads)} heads stay within {100 * limit:g} % of the mean",
+        f"most even: {words(best, best.worst)}",
+    ]
     if (answer := narrowest(heads, limit=limit)) is not None:
         lines += [f"narrowest within the limit: {words(answer, answer.worst)}", *_pressure_table(answer, tissue)]
     if (by_rms := narrowest(heads, limit=limit, by_rms=True)) is not None:

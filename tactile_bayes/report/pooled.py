@@ -197,8 +197,9 @@ def pooled_summary(report: PooledReport) -> str:
     sizes = [one.max_size_mm for one in report.maps if one.max_size_mm is not None]
     if sizes:
         words = first_of([_size_words(one, with_ends=report.status == DISAGREE) for one in sizes], MOST_NAMED)
-        found = f"A lump was found on {len(sizes)} of {len(report.maps)} maps"
-        lines.append(f"{found}, alone sized at {words} mm{_alike(report) if report.status == DISAGREE else ''}.")
+        alike = _alike(report) if report.status == DISAGREE else ""
+        shown = f"A lump was found on {len(sizes)} of {len(report.maps)} maps"
+        lines.append(f"{shown}, alone sized at {words} mm{alike}.")
     lines += finding_summary(findings, "check", most=2)
     if largest is None:
         lines.append(_no_size_line(report))
