@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Annotated, Final, Literal
 
 import numpy as np
+from scipy.special import ndtri
 
 from tactile_bayes.declarations import Meta, Record, field, replace, rounded
 from tactile_bayes.errors import check_number
@@ -294,7 +294,7 @@ class Draws(Record, eq=False):
         return f"{summary.median:.3g}{unit} ({interval})"
 
 
-# --- The normal distribution function and its inverse, without the slow import of scipy.
+# --- The normal distribution function.
 
 
 def normal_cdf(z: FloatArray) -> FloatArray:
@@ -305,58 +305,6 @@ def normal_cdf(z: FloatArray) -> FloatArray:
 
 
 _B1 = (1.330274429, -1.821255978, 1.781477937, -0.356563782, 0.319381530)
-
-
-def chi_square_tail(dof: int, value: FloatArray | float) -> FloatArray:
-    """Probability of a chi-square variable above a value."""
-    from scipy.special import chdtrc  # slow to load, and the estimate of one map needs none
-
-    return np.asarray(chdtrc(dof, value))
-
-
-def normal_quantile(probability: FloatArray | float) -> FloatArray:
-    """Inverse of the normal distribution function, equal to `scipy.special.ndtri` (Cephes) to the last digit.
-
-    The library's own lies behind 0.1 s of imports, an eighth of an estimate.
-    """
-    p = np.asarray(probability, dtype=np.float64)
-    is_high = p > 1.0 - _EDGE
-    tail = np.where(is_high, 1.0 - p, p)
-    centred = tail - 0.5
-    square = centred**2
-    middle = centred + centred * (square * np.polyval(_MIDDLE[0], square) / np.polyval(_MIDDLE[1], square))
-    x = np.sqrt(-2.0 * _log(np.minimum(tail, _EDGE)))
-    z = 1.0 / x
-    near, far = (z * np.polyval(above, z) / np.polyval(below, z) for above, below in (_NEAR, _FAR))
-    low = x - _log(x) / x - np.where(x < 8.0, near, far)
-    return np.asarray(np.where(tail > _EDGE, _ROOT_2PI * middle, np.where(is_high, low, -low)))
-
-
-def _log(values: FloatArray) -> FloatArray:
-    """Logarithm by the C library: numpy's has another last digit on some processors."""
-    return np.asarray(np.frompyfunc(math.log, 1, 1)(values), dtype=np.float64)
-
-
-_EDGE, _ROOT_2PI = 0.1353352832366127, 2.5066282746310007
-# fmt: off
-_MIDDLE = (
-    (-59.96335010141079, 98.00107541859997, -56.67628574690703, 13.931260938727968, -1.2391658386738125),
-    (1.0, 1.9544885833814176, 4.676279128988815, 86.36024213908905, -225.46268785411937, 200.26021238006066,
-     -82.03722561683334, 15.90562251262117, -1.1833162112133),
-)
-_NEAR = (
-    (4.0554489230596245, 31.525109459989388, 57.16281922464213, 44.08050738932008, 14.684956192885803,
-     2.1866330685079025, -0.1402560791713545, -0.03504246268278482, -0.0008574567851546854),
-    (1.0, 15.779988325646675, 45.39076351288792, 41.3172038254672, 15.04253856929075, 2.504649462083094,
-     -0.14218292285478779, -0.03808064076915783, -0.0009332594808954574),
-)
-_FAR = (
-    (3.2377489177694603, 6.915228890689842, 3.9388102529247444, 1.3330346081580755, 0.20148538954917908,
-     0.012371663481782003, 0.00030158155350823543, 2.6580697468673755e-06, 6.239745391849833e-09),
-    (1.0, 6.02427039364742, 3.6798356385616087, 1.3770209948908132, 0.21623699359449663, 0.013420400608854318,
-     0.00032801446468212774, 2.8924786474538068e-06, 6.790194080099813e-09),
-)
-# fmt: on
 
 
 # --- Sobol points with random digital shifts, without the slow import of scipy.
@@ -478,5 +426,5 @@ def _mixture_quantiles(mean: FloatArray, sd: FloatArray) -> FloatArray:
         sd = np.sqrt(np.mean(sd[order] ** 2, axis=1) + np.var(mean[order], axis=1))
         mean = mean[order].mean(axis=1)
     grid = float(mean.mean()) + total * _NODES
-    score = normal_quantile(np.clip(normal_cdf((grid[:, None] - mean) / sd).mean(axis=1), 1e-12, 1.0 - 1e-12))
-    return np.interp(normal_quantile((np.arange(n) + 0.5) / n), score, grid)
+    score = ndtri(np.clip(normal_cdf((grid[:, None] - mean) / sd).mean(axis=1), 1e-12, 1.0 - 1e-12))
+    return np.interp(ndtri((np.arange(n) + 0.5) / n), score, grid)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import ndtri
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import NotConvergedError
@@ -140,7 +141,7 @@ class Proposal:
         """Points (..., p) and their log densities (...) for (..., dimension) uniform coordinates."""
         mean, b = self._gaussians.mean, self._stretch
         p = mean.shape[1]
-        z = draws.normal_quantile(uniform[..., :p])
+        z = ndtri(uniform[..., :p])
         bent = np.sinh(b * z) / b
         if len(mean) == 1:
             return mean[0] + bent @ self._roots[0].T, self._log_bent(z) - self._log_det[0]

@@ -6,6 +6,7 @@ import math
 from typing import Final, Literal, get_args
 
 import numpy as np
+from scipy.special import ndtri
 
 from tactile_bayes.declarations import Record, rounded
 from tactile_bayes.geometry import FloatArray
@@ -165,6 +166,4 @@ def _on_clock(hours: float) -> float:
 
 def _deviations(probability: float) -> float:
     """Half width of an equal-tailed normal interval, in standard deviations."""
-    from scipy.special import ndtri  # slow to load, and only a scan with a nipple needs it
-
     return float(ndtri(0.5 + probability / 2.0))

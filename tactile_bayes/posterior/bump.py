@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
 
 import numpy as np
+from scipy.special import expit
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
@@ -516,4 +516,4 @@ class Detection(Record):
     @property
     def probability(self) -> float:
         """Probability of a bump, at even odds and if there were only bumps and smooth errors."""
-        return 0.0 if self.log_bayes_factor < -700.0 else 1.0 / (1.0 + math.exp(-self.log_bayes_factor))
+        return float(expit(self.log_bayes_factor))

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.special import ndtri
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import NotConvergedError
 from tactile_bayes.geometry import BoolArray, FloatArray
-from tactile_bayes.inference.draws import MOST_PAIRED, ParameterDraws, SolutionCache, normal_quantile, paired_points
+from tactile_bayes.inference.draws import MOST_PAIRED, ParameterDraws, SolutionCache, paired_points
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import (
     SMOOTHING_MM,
@@ -593,4 +594,4 @@ def _random_shifts(
         return np.zeros_like(draws.flat)
     width = fit.scene.column(draws.flat, "u") + fit.scene.column(draws.flat, "v")
     points = paired_points(width, draws.replicates, len(directions), rng)
-    return np.asarray(normal_quantile(points) @ (vectors[:, directions] * np.sqrt(values[directions])).T)
+    return np.asarray(ndtri(points) @ (vectors[:, directions] * np.sqrt(values[directions])).T)

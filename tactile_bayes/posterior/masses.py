@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+from scipy.special import logit
 
 from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, NotConvergedError
@@ -367,6 +367,5 @@ def _calibrated_probability(tactile_map: TactileMap, mass: Mass) -> float:
     """Probability that a mass is a lump, from its estimate, or else from the odds and the bump of its rise."""
     if mass.estimate.probability is not None:
         return mass.estimate.probability
-    probability = float(np.clip(mass.probability, 1e-300, 1.0 - 1e-16))
-    odds = Detection(math.log(probability / (1.0 - probability)))
+    odds = Detection(float(logit(min(mass.probability, 1.0 - 1e-16))))
     return weigh(tactile_map, odds, mass.bump).chance

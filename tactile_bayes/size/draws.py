@@ -6,18 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
+from scipy.special import chdtrc, ndtri
 
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import (
-    Labels,
-    Quantity,
-    chi_square_tail,
-    even_replicates,
-    normal_quantile,
-    rows_by_label,
-    summarise,
-)
+from tactile_bayes.inference.draws import Labels, Quantity, even_replicates, rows_by_label, summarise
 
 EXTREMES: Final = ("max_size_mm", "min_size_mm")
 SIZES: Final = (*EXTREMES, "d_x_mm", "d_y_mm")  #: Names of the sizes that a posterior has, in the order of reports.
@@ -152,7 +145,7 @@ class Elongation(Record, eq=False):
     def at(self, points: FloatArray) -> FloatArray:
         """(n, 2) draws from (n, 3) uniform points: the first decides between oval and round, which is (0, 0)."""
         values, vectors = np.linalg.eigh(self.covariance)
-        normal = normal_quantile(points[:, 1:]) @ (vectors * np.sqrt(np.clip(values, 0.0, None))).T
+        normal = ndtri(points[:, 1:]) @ (vectors * np.sqrt(np.clip(values, 0.0, None))).T
         return np.where(points[:, :1] < self.probability, self.mean + normal, 0.0)
 
     @property
@@ -381,4 +374,4 @@ def cochran_probability(centre: FloatArray, noise: FloatArray, grid: FloatArray)
     weight = 1.0 / (noise[:, None] + grid**2)
     mean = np.sum(weight * centre[:, None], axis=0) / weight.sum(axis=0)
     q = np.sum(weight * (centre[:, None] - mean) ** 2, axis=0)
-    return chi_square_tail(len(centre) - 1, q)
+    return np.asarray(chdtrc(len(centre) - 1, q))

@@ -20,11 +20,12 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, ClassVar, Final, Literal
 
 import numpy as np
+from scipy.special import ndtri
 
 from tactile_bayes.declarations import Meta, Record, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
-from tactile_bayes.inference.draws import even_replicates, normal_quantile, paired_points
+from tactile_bayes.inference.draws import even_replicates, paired_points
 from tactile_bayes.size import terms
 from tactile_bayes.size.draws import BetweenMaps, BumpDraws, SizePosterior, shares
 
@@ -208,7 +209,7 @@ def push_sizes(
         for i, (axis, sigma_mm) in enumerate(zip(axes, (bump.sigma_x_mm, bump.sigma_y_mm), strict=True))
     ]
     sizes = _sizes(bump, axes, coefficients)
-    z, rho = normal_quantile(points[:, 2:].T), calibration.residual_correlation
+    z, rho = ndtri(points[:, 2:].T), calibration.residual_correlation
     z[1] = rho * z[0] + np.sqrt(1.0 - rho**2) * z[1]
     valid = (sizes[0] > 0) & (sizes[1] > 0)
     d_x, d_y = (
@@ -233,7 +234,7 @@ def _of_another_exam(
     """The sizes with a further spread between exams, one factor for both axes."""
     points = paired_points(size.max_size_mm, size.replicates, 2, rng)
     tau = between.at(points[:, 0])
-    factor = np.exp(tau * normal_quantile(points[:, 1]))
+    factor = np.exp(tau * ndtri(points[:, 1]))
     return replace(
         size,
         d_x_mm=size.d_x_mm * factor,

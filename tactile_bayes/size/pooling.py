@@ -7,12 +7,13 @@ from functools import cached_property
 from typing import Final, Literal
 
 import numpy as np
+from scipy.special import ndtri
 
 from tactile_bayes.declarations import Record, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.inference.draws import Labels, normal_quantile, paired_points, stratified_quantiles
+from tactile_bayes.inference.draws import Labels, paired_points, stratified_quantiles
 from tactile_bayes.size.bodies import BodyCalibration, known_body, suppositions
 from tactile_bayes.size.draws import (
     LEAST_PROBABILITY,
@@ -244,7 +245,7 @@ class _Pool(Record, eq=False, dict=True):
         return self._errors(self.drawn.averaged(np.zeros(len(self.points))))
 
     def _errors(self, maps: AveragedMaps) -> tuple[FloatArray, FloatArray]:
-        body_sd = self.calibration.body_sd(maps.log_amplitude, maps.log_width, normal_quantile(self.points[:, _SCORE]))
+        body_sd = self.calibration.body_sd(maps.log_amplitude, maps.log_width, ndtri(self.points[:, _SCORE]))
         return body_sd, self.calibration.coefficient_variance(maps.terms)
 
     def _beyond_maps(self, maps: AveragedMaps) -> tuple[FloatArray, dict[str, FloatArray]]:
@@ -263,7 +264,7 @@ class _Pool(Record, eq=False, dict=True):
 
     def _smoothed(self, mean: FloatArray, sd: FloatArray, longer: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Logs of both sizes as stratified quantiles, apart for round and oval draws: a round lump has one size."""
-        z = normal_quantile(self.points[:, 0])
+        z = ndtri(self.points[:, 0])
         largest = stratified_quantiles(mean + sd * z, mean, sd, 2 * self.replicates + (longer > 0))
         smallest, o = largest.copy(), longer > 0
         shorter = 2.0 * longer[o]

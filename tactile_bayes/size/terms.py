@@ -13,11 +13,11 @@ from itertools import accumulate
 from typing import Annotated, Final, Literal
 
 import numpy as np
+from scipy.special import ndtri
 
 from tactile_bayes.declarations import Meta, Record, described, field
 from tactile_bayes.errors import Abstention, BadDataError
 from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
-from tactile_bayes.inference.draws import normal_quantile
 from tactile_bayes.presets import HEAD_PROFILE, INTERVAL, Background, Noise
 from tactile_bayes.scans import HeadShape
 
@@ -223,7 +223,7 @@ class SiteShift(Record, eq=False):
     def percent(self, log_width: float) -> tuple[float, float, float]:
         """Median of the shift at p in percent of d, and the ends of its equal-tailed interval of `INTERVAL`."""
         p = np.array(log_width)
-        z = float(normal_quantile(0.5 + INTERVAL / 2))
+        z = float(ndtri(0.5 + INTERVAL / 2))
         middle, half = float(self.log_shift(p)), float(np.sqrt(self.variance(p))) * z
         low, high = (float(100 * np.expm1(end)) for end in (middle - half, middle + half))
         return float(100 * np.expm1(middle)), low, high

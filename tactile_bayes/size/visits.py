@@ -21,6 +21,7 @@ from collections.abc import Mapping, Sequence
 from typing import Final, Literal
 
 import numpy as np
+from scipy.special import chdtrc, ndtri
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import UsageError
@@ -112,7 +113,7 @@ def one_place_probability(places: Sequence[PatientPlace], *, registration_mm: fl
     weights = np.linalg.inv(np.stack([one.covariance_mm2 + 0.5 * registration_mm**2 * np.eye(2) for one in places]))
     mean = np.linalg.solve(weights.sum(axis=0), np.einsum("kij,kj->i", weights, centres))
     q = float(np.einsum("ki,kij,kj->", centres - mean, weights, centres - mean))
-    return float(draws.chi_square_tail(2 * (len(places) - 1), q))
+    return float(chdtrc(2 * (len(places) - 1), q))
 
 
 class SharedBody(Record):
@@ -295,7 +296,7 @@ def joint_sizes(
     if law is None:
         law = SHARED_WITHOUT_DEPTH if fits[0].fat_mm is None else SHARED_BODY
     correlation = law.correlation(np.array([float(np.nanmean(one.mean)) for one in averaged]))
-    covariance = _covariance(averaged, fits, correlation, draws.normal_quantile(points[:, 1]))
+    covariance = _covariance(averaged, fits, correlation, ndtri(points[:, 1]))
     mean = np.stack([one.mean for one in averaged]) + np.hypot(half[:, 0], half[:, 1])
     if amplitudes is not None:
         left, noise = amplitudes.at_common_depth(averaged, fits)
@@ -409,7 +410,7 @@ def straight_line(log_size: FloatArray, covariance: FloatArray, days: Sequence[f
     line = spread @ (weighted.T @ log_size)
     left = log_size - columns @ line
     square, dof = left @ np.linalg.solve(covariance, left), len(days) - 2
-    departure = float(draws.chi_square_tail(dof, square)) if dof > 0 else None
+    departure = float(chdtrc(dof, square)) if dof > 0 else None
     return Trend(float(line[0]), float(line[1]), float(np.sqrt(spread[1, 1])), departure)
 
 
