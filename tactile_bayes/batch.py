@@ -132,6 +132,8 @@ def open_store(
     `UsageError`, another file or a damaged line in its middle a `BadDataError`. JSON keeps floats exactly; tuples come
     back as lists. A `read_only` store is not changed: it may be another user's, or on a read-only disk.
     """
+    import fcntl
+
     access = os.O_RDONLY if read_only else os.O_RDWR | os.O_CREAT | os.O_APPEND
     try:
         descriptor = os.open(path, access | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
@@ -140,7 +142,10 @@ def open_store(
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise UsageError(f"{path} is no regular file; choose another name")
-        _lock(descriptor, path, shared=read_only)
+        try:
+            fcntl.flock(descriptor, (fcntl.LOCK_SH if read_only else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UsageError(f"{path} is in use by another run; wait for it or choose another name") from None
         store = BatchStore(descriptor, path, encode=encode, decode=decode, read_only=read_only)
         store.load({"schema": STORE_SCHEMA, "settings": json.loads(json.dumps(settings))})
         yield store
@@ -164,15 +169,6 @@ def open_store_beside(output: Path | None, kind: Any, *, settings: Mapping[str, 
     encode, decode = partial(to_plain, digits=EXACT), partial(from_plain, kind)
     with open_store(store_path(output), settings=settings, encode=encode, decode=decode) as store:
         yield store
-
-
-def _lock(descriptor: int, path: Path, *, shared: bool) -> None:
-    import fcntl
-
-    try:
-        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise UsageError(f"{path} is in use by another run; wait for it or choose another name") from None
 
 
 def _with_checksum(text: str) -> str:
@@ -379,9 +375,8 @@ def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Execu
             ) from None
         _check_workers(client, address)
         executor = stack.enter_context(client.get_executor(pure=False))
-        executor.ahead = max(
-            16, 4 * sum(client.nthreads().values())
-        )  # no worker waits, and the scheduler holds few items
+        # no worker waits, and the scheduler holds few items
+        executor.ahead = max(16, 4 * sum(client.nthreads().values()))
         yield executor
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import click
 
 from tactile_bayes.campaigns.campaign import run_campaign
 from tactile_bayes.campaigns.exams import SCANS, FolderExams, find_exams
-from tactile_bayes.campaigns.report import names_line
+from tactile_bayes.campaigns.run import FEW
 from tactile_bayes.campaigns.steps import CampaignSettings
 from tactile_bayes.commands.options import make_settings
 from tactile_bayes.declarations import names_of
@@ -20,7 +19,8 @@ from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.atomic import refuse_existing
 from tactile_bayes.files.manifest_csv import add_rows, read_manifest, read_rows, write_manifest
 from tactile_bayes.files.size_json import NONE
-from tactile_bayes.findings import counted
+from tactile_bayes.files.tables import RawTable
+from tactile_bayes.findings import counted, first_of
 from tactile_bayes.options import CampaignOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.shell import progress_bar
@@ -48,20 +48,20 @@ def campaign_init_action(folder: Path | str, output: Path, names: str | None, ad
         write_manifest(output, search.rows, force=force)
     elif search.rows:
         add_rows(table, search.rows)
-    _print_table_summary(search, output, table.rows if table else None, names)
+    _print_table_summary(search, output, table, names)
 
 
-def _print_table_summary(
-    search: FolderExams, output: Path, kept: Sequence[Mapping[str, str]] | None, names: str | None
-) -> None:
+def _print_table_summary(search: FolderExams, output: Path, kept: RawTable | None, names: str | None) -> None:
     """Print the number of exams and patients, gaps and faults of the table, and the next command."""
-    rows = [*(kept or ()), *search.rows]
+    rows = [*(kept.rows if kept else ()), *search.rows]
     patients = {row["patient"].casefold() for row in rows} - {""}
     of_patients = f" of {counted(len(patients), 'patient')}" if patients else ""
-    added = "" if kept is None else f" ({len(search.rows)} added, {len(kept)} kept)"
+    added = "" if kept is None else f" ({len(search.rows)} added, {len(kept.rows)} kept)"
     click.echo(f"{output}: {counted(len(rows), 'exam')}{of_patients}{added}")
-    for line in (*search.spelled, *names_line("listed, and not there any more", search.gone)):
+    for line in search.spelled:
         click.echo(line)
+    if search.gone:
+        click.echo(f"listed, and not there any more: {first_of(search.gone, FEW)}")
     if search.others:
         others = counted(search.others.total(), "other file")
         click.echo(f"passed over: {others} ({', '.join(sorted(search.others))})")

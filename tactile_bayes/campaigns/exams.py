@@ -358,10 +358,9 @@ def estimate_matched(path: Path, settings: Settings, match: Match) -> SizeEstima
         words = " and ".join(f"({one.x_mm:.1f}, {one.y_mm:.1f}) mm" for one in near)
         way_out = "give the row its centre_x_mm and centre_y_mm, or a smaller --match-mm"
         raise BadDataError(f"shows masses at {words} within {most_mm:g} mm of mass {mass}'s place", way_out=way_out)
-    if near and near[0].reported:
-        return outcome
     if near:
-        return estimate_file(path, replace(settings, centre_mm=(near[0].x_mm, near[0].y_mm)))
+        at_mass = replace(settings, centre_mm=(near[0].x_mm, near[0].y_mm))
+        return outcome if near[0].reported else estimate_file(path, at_mass)
     place = places[mass]
     if not on_map(tactile_map, *place):
         words = f"mass {mass} would lie at ({place[0]:.1f}, {place[1]:.1f}) mm, off the map"

@@ -184,10 +184,7 @@ def failure_lines(campaign: Campaign, rows: Sequence[ExamRow]) -> list[dict[str,
 
 
 def trial_lines(
-    campaign: Campaign,
-    rows: Sequence[ExamRow],
-    pooled: Pooled,
-    masses: Collection[tuple[str, str]] | None,
+    campaign: Campaign, rows: Sequence[ExamRow], pooled: Pooled, masses: Collection[tuple[str, str]] | None
 ) -> list[dict[str, object]]:
     """``trial.csv``: every exam as a reading of ``tactile``, every pooled visit as one of ``tactile-pooled``.
 
@@ -310,12 +307,9 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
     for name, lines in tables.items():
         columns = _TRIAL_COLUMNS if name == layout.TRIAL else layout.columns_of(Path(name).stem)
         write_text(folder / name, layout.table_text(lines, columns), force=True)
-    report, fault = (
-        "",
-        "" if masses is None or tables[layout.TRIAL] else "no exam is of a mass with a size after excision",
-    )
-    if masses is not None and not fault:
-        report, fault = _write_report(folder, campaign.settings, growth)
+    report, fault = ("", "") if excised is None else _write_report(folder, campaign.settings, growth)
+    if not tables[layout.TRIAL]:
+        fault = "no exam is of a mass with a size after excision"
     for name in (*(() if report else (REPORT, PAGE)), *(() if growth else (layout.GROWN,))):
         (folder / name).unlink(missing_ok=True)
     links = {name: name for name in tables}
@@ -331,7 +325,7 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
         "exams with a mass that no row names, see their findings": _names_with_finding(rows, "unnamed_mass", "name"),
         "folders of exams that the table does not list": unlisted,
     }
-    doubtful = [line for words, names in doubts.items() for line in names_line(words, names)]
+    doubtful = [f"{words}: {first_of(names, FEW)}" for words, names in doubts.items() if names]
     together = _pooled_words(campaign, pooled), repeatability_words(campaign), growth_line(growth, layout.GROWN)
     return Written(
         counts,
@@ -358,11 +352,6 @@ def _names_with_finding(rows: Sequence[ExamRow], kind: str, name: str) -> list[s
     return list(dict.fromkeys(getattr(row.exam, name) for row in rows if any(one.kind == kind for one in row.findings)))
 
 
-def names_line(words: str, names: Sequence[str]) -> list[str]:
-    """The first names in a line that counts the others; none without any."""
-    return [f"{words}: {first_of(names, FEW)}"] if names else []
-
-
 def check_inputs(exams: Sequence[Exam], settings: CampaignSettings) -> None:
     """Read the table of excision sizes and the protocol, so that a fault in them costs no work.
 
@@ -370,10 +359,8 @@ def check_inputs(exams: Sequence[Exam], settings: CampaignSettings) -> None:
     that was excised before every exam is refused.
     """
     if settings.excision is None:
-        for option, purpose in (
-            ("columns", "is the layout of the excision table"),
-            ("protocol", "is for the trial's report"),
-        ):
+        purposes = {"columns": "is the layout of the excision table", "protocol": "is for the trial's report"}
+        for option, purpose in purposes.items():
             if getattr(settings, option) is not None:
                 raise UsageError(f"--{option} {purpose}; give --excision too")
     table = _excised(settings)
@@ -477,12 +464,8 @@ def _visit_entry(
 
 def _exam_entry(campaign: Campaign, row: ExamRow, *, inline: bool) -> ExamEntry:
     exam, folder = row.exam, f"{layout.EXAMS}/{row.exam.name}"
-    made = {
-        name
-        for step in ("map", "estimate", "figures", "size", "page")
-        for name in campaign.files(step, exam.name)
-        if not row.failed
-    }
+    kept_steps = () if row.failed else ("map", "estimate", "figures", "size", "page")
+    made = {name for step in kept_steps for name in campaign.files(step, exam.name)}
     picture: bytes | str | None = f"{folder}/{layout.THUMBNAIL}" if layout.THUMBNAIL in made else None
     if inline and isinstance(picture, str):
         picture = read_bytes(campaign.folder / picture, most=IMAGE_BYTES)

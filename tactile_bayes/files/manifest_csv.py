@@ -190,13 +190,9 @@ def _check_spelling(table: Table, exams: Sequence[Exam]) -> None:
     """Refuse codes that `same_code` makes one: one may be mistyped, and on some disks their folders are one."""
     first: dict[tuple[str, str, str], tuple[str, int]] = {}
     for row, exam in enumerate(exams):
-        patient_code = exam.patient
-        for column, code, patient in (
-            ("patient", patient_code, ""),
-            ("visit", exam.visit, patient_code),
-            ("mass", exam.mass, patient_code),
-        ):
-            spelled, line = first.setdefault((column, patient, same_code(code)), (code, exam.line))
+        for column in ("patient", "visit", "mass"):
+            code, whose = getattr(exam, column), "" if column == "patient" else exam.patient
+            spelled, line = first.setdefault((column, whose, same_code(code)), (code, exam.line))
             if code != spelled:
                 apart = "leading zeros" if code.isdigit() else "capitals"
                 fault = f"{code!r} differs from {spelled!r} on line {line} by {apart} alone"
