@@ -110,9 +110,8 @@ class BatchStore(UserDict[str, Any]):
                 os.fdatasync(self._descriptor)
                 self._flush_at = time.monotonic() + _FLUSHED_EVERY_S
         except OSError as error:
-            raise UsageError(
-                f"{self.path} cannot be written ({error.strerror}); what it holds is kept: free space and run again"
-            ) from None
+            way_out = "what it holds is kept: free space and run again"
+            raise UsageError(f"{self.path} cannot be written ({error.strerror}); {way_out}") from None
         self._end += len(data)
 
 
@@ -192,21 +191,18 @@ def _check_header(first: bytes, header: Mapping[str, Any], *, path: Path) -> Non
     except (ValueError, KeyError, TypeError, RecursionError):
         raise BadDataError("not a store of batch results", way_out="choose another name", path=str(path)) from None
     if schema != header["schema"]:
-        raise BadDataError(
-            f"is a store of schema {schema}, this program writes {header['schema']}",
-            way_out="finish it with the version that began it, or choose another name",
-            path=str(path),
-        )
+        fault = f"is a store of schema {schema}, this program writes {header['schema']}"
+        way_out = "finish it with the version that began it, or choose another name"
+        raise BadDataError(fault, way_out=way_out, path=str(path))
     if _with_checksum(line.rpartition(" ")[0]) != line:
         raise BadDataError("line 1 is damaged", way_out="choose another name", path=str(path))
     new = dict(header["settings"])
     differ = sorted(name for name in settings.keys() | new.keys() if settings.get(name) != new.get(name))
     if differ:
         name = differ[0]
-        raise UsageError(
-            f"{path} holds results of other settings ({', '.join(differ)}: {name} was {settings.get(name)!r}, "
-            f"is {new.get(name)!r}); choose another name, or remove it to begin again"
-        )
+        fault = f"{', '.join(differ)}: {name} was {settings.get(name)!r}, is {new.get(name)!r}"
+        way_out = "choose another name, or remove it to begin again"
+        raise UsageError(f"{path} holds results of other settings ({fault}); {way_out}")
 
 
 # --- Executors for batches: this process, local worker processes or a dask cluster.
@@ -359,9 +355,8 @@ def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Execu
     try:
         from distributed import Client
     except ImportError:
-        raise UsageError(
-            "a cluster needs the package distributed; install it with pip install 'tactile-bayes[cluster]'"
-        ) from None
+        way_out = "install it with pip install 'tactile-bayes[cluster]'"
+        raise UsageError(f"a cluster needs the package distributed; {way_out}") from None
     for name in list(logging.root.manager.loggerDict):  # silent on stderr: the outcomes hold the errors
         if name.partition(".")[0] == "distributed":
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
@@ -369,10 +364,8 @@ def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Execu
         try:
             client = stack.enter_context(Client(address, timeout=timeout_s, set_as_default=False))
         except (OSError, ValueError) as error:
-            raise UsageError(
-                f"no dask scheduler answers at {address} ({one_line(error)}); start one with `dask scheduler` and "
-                "give the address it prints"
-            ) from None
+            way_out = "start one with `dask scheduler` and give the address it prints"
+            raise UsageError(f"no dask scheduler answers at {address} ({one_line(error)}); {way_out}") from None
         _check_workers(client, address)
         executor = stack.enter_context(client.get_executor(pure=False))
         # no worker waits, and the scheduler holds few items
@@ -384,16 +377,14 @@ def _check_workers(client: Any, address: str) -> None:
     try:
         versions = client.run(_worker_version)
     except ImportError as error:
-        raise UsageError(
-            f"a worker of {address} cannot import this program ({one_line(error)}); install it there"
-        ) from None
+        fault = f"a worker of {address} cannot import this program ({one_line(error)})"
+        raise UsageError(f"{fault}; install it there") from None
     if not versions:
         raise UsageError(f"the scheduler at {address} has no workers; start one with `dask worker {address}`")
     for worker, version in versions.items():
         if version != __version__:
-            raise UsageError(
-                f"worker {worker} has version {version}, this program is {__version__}; install the same version"
-            )
+            fault = f"worker {worker} has version {version}, this program is {__version__}"
+            raise UsageError(f"{fault}; install the same version")
 
 
 def _worker_version() -> str:

@@ -130,14 +130,8 @@ def run_campaign(
     table = read_manifest(exams)
     _check_folder(table, output, settings)
     names = {settings.of(exam).calibration_name for exam in table} - {None}
-    inputs = [
-        exams,
-        settings.excision,
-        settings.columns,
-        settings.protocol,
-        *read,
-        *map(size_calibration_path, map(str, names)),
-    ]
+    calibrations = (size_calibration_path(str(name)) for name in names)
+    inputs = [exams, settings.excision, settings.columns, settings.protocol, *read, *calibrations]
     refuse_same((output / name for name in report.WRITTEN), inputs)
     report.check_inputs(table, settings)
     with (

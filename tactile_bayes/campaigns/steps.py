@@ -74,12 +74,8 @@ class CampaignSettings(CampaignOptions, kw_only=True):
 
     def of(self, exam: Exam) -> Settings:
         """Settings of one exam's estimate."""
-        of_row: dict[str, Any] = {
-            "centre_mm": exam.centre_mm,
-            "size_calibration": exam.calibration,
-            "known": exam.known or None,
-        }
-        return replace(self.estimate, **{name: value for name, value in of_row.items() if value is not None})
+        own: dict[str, Any] = {"centre_mm": exam.centre_mm, "size_calibration": exam.calibration, "known": exam.known}
+        return replace(self.estimate, **{name: value for name, value in own.items() if value})
 
 
 # --- The way of a step's files to their place: a worker writes them beside it, and the command puts them there.

@@ -66,9 +66,8 @@ def make_study(identity: exam.Identity, maps: Sequence[exam.MapFile]) -> Study:
     identity_lines = [f"{name}={value}" for name, value in sorted(identity.given.items())]
     digests = sorted(one.digest for one in maps)
     # equal for all exports of one exam, whatever else is exported with it
-    person = [
-        line for line in identity_lines if line.startswith(("patient_id=", "issuer=", "accession=", "study_date="))
-    ]
+    of_exam = ("patient_id=", "issuer=", "accession=", "study_date=")
+    person = [line for line in identity_lines if line.startswith(of_exam)]
     study_uid = identity.study_uid or exam.content_uid("study", *digests, *person)
     return Study(identity, moment, content, study_uid, (__version__, *identity_lines))
 
@@ -316,6 +315,7 @@ def _shared_groups(source: exam.MapFile, values: FloatArray, directions: FloatAr
     highdicom = exam.import_extra("highdicom")
     cell = source.tactile_map.recipe.cell_mm
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    turn = [_decimal(0.0 if abs(one) < 1e-12 else one) for one in directions.ravel()]
     window = {"WindowCenter": _decimal((low + high) / 2), "WindowWidth": _decimal(max(high - low, 1e-6))}
     groups = item(
         PixelMeasuresSequence=highdicom.PixelMeasuresSequence((cell, cell), cell),
@@ -323,9 +323,7 @@ def _shared_groups(source: exam.MapFile, values: FloatArray, directions: FloatAr
         ParametricMapFrameTypeSequence=[item(FrameType=_IMAGE_TYPE)],
         PixelValueTransformationSequence=[item(RescaleIntercept=0, RescaleSlope=1, RescaleType="US")],
         FrameVOILUTSequence=[item(**window, VOILUTFunction="LINEAR_EXACT")],
-        PlaneOrientationSequence=[
-            item(ImageOrientationPatient=[_decimal(0.0 if abs(one) < 1e-12 else one) for one in directions.ravel()])
-        ],
+        PlaneOrientationSequence=[item(ImageOrientationPatient=turn)],
     )
     side = laterality(source.facts)
     if side:
@@ -392,7 +390,7 @@ def structured_report(
         title=coded(exam.REPORT_TITLE),
     )
     digests = [f"SHA-256 of the estimate: {estimate.digest}", *(f"SHA-256 of a map: {one}" for one in estimate.maps)]
-    for text in (RESEARCH_USE, exam.verdict_words(estimate), *estimate.lines, *digests):
+    for text in (RESEARCH_USE, estimate.verdict_line, *estimate.lines, *digests):
         report[0].ContentSequence.append(_comment(text))
     dataset = sr.Comprehensive3DSR(
         evidence=evidence,

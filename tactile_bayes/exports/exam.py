@@ -117,10 +117,8 @@ def import_extra(module: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError:
-        extra = EXTRAS[package]
-        raise UsageError(
-            f"this needs the package {package}; install it with pip install 'tactile-bayes[{extra}]'"
-        ) from None
+        way_out = f"install it with pip install 'tactile-bayes[{EXTRAS[package]}]'"
+        raise UsageError(f"this needs the package {package}; {way_out}") from None
 
 
 # --- Inputs of an export: the file of a map, and the file of an estimate with its masses.
@@ -183,6 +181,11 @@ class EstimateFile(Record, eq=False):
         return any(one.largest is not None for one in self.masses)
 
     @property
+    def verdict_line(self) -> str:
+        """The verdict, as a sentence."""
+        return f"Verdict: {self.report.verdict.replace('_', ' ')}."
+
+    @property
     def lines(self) -> list[str]:
         """Findings, in sentences for paper."""
         return [plain_line(line) for line in finding_lines(self.report.findings, paper=True)]
@@ -198,11 +201,6 @@ class EstimateFile(Record, eq=False):
     def version(self) -> str:
         """Version of the program that made it; empty where the file has none."""
         return plain_line(str(self.report.provenance.get("version") or ""))
-
-
-def verdict_words(estimate: EstimateFile) -> str:
-    """The verdict, as a sentence."""
-    return f"Verdict: {estimate.report.verdict.replace('_', ' ')}."
 
 
 def plain_line(text: str) -> str:
@@ -298,9 +296,8 @@ def check_pairs(maps: Sequence[MapFile], estimates: Sequence[EstimateFile]) -> N
                 raise UsageError(f"{fault}; make it again: {remedy}")
         missing = len(set(estimate.maps) - {one.digest for one in maps})
         if maps and missing:
-            raise UsageError(
-                f"{estimate.path} is of {len(estimate.maps)} maps, and {missing} of them are not given; give all"
-            )
+            fault = f"{estimate.path} is of {len(estimate.maps)} maps, and {missing} of them are not given"
+            raise UsageError(f"{fault}; give all")
 
 
 # --- Identity of patient and study, as the user or a worklist gives it, checked against what the formats can hold.
@@ -373,9 +370,8 @@ class Identity(IdentityOptions):
                 raise UsageError(f"{name} is {quoted(getattr(self, name))}; {way_out}")
         super().__post_init__()
         if self.study_uid and not _UID.fullmatch(self.study_uid):
-            raise UsageError(
-                f"study_uid is {quoted(self.study_uid)}; give numbers with points between, at most 64 characters"
-            )
+            way_out = "give numbers with points between, at most 64 characters"
+            raise UsageError(f"study_uid is {quoted(self.study_uid)}; {way_out}")
         for name in ("birth_date", "study_date", "content_date"):
             if text := getattr(self, name):
                 Moment.parse(text, name=name, date_only=name == "birth_date")
@@ -428,9 +424,8 @@ def merged_identity(worklist: Path | None, options: Mapping[str, Any]) -> Identi
     for name, value in options.items():
         listed = getattr(identity, name)
         if listed and listed != value:
-            raise UsageError(
-                f"{name} is {quoted(value)} by the option and {quoted(listed)} in the worklist; leave one out"
-            )
+            both = f"{quoted(value)} by the option and {quoted(listed)} in the worklist"
+            raise UsageError(f"{name} is {both}; leave one out")
     return replace(identity, **options)
 
 

@@ -113,7 +113,7 @@ class _Resources:
 
     def _observation(self, role: str, code: dict[str, Any], finding: exam.ExportedMass) -> dict[str, Any]:
         site = exam.BREASTS.get(self.estimate.facts.get("side", ""))
-        notes = [RESEARCH_USE, exam.verdict_words(self.estimate), *self.estimate.lines]
+        notes = [RESEARCH_USE, self.estimate.verdict_line, *self.estimate.lines]
         notes += [finding.narrower] if finding.narrower else []
         if len(self.estimate.masses) > 1:
             notes.append(f"Mass {finding.number} of {len(self.estimate.masses)}")
@@ -152,7 +152,7 @@ class _Resources:
 
 def _lines(estimate: exam.EstimateFile) -> Iterator[str]:
     """Sentences of the report: verdict, findings, then the masses."""
-    yield exam.verdict_words(estimate)
+    yield estimate.verdict_line
     yield from estimate.lines
     for one in estimate.masses:
         mass = f"Mass {one.number}: " if len(estimate.masses) > 1 else ""

@@ -142,9 +142,8 @@ def _record_id(estimate: EstimateFile, finding: ExportedMass, identity: Identity
     patient = identity.patient_id
     if id_from_scan and not patient:
         if "subject" not in facts:
-            raise UsageError(
-                f"{estimate.path} names no subject; give --patient-id, or leave out --patient-id-from-scan"
-            )
+            way_out = "give --patient-id, or leave out --patient-id-from-scan"
+            raise UsageError(f"{estimate.path} names no subject; {way_out}")
         patient = facts["subject"]
     several = [str(finding.number)] if len(estimate.masses) > 1 else []
     if not patient:

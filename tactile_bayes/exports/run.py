@@ -240,8 +240,7 @@ def _dicom(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity:
 def _refuse_maps(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], to: ExportFormat) -> None:
     if maps and not estimates:
         one = maps[0].path
-        raise UsageError(
-            f"{to} files hold sizes, and {one} is a map; give what `tactile-bayes estimate {one} --json` prints"
-        )
+        way_out = f"give what `tactile-bayes estimate {one} --json` prints"
+        raise UsageError(f"{to} files hold sizes, and {one} is a map; {way_out}")
     if maps:
         raise UsageError(f"{to} files hold no map; leave out {maps[0].path}")
