@@ -77,6 +77,9 @@ def emulate_action(
             for other in others:
                 other.start()
             emulators[0].run(once=once)
+            if not once:  # its cable was pulled, as asked: the other may send nothing, and would wait for that for good
+                for one in emulators[1:]:
+                    one.unplugged = True
             for other in others:
                 other.join()
     finally:

@@ -23,6 +23,7 @@ import numpy as np
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware import head
+from tactile_bayes.hardware.ports import reason
 from tactile_bayes.hardware.readings import HelloReading, MissingReading, PoseReading, ToolReading, pose_from_relative
 from tactile_bayes.hardware.serial_trackers import encode_record
 from tactile_bayes.options import FaultOptions
@@ -386,8 +387,7 @@ class TcpLink:
         try:
             self._listener = socket.create_server((host, port))
         except OSError as error:
-            reason = error.strerror or str(error)
-            raise DeviceError(f"{host}:{port}: cannot listen ({reason}); give another --tcp HOST:PORT") from None
+            raise DeviceError(f"{host}:{port}: cannot listen ({reason(error)}); give another --tcp HOST:PORT") from None
         self._host: socket.socket | None = None
         name, number = self._listener.getsockname()[:2]
         self.url = f"socket://{name}:{number}"

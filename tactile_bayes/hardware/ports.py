@@ -78,7 +78,7 @@ class Port:
             self._serial.write(data)
             self._serial.flush()
         except GONE as error:
-            raise DeviceError(f"{self.name}: cannot be written to ({_reason(error)}); {self.remedy}") from None
+            raise DeviceError(f"{self.name}: cannot be written to ({reason(error)}); {self.remedy}") from None
 
     def read_some(self, timeout_s: float) -> bytes:
         """Return the first bytes that come within the time; empty when nothing came."""
@@ -91,7 +91,7 @@ class Port:
                 if time.monotonic() >= end:
                     return b""
         except GONE as error:
-            raise DeviceError(f"{self.name}: cannot be read ({_reason(error)}); {self.remedy}") from None
+            raise DeviceError(f"{self.name}: cannot be read ({reason(error)}); {self.remedy}") from None
 
     def _waiting(self) -> bytes:
         """Read the bytes that have come already."""
@@ -152,7 +152,7 @@ def _open(url: str, baud: int, role: str) -> Any:
         ) from None
     except GONE as error:
         raise DeviceError(
-            f"{role} {url}: cannot be opened ({_reason(error)}); `tactile-bayes devices` lists what is there"
+            f"{role} {url}: cannot be opened ({reason(error)}); `tactile-bayes devices` lists what is there"
         ) from None
     return port
 
@@ -165,7 +165,7 @@ def _relay(port: Any, sink: socket.socket) -> None:
                 sink.sendall(data + port.read(port.in_waiting))
 
 
-def _reason(error: Exception) -> str:
+def reason(error: Exception) -> str:
     """The system's error text, also where pyserial wraps it in a text of its own."""
     number = error.args[0] if isinstance(error, termios.error) else getattr(error, "errno", None)
     if not isinstance(number, int):

@@ -297,8 +297,8 @@ class TrackerDriver(Record):
             return f"{expected}, nothing came{before_words}; {self.hint}"
         fault = f"{expected}, {preview(received)} came ({len(received)} bytes)"
         for name, driver in TRACKERS.items():
-            records = driver.parser().feed(unasked + received)
-            if sum(isinstance(record, PoseReading | HelloReading) for record in records) > 1:
+            parser = driver.parser()
+            if parser.feed(unasked + received) and parser.garbage_bytes < len(unasked + received) / 2:
                 return f"{fault}: these are records of {driver.title}; give --tracker-protocol {name}"
         return f"{fault}; give another --tracker-protocol{', or its line rate' if rate else ''}"
 
@@ -417,7 +417,8 @@ def _no_hello(parser: head.HeadParser, received: bytes, port: Port) -> str:
     if parser.fault:
         return f"but {parser.fault}; the layout is in docs/scan-head-protocol.md"
     if not received:
-        return f"nothing came; check its power and {'cable' if port.has_line_rate else 'its server'}"
+        line = "cable" if port.has_line_rate else "its server"
+        return f"nothing came; check its power and {line}, and that this is the head's port"
     for driver in TRACKERS.values():
         if any(isinstance(reading, PoseReading) for reading in driver.parser().feed(received)):
             return f"records of {driver.title} came; give the port of the head"

@@ -145,11 +145,17 @@ class Arrangement(Record, eq=False):
         """Sentence on the mistake that was made if this arrangement is the right one."""
         if self.sway_mm:
             often = f"{self.sways_a_minute:.0f} times a minute"
-            return f"the body moved to and fro by {self.sway_mm:.0f} mm, {often}, as breathing moves it"
+            cause = "a tracker that drifts or slow breathing moves" if self.slow else "breathing moves"
+            return f"the body moved to and fro by {self.sway_mm:.0f} mm, {often}, as {cause} it"
         if self.late_ms:
             way = "late" if self.late_ms > 0 else "early"
             return f"the poses' times are {abs(self.late_ms):.0f} ms too {way} against the frames'"
         return " and ".join(CORRECTIONS[name] for name in self.corrections) or "all is as it is stated"
+
+    @property
+    def slow(self) -> bool:
+        """True for the slowest motion tried, which a steady drift of the tracker resembles most."""
+        return self.sways_a_minute <= 60 * _SWAYS_HZ[0]
 
     @property
     def plausible(self) -> bool:
@@ -233,6 +239,14 @@ class ArrangementCheck(Record, eq=False):
                 "the tracker's times do not fit those of the sensor array; size and place may be wrong",
                 f"map it with --latency-ms {self.stated_latency_ms + self.best.late_ms:.0f}",
                 "have the scan mapped again with the tracker's delay",
+            )
+        if self.best.sway_mm and self.best.slow:
+            return words, finding(
+                "frames_contradict",
+                "the body moved or the tracker drifted during the scan; size and place may be wrong",
+                "let the tracker warm up and keep metal away from it, have the breath held, or record with a reference "
+                "tool on the body (--reference)",
+                "have the scan taken again with the tracker warmed up and the breath held",
             )
         if self.best.sway_mm:
             return words, finding(

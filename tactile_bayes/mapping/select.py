@@ -273,6 +273,13 @@ class Jumps:
         return [f"the poses jump {times}, by up to {self.longest_mm:.0f} mm, faster than a hand: {cause}"]
 
 
+_LEFT_OUT: Final = (
+    "if the map has a hole at the lump, record again, the head plugged in and its tool in the tracker's sight",
+    "if the map has a hole at the lump, have the scan taken again",
+)
+"""Remedies of times without frames or poses."""
+
+
 def disjoint(frames: Span, poses: Span) -> bool:
     """True where no frame was measured between the first pose and the last."""
     if not frames.number or not poses.number:
@@ -305,7 +312,7 @@ def scan_findings(scan: Scan) -> tuple[Finding, ...]:
     noted = with_times(scan.findings, Span.of(scan.frames.time_s), Span.of(scan.poses.time_s))
     jumps = Jumps.of(scan.poses).cautions()
     noted = tuple(one for one in noted if one.text not in jumps)
-    frozen = (finding("times_apart", text) for text in _frozen_cautions(scan.poses))
+    frozen = (finding("times_apart", text, *_LEFT_OUT) for text in _frozen_cautions(scan.poses))
     return (*noted, *frozen, *(finding("poses_jump", text) for text in jumps))
 
 
@@ -329,7 +336,7 @@ def with_times(findings: Sequence[Finding], frames: Span, poses: Span) -> tuple[
     """`findings` of a scan's file followed by those on its times, each once."""
     cautions = overlap_cautions(frames, poses)
     others = [one for one in findings if one.text not in cautions]
-    return (*others, *(finding("times_apart", text) for text in cautions))
+    return (*others, *(finding("times_apart", text, *_LEFT_OUT) for text in cautions))
 
 
 # --- Selection of the frames that go into a map, and the reasons for leaving others out (paper step ii, the gate).

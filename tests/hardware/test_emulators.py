@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from emulated_devices import serving, short_scan
 
-from tactile_bayes.actions.devices import _link
+from tactile_bayes.actions.devices import _link, emulate_action
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.hardware import head
@@ -160,3 +160,19 @@ def test_a_port_without_an_address_is_for_this_computer_only(given: str, host: s
         assert link.url.startswith(f"socket://{host}:")
     finally:
         link.close()
+
+
+def test_a_head_whose_cable_is_pulled_on_request_ends_the_tracker_too(tmp_path, monkeypatch):
+    """`emulate both --disconnect 2` never ended: the tracker, told to stop meanwhile, came to no record."""
+
+    def serve(emulator: Emulator, *, once: bool) -> None:
+        while not (emulator.leads or once or emulator.unplugged):
+            time.sleep(0.01)
+
+    write_scan(tmp_path / "scan.mcap", short_scan(0.2), provenance=Provenance("test", {}))
+    monkeypatch.setattr(Emulator, "run", serve)
+    given = {"kind": "both", "scan": tmp_path / "scan.mcap", "protocol": "open", "tcp": None, "speed": 1.0, "seed": 1}
+    thread = threading.Thread(target=emulate_action, kwargs={**given, "once": False}, daemon=True)
+    thread.start()
+    thread.join(5.0)
+    assert not thread.is_alive()

@@ -347,6 +347,15 @@ def test_records_of_another_tracker_are_named():
         port.close()
 
 
+@pytest.mark.parametrize("protocol", ["fastrak", "liberty-ascii", "bird", "open"])
+def test_a_single_record_of_another_tracker_is_named(protocol):
+    """Of what answers once when it is asked, nothing was said but "give another --tracker-protocol"."""
+    record = EmulatedTracker(short_scan(0.2).poses, protocol=protocol).record(3)
+    asked = TRACKERS["liberty"]
+    words = asked._fault_words(asked.parser(), b"\r\n", record, rate=True)
+    assert words.endswith(f"records of {TRACKERS[protocol].title}; give --tracker-protocol {protocol}")
+
+
 @pytest.mark.long
 def test_a_server_that_sends_only_on_request_is_asked():
     listener = socket.create_server(("127.0.0.1", 0))

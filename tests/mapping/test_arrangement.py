@@ -15,6 +15,7 @@ from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid, rot
 from tactile_bayes.mapping.arrangement import (
     LEAST_SWAY_GAIN,
     LEAST_SWAY_MM,
+    Arrangement,
     ArrangementCheck,
     _Overlap,
     _screened,
@@ -206,6 +207,17 @@ def test_a_body_that_breathes_is_named_and_a_still_one_is_not():
         assert check.best.sway_mm == pytest.approx(10.0, abs=3.0)
         assert check.best.sways_a_minute == pytest.approx(15.0, abs=3.1)
         assert not check.refused
+
+
+@pytest.mark.parametrize(("rate", "drift"), [(6.0, True), (15.0, False)])
+def test_a_motion_slower_than_breath_may_be_the_trackers_drift(rate: float, drift: bool) -> None:
+    """A drift of 20 mm over a scan was told as breathing, to be mended by a held breath."""
+    stated = Arrangement((), spread=0.03, explained=0.5, lasting=0.6, agreement=1.0)
+    moved = replace(stated, spread=0.01, sway_mm=12.0, sways_a_minute=rate)
+    (found,) = ArrangementCheck(stated, moved, 9.0, {"rows-reversed": 9.0}).findings
+    assert found.kind == "frames_contradict"
+    for words in (found.text, found.remedy, found.on_paper):
+        assert ("tracker drifted" in words or "warm" in words) is drift
 
 
 @pytest.mark.long
