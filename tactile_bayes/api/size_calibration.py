@@ -238,13 +238,9 @@ def rows_of_one_way(rows: Table, normalise: str | None) -> tuple[Normalise, dict
 def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> eq6.SizeTable:
     """Columns of a table as arrays, with Delta sigma where depths are stated; without softer lumps."""
     # only lumps marked as detectable: fits to the others describe a trough
-    hard = [
-        row
-        for row, (flag, ratio) in enumerate(
-            zip(table.columns["detectable"], table.columns["stiffness_ratio"], strict=True)
-        )
-        if flag is not False and (ratio is None or ratio >= least_stiffness_ratio)
-    ]
+    flags, ratios = table.columns["detectable"], table.columns["stiffness_ratio"]
+    is_hard = [ratio is None or ratio >= least_stiffness_ratio for ratio in ratios]
+    hard = [row for row in range(len(table)) if is_hard[row] and flags[row] is not False]
     columns = {name: [values[row] for row in hard] for name, values in table.columns.items()}
 
     def array(name: str) -> FloatArray | None:
@@ -252,9 +248,8 @@ def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> eq6.SizeT
         if all(value is None for value in values):
             return None
         if any(value is None for value in values):
-            raise table.error(
-                hard[values.index(None)], name, "is blank in some rows only", way_out="fill the column or leave it out"
-            )
+            row = hard[values.index(None)]
+            raise table.error(row, name, "is blank in some rows only", way_out="fill the column or leave it out")
         return np.asarray(values, dtype=np.float64)
 
     d_mm, amplitude, sigma_x, sigma_y = (array(n) for n in ("d_mm", "amplitude", "sigma_x_mm", "sigma_y_mm"))

@@ -303,8 +303,8 @@ def _check_length(line: int, cells: Sequence[str], header: Sequence[str]) -> Non
     way_out = "give every row a cell for each column"
     if len(cells) > len(header):
         way_out += " (a decimal comma? write 12.5, not 12,5)"
-    cells_words = "1 cell" if len(cells) == 1 else f"{len(cells)} cells"
-    raise BadDataError(f"line {line}: {cells_words} under {len(header)} columns", way_out=way_out)
+    plural = "s" * (len(cells) > 1)
+    raise BadDataError(f"line {line}: {len(cells)} cell{plural} under {len(header)} columns", way_out=way_out)
 
 
 def _cell(line: int, text: str, field: Mapping[str, Any], *, decimal_comma: bool) -> Any:

@@ -258,20 +258,16 @@ class ModalityRatio(Figures):
 
 def mape_ratios(sizes: Mapping[str, ModalitySizes], *, intervals: Intervals) -> dict[str, ModalityRatio]:
     """Ratio of every other modality to the tactile one; empty without a tactile one."""
-    reference = sizes.get(REFERENCE)
-    if reference is None:
-        return {}
     ratios = {}
-    for name, modality_sizes in sizes.items():
-        if name != REFERENCE:
-            looked_for = on_common_masses(modality_sizes, reference)
-            both_detected = on_common_masses(modality_sizes.only_detected(), reference.only_detected())
-            figures = {
-                "ratio": mape_ratio(*looked_for, intervals=intervals),
-                "ratio_detected": mape_ratio(*both_detected, intervals=intervals),
-            }
-            n, n_detected = len(looked_for[0].size_mm), len(both_detected[0].size_mm)
-            ratios[name] = ModalityRatio(masses=n, masses_detected=n_detected, **fields_of(figures))
+    for name in [one for one in sizes if one != REFERENCE] if REFERENCE in sizes else []:
+        pair = sizes[name], sizes[REFERENCE]
+        looked_for, both_detected = on_common_masses(*pair), on_common_masses(*(one.only_detected() for one in pair))
+        figures = {
+            "ratio": mape_ratio(*looked_for, intervals=intervals),
+            "ratio_detected": mape_ratio(*both_detected, intervals=intervals),
+        }
+        n, n_detected = len(looked_for[0].size_mm), len(both_detected[0].size_mm)
+        ratios[name] = ModalityRatio(masses=n, masses_detected=n_detected, **fields_of(figures))
     return ratios
 
 

@@ -274,14 +274,9 @@ class Figures(Record):
         """A figure with its interval, by its name."""
         interval, reasons = f"{name}_interval", getattr(self, "reasons", {})
         ends: Any = getattr(self, interval, UNSET)
-        has_interval = ends is not UNSET
-        return Figure(
-            getattr(self, name),
-            reasons.get(name, ""),
-            ends if has_interval else None,
-            reasons.get(interval, ""),
-            has_interval,
-        )
+        if ends is UNSET:
+            return Figure(getattr(self, name), reasons.get(name, ""))
+        return Figure(getattr(self, name), reasons.get(name, ""), ends, reasons.get(interval, ""), True)
 
 
 def fields_of(figures: Mapping[str, Figure]) -> dict[str, Any]:

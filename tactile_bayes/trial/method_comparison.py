@@ -240,50 +240,39 @@ _NO_SPREAD = "one mass has no spread"
 
 def limit_figures(detected: ModalitySizes, *, intervals: Intervals) -> dict[str, Figure]:
     """Lower and upper limit in mm and as the logarithm of the ratio, for single readings of detected masses."""
-    return {
-        f"limit_{side}_{unit}": _limit(terms, sign, detected, intervals=intervals)
-        for unit, terms in (
-            ("mm", cache(partial(_limit_terms, np.asarray))),
-            ("log_ratio", cache(partial(_limit_terms, np.log))),
-        )
-        for side, sign in (("low", -1), ("high", 1))
-    }
+    figures = {}
+    for unit, scale in (("mm", np.asarray), ("log_ratio", np.log)):
+        terms = cache(partial(_limit_terms, scale))
+        for side, sign in (("low", -1), ("high", 1)):
+            figures[f"limit_{side}_{unit}"] = _limit(terms, sign, detected, intervals=intervals)
+    return figures
 
 
 def _limit(
     terms: Callable[[ModalitySizes], FloatArray], sign: int, detected: ModalitySizes, *, intervals: Intervals
 ) -> Figure:
     """A limit of agreement. Its corrected interval combines those of the mean and of the SD, on the log scale (Zou
-    2013)."""
+    2013), whose degrees of freedom allow for few influential patients."""
     end = SumStatistic(terms, lambda sums: _limit_mean(sums) + sign * _REACH * _limit_sd(sums), _NO_SPREAD)
     plain = figure(end, detected, scale="linear", intervals=intervals)
     if intervals.method != "corrected" or plain.interval is None:
         return plain
-    jackknife = partial(_jackknife_interval, detected, terms, confidence=intervals.probability)
+    scales: dict[Callable[[FloatArray], FloatArray], Scale] = {_limit_mean: "linear", _limit_sd: "log"}
+    parts = []
     try:
-        mean, mean_ends = jackknife(_limit_mean, scale="linear")
-        sd, sd_ends = jackknife(_limit_sd, scale="log")
+        for finish, scale in scales.items():
+            sample = Sample(SumStatistic(terms, finish, _NO_SPREAD), (detected,))
+            value, left_out = sample.value(), sample.left_out()
+            freedom = kurtosis_freedom(on_scale(left_out, scale))
+            ends = interval_from_values(value, left_out, scale=scale, confidence=intervals.probability, freedom=freedom)
+            parts.append((value, ends))
     except UndefinedError as undefined:
         return replace(plain, interval=None, interval_reason=str(undefined))
+    (mean, mean_ends), (sd, sd_ends) = parts
     limit = mean + sign * _REACH * sd
     below, above = (_REACH * (sd - sd_ends[0]), _REACH * (sd_ends[1] - sd))[::sign]
     ends = limit - math.hypot(mean - mean_ends[0], below), limit + math.hypot(mean_ends[1] - mean, above)
     return replace(plain, interval=ends)
-
-
-def _jackknife_interval(
-    detected: ModalitySizes,
-    terms: Callable[[ModalitySizes], FloatArray],
-    finish: Callable[[FloatArray], FloatArray],
-    *,
-    scale: Scale,
-    confidence: float,
-) -> tuple[float, Ends]:
-    """Value with its jackknife interval, whose degrees of freedom allow for few influential patients."""
-    sample = Sample(SumStatistic(terms, finish, _NO_SPREAD), (detected,))
-    value, left_out = sample.value(), sample.left_out()
-    freedom = kurtosis_freedom(on_scale(left_out, scale))
-    return value, interval_from_values(value, left_out, scale=scale, confidence=confidence, freedom=freedom)
 
 
 def _limit_terms(scale: Callable[[FloatArray], FloatArray], sizes: ModalitySizes) -> FloatArray:

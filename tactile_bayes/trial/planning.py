@@ -178,7 +178,7 @@ def patients_needed(designs: Sequence[Design], aim: Aim, target: float, *, trial
     if least.patients == MIN_PATIENTS and (least.power >= target if aim == "power" else width <= target):
         return Needed(aim=aim, target=target, maps=least.maps, patients=MIN_PATIENTS, patients_interval=None)
     exponent = 0.5 if aim == "power" else -0.5
-    predictor, response, weights = [], [], []
+    points = []  # predictor, response and weight
     for design in designs:
         if aim == "power":
             share = min(max(design.power, 0.5 / trials), 1 - 0.5 / trials)
@@ -188,11 +188,10 @@ def patients_needed(designs: Sequence[Design], aim: Aim, target: float, *, trial
             continue
         else:
             y, sd = math.log(design.tactile_width_ratio), 1.0
-        predictor.append(design.patients**exponent)
-        response.append(y)
-        weights.append(1 / sd)
-    if len(predictor) < 2:
+        points.append((design.patients**exponent, y, 1 / sd))
+    if len(points) < 2:
         return None
+    predictor, response, weights = zip(*points, strict=True)
     (slope, start), covariance = np.polyfit(predictor, response, 1, w=weights, cov="unscaled")
     response_at_target = float(ndtri(target)) if aim == "power" else math.log(target)
     x = (response_at_target - start) / slope

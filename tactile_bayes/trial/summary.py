@@ -137,8 +137,7 @@ def calibration(prediction: Prediction, *, confidence: float) -> Calibration:
     mean, tail = float(np.mean(z**2)), 0.5 - 0.5 * confidence
     # chi-squared, one degree of freedom per mass
     low, high = (math.sqrt(masses * mean / float(chdtri(masses, p))) for p in (tail, 1 - tail))
-    scale, ends = math.sqrt(mean), (low, high)
-    shift = 100 * math.expm1(float(np.median(prediction.ex_vivo_log - prediction.median_log)))
+    scale = math.sqrt(mean)
     levels = []
     for level in LEVELS:
         covered = int(np.sum(np.abs(z) <= float(ndtri(0.5 + 0.5 * level))))
@@ -155,9 +154,9 @@ def calibration(prediction: Prediction, *, confidence: float) -> Calibration:
         crps_mm=_finite_mean(crps_log_normal(prediction)),
         interval_score_mm=_finite_mean(interval_score(prediction, probability=0.95)),
         scale=scale,
-        scale_interval=ends,
-        shift_percent=shift,
-        advice=_advice(scale, ends, masses, distance > band),
+        scale_interval=(low, high),
+        shift_percent=100 * math.expm1(float(np.median(prediction.ex_vivo_log - prediction.median_log))),
+        advice=_advice(scale, (low, high), masses, distance > band),
     )
 
 
