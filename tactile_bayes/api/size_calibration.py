@@ -225,12 +225,14 @@ def rows_of_one_way(rows: Table, normalise: str | None) -> tuple[Normalise, dict
     """
     ways = [str(value or "mean") for value in rows.columns.get("normalise", ["mean"] * len(rows))]
     present = sorted(set(ways))
-    chosen, several = normalise or present[0], normalise is None and len(present) > 1
-    if several or chosen not in present:
+    chosen = normalise or present[0]
+    if normalise is None and len(present) > 1:
+        what = f"its maps were normalised in several ways ({', '.join(present)})"
+        way_out = f"learn from the rows of one way: --normalise {chosen}"
+        raise BadDataError(what, way_out=way_out, path=str(rows.path))
+    if chosen not in present:
         what = f"none of its maps were made with --normalise {chosen}"
-        what = f"its maps were normalised in several ways ({', '.join(present)})" if several else what
-        advice = "learn from the rows of one way:" if several else "give"
-        raise BadDataError(what, way_out=f"{advice} --normalise {present[0]}", path=str(rows.path))
+        raise BadDataError(what, way_out=f"give --normalise {present[0]}", path=str(rows.path))
     indices = [i for i, way in enumerate(ways) if way == chosen]
     return cast("Normalise", chosen), {name: [values[i] for i in indices] for name, values in rows.columns.items()}
 

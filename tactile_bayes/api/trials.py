@@ -256,12 +256,6 @@ class Pilot(Record, eq=False):
             raise BadDataError(what, way_out="give it with --map-sd", path=str(self.path))
         return {**errors, **stated}
 
-    @property
-    def files(self) -> dict[str, Path]:
-        """The two tables, where they are files."""
-        files = self.trial.files
-        return {role: files[name] for role, name in (("pilot", "trial"), ("excision", "excision")) if name in files}
-
 
 def read_pilot(pilot: Path | Sheet | None, excision: Path | Sheet | None, against: str | None) -> Pilot | None:
     """Read a pilot's tables, None without one; refuses what goes only with one, and a pilot without its excision."""
@@ -350,7 +344,8 @@ def planned(values: Mapping[str, Any], pilot: Pilot | None, progress: Progress) 
             designs, needed = run([case(patients=patients, maps=number) for patients, number in pairs]), ()
     assumed = {name: float(f"{errors[name]:.9g}") for name in _ERRORS}
     sources: dict[str, planning.ErrorSource] = {name: "option" if name in stated else unstated for name in _ERRORS}
-    inputs = hash_inputs(**({} if pilot is None else pilot.files))
+    files = {} if pilot is None else pilot.trial.files
+    inputs = hash_inputs(pilot=files.get("trial"), excision=files.get("excision"))
     settings: dict[str, Any] = {"trials": options.trials, "errors": assumed, "errors_from": sources}
     settings |= {str(aim): target for aim, target in aims.items()}
     report = planning.PlanReport(

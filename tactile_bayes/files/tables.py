@@ -274,16 +274,11 @@ def _check_header(header: Sequence[str], fields: Mapping[str, Any], *, wide: str
 
 def _advice_on_column(name: str, header: Sequence[str], fields: Mapping[str, Any]) -> str:
     """Way out for an unknown column: give the other table (trial and excision exchanged), or correct the name."""
-    trial_tables = {
-        contents: {field["name"]: field for field in load_schema(f"{kind}.table.json")["fields"]}
-        for kind, contents in (("trial", "readings"), ("excision", "sizes after excision"))
-    }
-    other_one = any(list(known) == list(fields) for known in trial_tables.values())
-    for contents, known in trial_tables.items():
+    for kind, contents in (("trial", "readings"), ("excision", "sizes after excision")):
+        known = {field["name"]: field for field in load_schema(f"{kind}.table.json")["fields"]}
         needed = {name for name, field in known.items() if _is_required(field)}
         if list(known) != list(fields) and needed <= set(header) <= set(known):
-            way_out = "give the other one here" if other_one else f"the columns here are {_names(fields)}"
-            return f"this is a trial's table of {contents}: {way_out}"
+            return f"this is a trial's table of {contents}: give the one with the columns {_names(fields)}"
     if set(fields).isdisjoint(header):
         return f"the first line names the columns, which are {_names(fields)}"
     name = name.strip().lower()

@@ -197,11 +197,11 @@ def _terms(sizes: ModalitySizes) -> FloatArray:
 
 def _terms_of_varied(sizes: ModalitySizes, *, ex_vivo: bool) -> FloatArray:
     """`_terms`; `UndefinedError` where the sizes, or with `ex_vivo` the ex-vivo sizes, do not vary."""
+    if len(sizes.size_mm) == 1:
+        raise UndefinedError("one mass has no spread")
     for name, values in (("sizes", sizes.size_mm), ("ex-vivo sizes", sizes.ex_vivo_mm))[: 1 + ex_vivo]:
         if all_equal(require_any(values)):
-            raise UndefinedError(
-                "one mass has no spread" if len(values) == 1 else f"all {len(values)} {name} are equal"
-            )
+            raise UndefinedError(f"all {len(values)} {name} are equal")
     return _terms(sizes)
 
 

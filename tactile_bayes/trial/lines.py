@@ -127,11 +127,8 @@ class Line(Record):
         if self.intercept_se is None or self.slope_se is None:
             return self.stated
         t = student(self.n - 2, confidence=confidence)
-        of_intercept, of_slope = t * self.intercept_se, t * self.slope_se
-        return (
-            (self.intercept - of_intercept, self.intercept + of_intercept),
-            (self.slope - of_slope, self.slope + of_slope),
-        )
+        a, of_a, b, of_b = self.intercept, t * self.intercept_se, self.slope, t * self.slope_se
+        return (a - of_a, a + of_a), (b - of_b, b + of_b)
 
 
 # --- Passing and Bablok's line: the shifted median of the slopes of all pairs of masses.

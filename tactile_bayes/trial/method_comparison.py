@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, lru_cache, partial
 from typing import Annotated, Literal, TypeVar
 
@@ -370,25 +370,27 @@ class MethodComparison(Figures, kw_only=True):
 
 def compare_methods(sizes: ModalitySizes, *, intervals: Intervals, error_ratio: float = 1.0) -> MethodComparison:
     """Compare one modality's detected sizes with excision."""
-    detected = sizes.only_detected()
+    detected, level = sizes.only_detected(), intervals.probability
     x, y = detected.ex_vivo_mm, detected.size_mm
-    robust = _kept(partial(lines.passing_bablok, confidence=intervals.probability))
-    weighted = _kept(partial(lines.weighted_deming, error_ratio=error_ratio))
-    slope: Scale = "slope" if intervals.method == "corrected" else "linear"
+    fits: dict[str, _Fit] = {
+        "ols": lines.least_squares,
+        "deming": partial(lines.deming, error_ratio=error_ratio),
+        "weighted_deming": _kept(partial(lines.weighted_deming, error_ratio=error_ratio)),
+        "passing_bablok": _kept(partial(lines.passing_bablok, confidence=level)),
+    }
     figures: dict[str, Figure] = {}
-    for name, statistic, scale in _statistics(error_ratio, weighted, robust, slope):
+    for name, statistic, scale in _statistics(
+        error_ratio, fits, "slope" if intervals.method == "corrected" else "linear"
+    ):
         on = scale if isinstance(statistic, SumStatistic) or len(x) <= MOST_REFITTED else None
         figures[name] = figure(statistic, detected, scale=on, intervals=intervals, leverage=_squared_distance)
     figures |= limit_figures(detected, intervals=intervals)
-    measurable, level = len(x) >= 2 and _can_be_squared(x, y), intervals.probability
-    analytic = (
-        _analytic_intervals(x, y, weighted, robust, confidence=level, error_ratio=error_ratio) if measurable else {}
-    )
+    measurable = len(x) >= 2 and _can_be_squared(x, y)
     return MethodComparison(
         masses=len(x),
         error_ratio=error_ratio,
         **fields_of(figures),
-        analytic_intervals=analytic,
+        analytic_intervals=_analytic_intervals(x, y, fits, confidence=level) if measurable else {},
         limits=_limits(detected, confidence=level) if measurable else {},
         trends=_trends(x, y, confidence=level) if measurable else {},
         concordance_parts=_or_none(lambda: lines.concordance(x, y, confidence=level)) if measurable else None,
@@ -402,18 +404,17 @@ def _squared_distance(sizes: ModalitySizes) -> FloatArray:
     return np.asarray((share - share.mean()) ** 2)
 
 
-def _statistics(error_ratio: float, weighted: _Fit, robust: _Fit, slope: Scale) -> list[tuple[str, Statistic, Scale]]:
+def _statistics(error_ratio: float, fits: Mapping[str, _Fit], slope: Scale) -> list[tuple[str, Statistic, Scale]]:
     """All figures with their names and the scales of their intervals."""
-    fits = (("weighted_deming", weighted), ("passing_bablok", robust))
 
     def demings(sums: FloatArray) -> FloatArray:
         return lines.deming_slopes(*squares(sums), error_ratio=error_ratio)
 
-    def part(fit: _Fit, name: str) -> Statistic:
+    def part(line: str, name: str) -> Statistic:
         def statistic(sizes: ModalitySizes) -> float:
             x, y = sizes.ex_vivo_mm, sizes.size_mm
             _require_squarable(x, y)
-            return float(getattr(fit(x, y), name))
+            return float(getattr(fits[line](x, y), name))
 
         return statistic
 
@@ -422,8 +423,10 @@ def _statistics(error_ratio: float, weighted: _Fit, robust: _Fit, slope: Scale) 
         ("ols_slope", SumStatistic(_terms, _ols_slope, _NO_LINE), slope),
         ("deming_intercept_mm", SumStatistic(_terms, _intercept_with(demings), _NO_LINE), "linear"),
         ("deming_slope", SumStatistic(_terms, demings, _NO_LINE), slope),
-        *((f"{name}_intercept_mm", part(fit, "intercept"), "linear") for name, fit in fits),
-        *((f"{name}_slope", part(fit, "slope"), slope) for name, fit in fits),
+        ("weighted_deming_intercept_mm", part("weighted_deming", "intercept"), "linear"),
+        ("passing_bablok_intercept_mm", part("passing_bablok", "intercept"), "linear"),
+        ("weighted_deming_slope", part("weighted_deming", "slope"), slope),
+        ("passing_bablok_slope", part("passing_bablok", "slope"), slope),
         ("concordance", SumStatistic(_terms, _concordance, "concordance needs sizes that vary"), "fisher"),
         ("difference_mean_mm", SumStatistic(_terms, _mean_difference), "linear"),
         ("difference_sd_mm", SumStatistic(_terms, _difference_sd, _NO_SPREAD), "log"),
@@ -493,28 +496,20 @@ def _can_be_squared(x: FloatArray, y: FloatArray) -> bool:
 
 
 def _analytic_intervals(
-    x: FloatArray, y: FloatArray, weighted: _Fit, robust: _Fit, *, confidence: float, error_ratio: float
+    x: FloatArray, y: FloatArray, fits: Mapping[str, _Fit], *, confidence: float
 ) -> dict[str, Ends | None]:
-    """Intervals of the lines and of concordance that take the masses as independent, by name; None where undefined."""
+    """Intervals of the lines and of concordance that take the masses as independent, by name; None where undefined.
 
-    def by_jackknife() -> lines.Line:
-        """Weighted Deming line with standard errors from leaving out one mass at a time: there is no formula."""
-        line = weighted(x, y)
-        if not 3 < len(x) <= MOST_REFITTED:
-            return line
-        return lines.Line(line.intercept, line.slope, line.n, *lines.jackknife_errors(weighted, x, y))
-
-    fits: dict[str, Callable[[], lines.Line]] = {
-        "ols": lambda: lines.least_squares(x, y),
-        "deming": lambda: lines.deming(x, y, error_ratio=error_ratio),
-        "weighted_deming": by_jackknife,
-        "passing_bablok": lambda: robust(x, y),
-    }
+    Those of the weighted Deming line, which has no formula, leave out one mass at a time.
+    """
     intervals: dict[str, Ends | None] = {}
     for name, fit in fits.items():
-        line = _or_none(fit)
+        line = _or_none(partial(fit, x, y))
         if line is None and name == "passing_bablok":
             continue
+        if line is not None and name == "weighted_deming" and 3 < len(x) <= MOST_REFITTED:
+            errors = _or_none(partial(lines.jackknife_errors, fit, x, y)) or (None, None)
+            line = replace(line, intercept_se=errors[0], slope_se=errors[1])
         both = (None if line is None else line.intervals(confidence=confidence)) or (None, None)
         for part, interval in zip(("intercept_mm", "slope"), both, strict=True):
             intervals[f"{name}_{part}"] = None if interval is None or not np.all(np.isfinite(interval)) else interval

@@ -351,9 +351,8 @@ class TrialReport(Record, kw_only=True):
     modalities: Annotated[dict[str, ModalityReport], Meta(min_length=1)]
     mape_ratio_to_tactile: dict[str, accuracy.ModalityRatio]
     """Percent error of each other modality over the tactile one's, on common masses; empty without a tactile one."""
-    paired_comparisons: tuple[
-        accuracy.PairedComparison, ...
-    ]  #: Every pair of modalities on the masses that both looked for.
+    paired_comparisons: tuple[accuracy.PairedComparison, ...]
+    """Every pair of modalities on the masses that both looked for."""
     doubts: tuple[str, ...]  #: Columns whose sizes seem to be in another unit than mm.
     conventions: dict[str, str]
     next_mass: NextMass | UnsetType = UNSET  #: Errors-in-variables model: what the next mass may bring.

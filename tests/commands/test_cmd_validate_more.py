@@ -389,7 +389,9 @@ def test_a_ratio_over_no_error_and_lines_through_one_mass_are_reasons(tmp_path: 
 
 
 def test_exchanged_tables_and_readings_without_excision_are_told_apart(tmp_path: Path) -> None:
-    assert "this is a trial's table of readings: give the other one here" in refusal(EXCISION, "--excision", TRIAL)
+    assert "this is a trial's table of readings: give the one with the columns patient, mass, ex_vivo_mm" in refusal(
+        EXCISION, "--excision", TRIAL
+    )
     assert "this is a trial's table of sizes after excision" in refusal(EXCISION, "--excision", EXCISION)
     words = small(tmp_path, [("A", 1, "tactile", 10.0), ("B", 1, "tactile", 12.0)], [("A", 1, 11.0)])
     assert "or leave its readings out" in refusal(*words)
@@ -397,7 +399,9 @@ def test_exchanged_tables_and_readings_without_excision_are_told_apart(tmp_path:
         file.write("   \nB,1,\n")
     assert "line 4, column ex_vivo_mm: is blank; was the mass not measured? then leave its row out" in refusal(*words)
     for table, contents in ((TRIAL, "readings"), (EXCISION, "sizes after excision")):
-        with pytest.raises(BadDataError, match=f"this is a trial's table of {contents}: the columns here are "):
+        with pytest.raises(
+            BadDataError, match=f"this is a trial's table of {contents}: give the one with the columns "
+        ):
             tactile_bayes.calibrate_size(table)
     assert "the first line names the columns, which are patient, mass, modality" in refusal(
         TRIAL.with_name("phantoms.csv"), "--excision", EXCISION
