@@ -148,10 +148,10 @@ def _import_scan(source: Path, output: Path, request: ImportRequest) -> list[str
         file = read_scan_report(source)
         scan, lost, truth = file.scan, file.lost, file.truth
     else:
-        files = request.scan_files.items()
-        parts = [
-            pose_source(path, request.arrays) if name == "poses" else _SCAN_FILES[name](path) for name, path in files
-        ]
+        parts = []
+        for name, path in request.scan_files.items():
+            part = pose_source(path, request.arrays) if name == "poses" else _SCAN_FILES[name](path)
+            parts.append(replace(part, path=str(path)))
         scan, notes = import_arrays(source, request.arrays, parts)
         notes.insert(0, _lengths(scan))
     settings = {"as": "scan", "lost": list(lost), "correct": list(request.corrections), **request.arrays.given}

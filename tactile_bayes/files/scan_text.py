@@ -387,12 +387,11 @@ def _without_word_columns(lines: Sequence[Line]) -> Sequence[Line]:
     words = [i for i in range(width) if 2 * sum(one.values[i] is None for one in sample) > len(sample)]
     if not words or 2 * len(words) > width:
         return lines
-
-    def blanked(line: Line) -> Line:
+    kept = []
+    for line in lines:
         values = [math.nan if i in words else one for i, one in enumerate(line.values)]
-        return line if len(values) != width or None in values else replace(line, values=values)
-
-    return [blanked(line) for line in lines]
+        kept.append(line if len(values) != width or None in values else replace(line, values=values))
+    return kept
 
 
 def _blocks(lines: Sequence[Line], taxels: int | None) -> list[list[Line]]:

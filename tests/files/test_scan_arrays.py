@@ -576,6 +576,12 @@ def test_many_files_fail_one_by_one(pressed: Arrays, head: Path, tmp_path: Path)
     assert sorted(path.name for path in tmp_path.glob("*") if path.is_dir()) == ["scans"]
     one = run_here("import", "c.h5", "-o", "one/", "--unit", "kPa", "--head-geometry", head, cwd=tmp_path)
     assert one.stdout.startswith("one/c.mcap: scan\n")
+    in_metres = json.loads(head.read_text())
+    for row in in_metres["scanhead_from_tracker"][:3]:
+        row[3] /= 1000
+    (tmp_path / "metres.json").write_text(json.dumps(in_metres))
+    wrong = run_here("import", "c.h5", "-o", "w.mcap", "--unit", "kPa", "--head-geometry", "metres.json", cwd=tmp_path)
+    assert wrong.stderr.startswith("error: metres.json: array_from_tracker puts the tracker's sensor 0.0")
     (tmp_path / "a.npz").write_bytes(b"")
     clash = run_here("import", "a.mat", "a.npz", "-o", "more", cwd=tmp_path)
     assert clash.returncode == 2
