@@ -375,7 +375,7 @@ def _orient(axes: Axes, view: Orientation, tactile_map: TactileMap) -> None:
         for axis, direction in back.items()
     )
     axes.set_xlabel(across, fontsize=9)
-    axes.set_ylabel(up, fontsize=9)
+    axes.set_ylabel(up.replace(" (mm, ", "\n(mm, "), fontsize=9)  # in one line it is longer than the coverage is high
     axes.tick_params(labelsize=8)
     if view.right[0] == "-":
         axes.invert_xaxis()

@@ -127,6 +127,7 @@ def test_a_foreign_file_is_one_line_and_exit_3(tmp_path: Path, name: str, data: 
 
 
 def test_many_numbers_are_counted_and_many_words_are_shown() -> None:
-    lines = list(fact_lines({"a": [[0.5, 1.5]] * 20, "b": ["word"] * 40}))
+    lines = list(fact_lines({"a": [[0.5, 1.5]] * 20, "b": ["word"] * 40, "c": (5.0, 14.0)}))
+    assert lines[2] == "c  5, 14"
     assert lines[0] == "a  40 numbers, 0.5 to 1.5"
     assert lines[1].count("word") == 40

@@ -152,6 +152,7 @@ def test_the_viewer_looks_into_the_tissue_with_the_notch_above(axes, notch, x_to
     assert axes[0].yaxis_inverted() != y_up
     # One axis turned, never both or none: two would show the breast from within.
     assert axes[0].xaxis_inverted() != axes[0].yaxis_inverted()
+    assert max(map(len, axes[0].get_ylabel().splitlines())) <= 25  # the coverage beside it is as low as 70 mm
 
 
 def test_an_imported_grid_is_drawn_as_its_file_reads(axes):
