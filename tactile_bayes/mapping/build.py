@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, check_number
-from tactile_bayes.findings import Finding, by_severity
+from tactile_bayes.findings import Finding, by_severity, finding
 from tactile_bayes.geometry import BoolArray, FloatArray, Plane, apply, inverse, patient_from_plane
 from tactile_bayes.mapping import accumulate, latency, select
 from tactile_bayes.mapping.arrangement import check_arrangement
@@ -35,18 +36,59 @@ from tactile_bayes.scans import HeadShape, Scan
 # --- Frames near the lump, to which the paper fits its plane.
 
 _CELL_MM = 2.0  #: Side of the cells for the search: a few mm are close enough.
+LEAST_RISE = 0.1  #: Of the smoothed map over its median.
 _WIDENING = 1.5  #: Factor by which a radius grows whose frames span no plane.
 
 
-def highest_point_mm(selections: Sequence[SelectedFrames], plane: Plane) -> FloatArray:
-    """(2,) highest point of the smoothed map on `plane`."""
+def _rises(selections: Sequence[SelectedFrames], plane: Plane) -> tuple[CellSums, FloatArray]:
+    """Sums of scans in cells of `_CELL_MM` on `plane`, and their smoothed mean over its median, less 1; NaN for few."""
     sources = accumulate.frame_sources(selections, plane_from_base=plane.plane_from_base, cell_mm=_CELL_MM)
     levels = [source.selection.level_kpa[source.selection.used] for source in sources]
     sums = accumulate.add_all(sources, levels, cell_mm=_CELL_MM).trimmed()
     count, total = smooth(sums.count), smooth(sums.total)
-    mean = np.divide(total, count, out=np.full_like(total, -np.inf), where=count >= FEW_READINGS)
-    row, column = np.unravel_index(int(mean.argmax()), mean.shape)
+    least = min(FEW_READINGS, float(count.max()))
+    mean = np.divide(total, count, out=np.full_like(total, np.nan), where=count >= least)
+    return sums, mean / np.nanmedian(mean) - 1.0
+
+
+def _highest(rises: FloatArray) -> tuple[int, int]:
+    row, column = np.unravel_index(int(np.nanargmax(rises)), rises.shape)
+    return int(row), int(column)
+
+
+def highest_point_mm(selections: Sequence[SelectedFrames], plane: Plane) -> FloatArray:
+    """(2,) highest point of the smoothed map on `plane`."""
+    sums, rises = _rises(selections, plane)
+    row, column = _highest(rises)
     return np.array([sums.x_mm()[column], sums.y_mm()[row]])
+
+
+def moved_between(selections: Sequence[SelectedFrames], plane: Plane) -> tuple[Finding, ...]:
+    """Caution where two scans have their highest rises each where the other has none: one lump would be mapped twice.
+
+    Rises below `LEAST_RISE` say nothing: beside lumps a scan's pattern goes with its strokes.
+    """
+    maps = [_rises([part], plane) for part in selections if part.used.sum() >= select.LEAST_FRAMES]
+    for (one, here), (other, there) in combinations(maps, 2):
+        (row, column), (other_row, other_column) = _highest(here), _highest(there)
+        down, right = np.subtract(one.first, other.first).tolist()  # from indices of the one to those of the other
+        place, other_place = (row + down, column + right), (other_row - down, other_column - right)
+        if not all(map(_inside, (there, here), (place, other_place))):
+            continue
+        rise, other_rise = float(here[row, column]), float(there[other_row, other_column])
+        if min(rise, other_rise) > LEAST_RISE and here[other_place] < rise / 2 and there[place] < other_rise / 2:
+            apart = _CELL_MM * float(np.hypot(place[0] - other_row, place[1] - other_column))
+            text = (
+                f"two scans feel the highest rise {apart:.0f} mm apart, each where the other feels none: patient or "
+                "tracker moved between them, and one lump may be taken for two"
+            )
+            remedy = "build one map per scan, and pool them: estimate --pool"
+            return (finding("frames_contradict", text, remedy, "have each scan mapped by itself"),)
+    return ()
+
+
+def _inside(values: FloatArray, place: tuple[int, int]) -> bool:
+    return all(0 <= i < n for i, n in zip(place, values.shape, strict=True)) and bool(np.isfinite(values[place]))
 
 
 def local_plane(
@@ -202,6 +244,7 @@ def _build(
         radius = None if settings.plane_radius_mm == "auto" else settings.plane_radius_mm
         plane, radius_figures = local_plane(selections, plane, radius_mm=radius)
         figures |= radius_figures
+    findings += moved_between(selections, plane) if len(selections) > 1 else ()
     sources = accumulate.frame_sources(selections, plane_from_base=plane.plane_from_base, cell_mm=settings.cell_mm)
     if settings.register_strokes:
         sources, strokes = latency.register_strokes(sources)

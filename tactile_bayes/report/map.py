@@ -15,6 +15,7 @@ from tactile_bayes.mapping.accumulate import LEAST_SHARE
 from tactile_bayes.mapping.map import FEW_READINGS, Orientation, TactileMap, advise_cell, orientation_of, skewed
 from tactile_bayes.mapping.plausibility import WHY_NOT
 from tactile_bayes.mapping.profile import SPAN_MM
+from tactile_bayes.mapping.select import CONTACT_KPA
 from tactile_bayes.presets import CELL_PER_SIGMA, RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file, load_matplotlib
 
@@ -185,7 +186,9 @@ def _notes(tactile_map: TactileMap) -> Iterator[str]:
 def _advice(quality: Mapping[str, float]) -> Iterator[str]:
     """Advice on the pressure window and on skewed strokes."""
     gated = quality.get("dropped_low", 0.0) + quality.get("dropped_high", 0.0)
-    if gated > _MUCH_GATED * quality.get("frames_total", np.inf):
+    if gated > _MUCH_GATED * quality.get("frames_total", np.inf) and quality["level_p05_kpa"] < CONTACT_KPA:
+        yield "the head was lifted: keep it on the skin"
+    elif gated > _MUCH_GATED * quality.get("frames_total", np.inf):
         ends = f"{quality['level_p05_kpa']:.1f} to {quality['level_p95_kpa']:.1f} kPa"
         high = quality.get("dropped_high", 0.0) / gated
         press = "less hard" if high > _MOSTLY else "harder" if high < 1 - _MOSTLY else "more evenly"

@@ -369,6 +369,19 @@ def test_exchanged_landmarks_are_told_by_the_breast(side):
         assert [text.startswith(told) for text in findings] == [True] * wrong
 
 
+@pytest.mark.parametrize(("moved_mm", "told"), [(0.0, False), (3.0, False), (15.0, True)])
+def test_a_patient_who_moved_between_two_scans_is_told(moved_mm, told):
+    """One lump was mapped as two, and the map called sound."""
+    scan = stroke_scan()
+    place = TrackerPoses(
+        scan.poses.time_s, scan.poses.position_mm + np.array([moved_mm, 0, 0]), scan.poses.quaternion_wxyz
+    )
+    findings = [
+        one for one in build_map([scan, replace(scan, poses=place)]).findings if one.kind == "frames_contradict"
+    ]
+    assert ["the highest rise 15 mm apart" in one.text or "14 mm" in one.text for one in findings] == [True] * told
+
+
 def test_scans_that_do_not_belong_together_are_refused():
     scan = stroke_scan()
     moved = Landmarks(MARKS.sternal_notch_mm + np.array([0, 0, 60.0]), MARKS.xiphoid_mm)

@@ -150,3 +150,7 @@ def test_a_window_that_leaves_much_out_is_told_a_wider_one():
         "press harder next time; a window of 3.3 to 8.7 kPa (--pressure-window-kpa) would keep nine frames in ten"
         in report
     )
+    levels[:180] = 0.5
+    lifted = map_text(build_map(scans.make_scan(centres, levels_kpa=levels)))
+    assert "the head was lifted: keep it on the skin" in lifted
+    assert "would keep nine frames" not in lifted
