@@ -11,7 +11,7 @@ import numpy as np
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, check_number
 from tactile_bayes.findings import Finding, by_severity, finding
-from tactile_bayes.geometry import BoolArray, FloatArray, Plane, apply, inverse, patient_from_plane
+from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, Plane, apply, inverse, patient_from_plane
 from tactile_bayes.mapping import accumulate, latency, select
 from tactile_bayes.mapping.arrangement import check_arrangement
 from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, CellSums, HeadMoments, head_moments
@@ -51,16 +51,21 @@ def _rises(selections: Sequence[SelectedFrames], plane: Plane) -> tuple[CellSums
     return sums, mean / np.nanmedian(mean) - 1.0
 
 
-def _highest(rises: FloatArray) -> tuple[int, int]:
-    row, column = np.unravel_index(int(np.nanargmax(rises)), rises.shape)
-    return int(row), int(column)
+def _highest(sums: CellSums, rises: FloatArray) -> IndexArray:
+    """(2,) row and column on the lattice of the highest rise."""
+    return np.add(sums.first, np.unravel_index(int(np.nanargmax(rises)), rises.shape))
+
+
+def _rise_at(sums: CellSums, rises: FloatArray, cell: IndexArray) -> float:
+    """Rise in a cell of the lattice; NaN off the map."""
+    row, column = (cell - sums.first).tolist()
+    on_map = 0 <= row < rises.shape[0] and 0 <= column < rises.shape[1]
+    return float(rises[row, column]) if on_map else float("nan")
 
 
 def highest_point_mm(selections: Sequence[SelectedFrames], plane: Plane) -> FloatArray:
     """(2,) highest point of the smoothed map on `plane`."""
-    sums, rises = _rises(selections, plane)
-    row, column = _highest(rises)
-    return np.array([sums.x_mm()[column], sums.y_mm()[row]])
+    return np.asarray(_highest(*_rises(selections, plane))[::-1] * _CELL_MM)
 
 
 def moved_between(selections: Sequence[SelectedFrames], plane: Plane) -> tuple[Finding, ...]:
@@ -69,15 +74,12 @@ def moved_between(selections: Sequence[SelectedFrames], plane: Plane) -> tuple[F
     Rises below `LEAST_RISE` say nothing: beside lumps a scan's pattern goes with its strokes.
     """
     maps = [_rises([part], plane) for part in selections if part.used.sum() >= select.LEAST_FRAMES]
-    for (one, here), (other, there) in combinations(maps, 2):
-        (row, column), (other_row, other_column) = _highest(here), _highest(there)
-        down, right = np.subtract(one.first, other.first).tolist()  # from indices of the one to those of the other
-        place, other_place = (row + down, column + right), (other_row - down, other_column - right)
-        if not all(map(_inside, (there, here), (place, other_place))):
-            continue
-        rise, other_rise = float(here[row, column]), float(there[other_row, other_column])
-        if min(rise, other_rise) > LEAST_RISE and here[other_place] < rise / 2 and there[place] < other_rise / 2:
-            apart = _CELL_MM * float(np.hypot(place[0] - other_row, place[1] - other_column))
+    for one, other in combinations(maps, 2):
+        cell, other_cell = _highest(*one), _highest(*other)
+        rise, other_rise = _rise_at(*one, cell), _rise_at(*other, other_cell)
+        alone = _rise_at(*other, cell) < other_rise / 2 and _rise_at(*one, other_cell) < rise / 2
+        if alone and min(rise, other_rise) > LEAST_RISE:
+            apart = _CELL_MM * float(np.linalg.norm(cell - other_cell))
             text = (
                 f"two scans feel the highest rise {apart:.0f} mm apart, each where the other feels none: patient or "
                 "tracker moved between them, and one lump may be taken for two"
@@ -85,10 +87,6 @@ def moved_between(selections: Sequence[SelectedFrames], plane: Plane) -> tuple[F
             remedy = "build one map per scan, and pool them: estimate --pool"
             return (finding("frames_contradict", text, remedy, "have each scan mapped by itself"),)
     return ()
-
-
-def _inside(values: FloatArray, place: tuple[int, int]) -> bool:
-    return all(0 <= i < n for i, n in zip(place, values.shape, strict=True)) and bool(np.isfinite(values[place]))
 
 
 def local_plane(
