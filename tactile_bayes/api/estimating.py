@@ -137,10 +137,9 @@ def estimate_one(
     if estimate.code in NO_LUMP and tactile_map.covered.any():
         fat_mm = None if calibration is None else calibration.fat_mm
         smallest = smallest_lumps(tactile_map, fat_mm=fat_mm)
-        if (hidden := shows_no_lump(smallest)) is not None:
-            estimate = replace(estimate, **as_dict(hidden), weighed=None)
-        else:
-            estimate = replace(estimate, smallest=smallest)
+        hidden = shows_no_lump(smallest)
+        fields = {"smallest": smallest} if hidden is None else as_dict(hidden) | {"weighed": None}
+        estimate = replace(estimate, **fields)
     posterior = estimate.map_posterior
     applied = None if posterior is None or calibration is None else calibration.at_depth_or_fallback(*posterior.medians)
     if posterior is not None and applied is not None and estimate.size is not None:

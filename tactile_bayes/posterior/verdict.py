@@ -165,10 +165,9 @@ def shows_no_lump(smallest: SmallestLumps) -> Abstention | None:
     """Reason why a map excludes no lump, where its errors hide the largest one at every place and depth; else None."""
     if np.isfinite(smallest.d_mm).any():
         return None
-    largest = (
-        f"not even one of {largest_tried_mm(float(smallest.depths_mm.max())):g} mm would rise above the map's errors"
-    )
-    return cannot_show(largest, MORE_LINES, MORE_LINES_ON_PAPER)
+    largest_mm = largest_tried_mm(float(smallest.depths_mm.max()))
+    why = f"not even one of {largest_mm:g} mm would rise above the map's errors"
+    return cannot_show(why, MORE_LINES, MORE_LINES_ON_PAPER)
 
 
 def chance_text(probability: float, digits: int = 2) -> str:

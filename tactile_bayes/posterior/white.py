@@ -109,7 +109,9 @@ WIDEST_IN_RADII = 0.75
 MOST_AXIS_RATIO = 4.0
 CLOSE_IN_RADII = 0.6  #: Radius of a small window, over the usual one: 12 mm hold less of a rib 16 mm away.
 PATIENCE = 16  #: Iterations: a clear lump takes 4 to 15.
-OUTGROWN, AT_RIM, FEW_CELLS = "wider than the window measures", "at the rim of the map", "too few covered cells"
+OUTGROWN = "wider than the window measures"
+AT_RIM = "at the rim of the map"
+FEW_CELLS = "too few covered cells"
 FIT_TOLERANCE = 1e-8
 """Tolerance of the least squares, in units of `Bump.step_scale`: far below any error that a map has."""
 PLACE_TOLERANCE = 1e-2  #: The same where least squares only gives a start for the posterior's mode.

@@ -219,15 +219,10 @@ def _pooled(one: PooledRow, tradeoff: Tradeoff) -> list[str]:
     return [line, half]
 
 
-def _is_model_map(answer: SizeAnswer) -> bool:
-    """True if an answer is of a forward model's map, which has no errors."""
-    return AMPLITUDE in answer.quantities
-
-
 def _exact_maps(tradeoff: Tradeoff) -> Iterator[str]:
     """Table of a forward model's maps, which have no errors: bump, and signed deviation from the reference."""
     best = tradeoff.reference.answer
-    if best is None or not _is_model_map(best):
+    if best is None or AMPLITUDE not in best.quantities:
         return
     columns = ((ELEMENT, 6, 2), (AMPLITUDE, 7, 4), (WIDTHS[0], 7, 3), (WIDTHS[1], 7, 3))
     yield from ("", f"{'the map':<25}{'mesh':>6}{'a':>7}{'sig. x':>7}{'sig. y':>7}   off, %")
@@ -244,7 +239,7 @@ def _exact_maps(tradeoff: Tradeoff) -> Iterator[str]:
 
 def _notes(tradeoff: Tradeoff) -> Iterator[str]:
     reference, interval, error = tradeoff.reference, "of this exam", ""
-    if reference.answer is not None and _is_model_map(reference.answer):
+    if reference.answer is not None and AMPLITUDE in reference.answer.quantities:
         interval = "what the calibration leaves"
     elif reference.answer is not None:
         error = f"its own Monte-Carlo error is {reference.mc_error_mm:.2g} mm, "
