@@ -14,7 +14,6 @@ from contextlib import ExitStack, suppress
 from dataclasses import KW_ONLY, dataclass
 from datetime import date
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import click
@@ -94,9 +93,8 @@ def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration | 
         head = like.head
     else:
         raise UsageError("the head's geometry is missing; give --head-geometry HEAD.json or --like SCAN.mcap")
-    calibration: ElementCalibration | None = None
     if request.uncalibrated:
-        pass
+        calibration: ElementCalibration | None = None
     elif request.array_calibration:
         calibration = read_array_calibration(request.array_calibration).calibration
     elif like is not None:
@@ -173,19 +171,21 @@ class Keys:
         self._terminal = sys.stdin.isatty()
         self.waiting, self._printed_landmarks = self.wait and self._terminal, 0
 
-    def __enter__(self) -> Keys:
-        if self._terminal:
-            self._settings = termios.tcgetattr(sys.stdin)
+    @contextlib.contextmanager
+    def listening(self) -> Iterator[None]:
+        """Take keys one by one; starts the recording, or the tracker alone where space starts it."""
+        settings = termios.tcgetattr(sys.stdin) if self._terminal else None
+        if settings:
             tty.setcbreak(sys.stdin)
-        if self.waiting:
-            self._say(RECORDING_KEYS)
-            self.recorder.listen()
-        return self
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        if self._terminal:
-            with contextlib.suppress(termios.error):  # the terminal was closed
-                termios.tcsetattr(sys.stdin, termios.TCSADRAIN, self._settings)
+        try:
+            if self.waiting:
+                self._say(RECORDING_KEYS)
+            (self.recorder.listen if self.waiting else self.recorder.start)()
+            yield
+        finally:
+            with suppress(termios.error):  # the terminal was closed
+                if settings:
+                    termios.tcsetattr(sys.stdin, termios.TCSADRAIN, settings)
 
     def poll(self) -> None:
         """Act on the keys pressed since the last call, and report landmarks."""
@@ -195,7 +195,7 @@ class Keys:
         if not self._terminal or not select.select([sys.stdin], [], [], 0)[0]:
             return
         keys = b""
-        with contextlib.suppress(OSError):  # a closed terminal is at its end, or fails
+        with suppress(OSError):  # a closed terminal is at its end, or fails
             keys = os.read(sys.stdin.fileno(), 64)
         if not keys:
             self.recorder.stop("a closed terminal")
@@ -397,15 +397,14 @@ def calibration_for(hello: HelloReading, given: ElementCalibration | None, reque
 
 def _run(recorder: Recorder, signals: list[str], head: HeadGeometry, request: Request) -> RecordingReport:
     wait, drawn = request.duration_s is None and not request.at_once, request.live and can_redraw()
-    with Keys(recorder, head.scanhead_from_tracker, wait=wait, drawn=drawn) as keys:
-        if not keys.waiting:
-            recorder.start()
+    keys = Keys(recorder, head.scanhead_from_tracker, wait=wait, drawn=drawn)
 
-        def poll() -> None:
-            keys.poll()
-            if signals:
-                recorder.stop(signals[-1])
+    def poll() -> None:
+        keys.poll()
+        if signals:
+            recorder.stop(signals[-1])
 
+    with keys.listening():
         return recorder.run(poll)
 
 

@@ -69,6 +69,16 @@ last reach it, and all of 32 that breathe."""
 _LEAST_SWAY_GAINS: Final = {1: 0.04, 2: 0.1}
 """Least gain after one and two steps, or no more are made: 25 scans of breathing bodies that reach `LEAST_SWAY_GAIN`
 have at least 0.067 and 0.14 by then."""
+_BREATHED: Final = (
+    "the body moved to and fro during the scan, as breathing moves it; size and place may be wrong",
+    "record with a reference tool on the body (--reference), or have the breath held",
+    "have the scan taken again with the breath held",
+)
+_DRIFTED: Final = (
+    "the body moved or the tracker drifted during the scan; size and place may be wrong",
+    "let the tracker warm up and keep metal away, have the breath held, or record with a reference tool (--reference)",
+    "have the scan taken again with the tracker warmed up and the breath held",
+)
 _SWAY_PARAMETERS: Final = 5  #: A rate, and cosine and sine along two axes.
 _LEAST_OTHERS: Final = 2  #: Fewest readings of other times that predict one.
 NOTHING_SHOWN: Final = "too little stands out to show that array, lever arm and quaternions are as stated"
@@ -240,21 +250,8 @@ class ArrangementCheck(Record, eq=False):
                 f"map it with --latency-ms {self.stated_latency_ms + self.best.late_ms:.0f}",
                 "have the scan mapped again with the tracker's delay",
             )
-        if self.best.sway_mm and self.best.slow:
-            return words, finding(
-                "frames_contradict",
-                "the body moved or the tracker drifted during the scan; size and place may be wrong",
-                "let the tracker warm up and keep metal away from it, have the breath held, or record with a reference "
-                "tool on the body (--reference)",
-                "have the scan taken again with the tracker warmed up and the breath held",
-            )
         if self.best.sway_mm:
-            return words, finding(
-                "frames_contradict",
-                "the body moved to and fro during the scan, as breathing moves it; size and place may be wrong",
-                "record with a reference tool on the body (--reference), or have the breath held",
-                "have the scan taken again with the breath held",
-            )
+            return words, finding("frames_contradict", *(_DRIFTED if self.best.slow else _BREATHED))
         return words, finding(
             "wrong_arrangement",
             "the sensor array or the tracker seems not to be mounted as stated; size and place may be wrong",
