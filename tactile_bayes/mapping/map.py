@@ -225,21 +225,18 @@ def broken_assumptions(quality: Mapping[str, float], *, strokes_lengthwise: int 
             "moved by 7 %)"
         )
         yield finding("curved_skin", text)
-    strokes, remedy = (
-        quality.get("stroke_count", LEAST_STROKES),
-        f"scan with {LEAST_STROKES} strokes or more, side by side",
-    )
-    if strokes < min(LEAST_STROKES, strokes_lengthwise):
-        text = f"the {strokes_lengthwise} strokes run along the head, and sizes were learned from strokes across it"
-        remedy = "scan with the head's long side square to the strokes"
-        yield finding("few_strokes", text, remedy, remedy)
-    elif strokes < LEAST_STROKES:
-        total, used = quality.get("frames_total", 0.0), quality.get("frames_used", 0.0)
-        whose = f"the {used:.0f} frames used make" if used < MOST_USED * total else "the scan has"
+    strokes = quality.get("stroke_count", LEAST_STROKES)
+    if strokes < LEAST_STROKES:
+        few_used = quality.get("frames_used", 0.0) < MOST_USED * quality.get("frames_total", 0.0)
+        whose = f"the {quality['frames_used']:.0f} frames used make" if few_used else "the scan has"
         text = (
             f"{whose} {strokes:.0f} stroke{'' if strokes == 1 else 's'} only, and sizes were learned from 4 to 7 "
             "(simulated ones from 3 came out 6 % large)"
         )
+        remedy = f"scan with {LEAST_STROKES} strokes or more, side by side"
+        if strokes_lengthwise > strokes:
+            text = f"the {strokes_lengthwise} strokes run along the head, and sizes were learned from strokes across it"
+            remedy = "scan with the head's long side square to the strokes"
         yield finding("few_strokes", text, remedy, remedy)
 
 
