@@ -25,7 +25,7 @@ from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.scan_text import is_identity, read_frames, read_poses, visible_poses
 from tactile_bayes.files.sequence_mha import is_sequence, read_sequence
 from tactile_bayes.geometry import FloatArray, check_rigid
-from tactile_bayes.mapping.select import unit_question
+from tactile_bayes.mapping.select import LEAST_FRAMES, unit_question
 from tactile_bayes.presets import KPA_PER_UNIT, MM_PER_UNIT, PRESSURE_RANGE_KPA, PRESSURE_WINDOW_KPA
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
@@ -38,9 +38,7 @@ _MOST_NAMES: Final = 12  # of a file's arrays in an error
 _TURN: Final = 2 * np.pi
 _NOT_RIGID: Final = 1e-3  # of matrices that were written with few digits
 _LEVER_MM: Final = (1.0, 1000.0)  #: From the tracker's sensor to the head, where they are two things.
-_OTHER_ORDER: Final = (
-    0.8  #: Squared difference of neighbours in another order over that as stated: right scans have 1.0.
-)
+_OTHER_ORDER: Final = 0.8  #: Roughness in another order over that as stated; right scans have 1.0 or more.
 _LOOKED_AT: Final = 500  # frames
 _TIME_OPTIONS: Final = {"frame_time_s": ("time-unit", "rate-hz"), "pose_time_s": ("pose-time-unit", "pose-rate-hz")}
 _CALIBRATION: Final = ("gain_kpa_per_count", "offset_kpa")
@@ -332,6 +330,8 @@ def _check_order(counts: np.ndarray, stated: Stated, notes: list[str]) -> None:
     if means.max() <= 0:
         return
     pressed = np.flatnonzero(2 * means > means.max())
+    if len(pressed) < LEAST_FRAMES:  # the noise of few frames has an order by chance
+        return
     frames = counts[pressed[:: max(1, len(pressed) // _LOOKED_AT)]].astype(np.float64)
     frames /= frames.mean(axis=(1, 2), keepdims=True)
     frames -= frames.mean(axis=0)
