@@ -111,13 +111,13 @@ def default_of(record: Any, name: str) -> Any:
 
 def value_type(kind: Any) -> Any:
     """The bare type of a kind: without None, range and meaning."""
-    members = [one for one in _members(kind) if one is not type(None)]
+    members = [member for member in _members(kind) if member is not type(None)]
     return _bare(members[0] if len(members) == 1 else kind)
 
 
 def range_of(kind: Any) -> tuple[Any, Any, tuple[str, ...]]:
     """Least and largest value, None for no end, and the open ends, of "min" and "max"."""
-    rules = _rules(next(one for one in _members(kind) if one is not type(None)))
+    rules = _rules(next(member for member in _members(kind) if member is not type(None)))
     ends = tuple(end for end, rule in (("min", "gt"), ("max", "lt")) if rule in rules)
     return rules.get("gt", rules.get("ge")), rules.get("lt", rules.get("le")), ends
 
@@ -352,10 +352,10 @@ def _record_for(kind: Any, value: Any) -> Any:
     records = [one for one in map(_bare, _members(kind)) if _is_record(one)]
     if len(records) == 1:
         return records[0]
-    for one in records:
-        config = one.__struct_config__
+    for record in records:
+        config = record.__struct_config__
         if isinstance(value, dict) and config.tag_field and value.get(config.tag_field) == config.tag:
-            return one
+            return record
     return None
 
 
@@ -379,7 +379,7 @@ def _is_array(kind: Any) -> bool:
 
 def _way_out(kind: Any, value: Any) -> str:
     """The advice on a refused value, such as "give a number above 0"."""
-    members = [one for one in _members(kind) if one not in (type(None), UnsetType)]
+    members = [member for member in _members(kind) if member not in (type(None), UnsetType)]
     forms = [one for one in map(_bare, members) if _is_record(one)]
     if len(forms) > 1 and isinstance(value, dict):  # no form of that name
         names = ", ".join(str(one.__struct_config__.tag) for one in forms)

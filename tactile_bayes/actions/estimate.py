@@ -47,9 +47,9 @@ def _pool(
         for failure in failures:
             click.echo(failure.text, err=True)
         return failures[0].exit_code
-    exams = [one for one in answers if isinstance(one, Answer)]
+    exams = [answer for answer in answers if isinstance(answer, Answer)]
     if settings.centre_mm is None:
-        for i, place in maps_of_another_mass([one.report for one in exams]).items():
+        for i, place in maps_of_another_mass([exam.report for exam in exams]).items():
             exams[i] = estimate_file(maps[i], replace(settings, centre_mm=place)).answer
     result = pool_answers(exams, settings, names=[str(path) for path in maps], files=maps)
     report = result.pooled_report.checked()
@@ -108,7 +108,7 @@ def estimate_action(
         try:
             answers = _many_maps(maps, settings, workers=workers, scheduler=scheduler)
         except BatchInterrupted as interrupt:
-            done = {one.key for one in interrupt.outcomes}
+            done = {outcome.key for outcome in interrupt.outcomes}
             finished = [path for path in maps if str(path) in done]
             _print(finished, _answers(interrupt.outcomes), as_json=as_json, verbose=verbose, listed=True)
             raise
@@ -124,7 +124,7 @@ def estimate_action(
         _print(maps, answers, as_json=as_json, verbose=verbose, listed=len(maps) > 1)
         if verbose:
             click.echo(f"estimate: {elapsed_s:.3f} s", err=True)
-    failures = [one.exit_code for one in answers if isinstance(one, Failure)]
+    failures = [answer.exit_code for answer in answers if isinstance(answer, Failure)]
     return failures[0] if failures else max(one.exit_code for one in answers)
 
 
@@ -140,7 +140,7 @@ def _many_maps(maps: tuple[Path, ...], settings: Settings, *, workers: int, sche
 def _answers(outcomes: Sequence[Outcome[Answer | Failure]]) -> Answers:
     """Answers for all maps; maps with the same error of the batch are named together in the first's answer."""
     lines = dict(zip(dict.fromkeys(one.error for one in outcomes if not one.ok), fault_lines(outcomes), strict=True))
-    faults = (lines.pop(one.error, "") if not one.ok else "" for one in outcomes)
+    faults = (lines.pop(outcome.error, "") if not outcome.ok else "" for outcome in outcomes)
     return [
         one.value if one.value is not None else Failure(f"error: {fault}" if fault else "", EXIT_FAULT)
         for one, fault in zip(outcomes, faults, strict=True)

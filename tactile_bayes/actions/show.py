@@ -54,7 +54,7 @@ def _value_text(value: Any) -> str:
         return f"{value:.6g}"
     if isinstance(value, list | tuple):
         leaves = list(_leaves(list(value)))
-        if len(leaves) > _MOST_NUMBERS and all(isinstance(one, int | float) for one in leaves):
+        if len(leaves) > _MOST_NUMBERS and all(isinstance(leaf, int | float) for leaf in leaves):
             return f"{len(leaves)} numbers, {min(leaves):.6g} to {max(leaves):.6g}"
         return ", ".join(_value_text(item) for item in value) if value else "none"
     if isinstance(value, dict):

@@ -291,7 +291,7 @@ def compare_model_action(
     measured = measured_frames(loaded, place_mm=at, **options)
     comparisons = []
     for fidelity in dict.fromkeys(fidelities or (body.fidelity,)):
-        warnings = [outside_range(one.d_mm, one.depth_ratio) for one in body.solid_lumps if fidelity == "empirical"]
+        warnings = [outside_range(lump.d_mm, lump.depth_ratio) for lump in body.solid_lumps if fidelity == "empirical"]
         for warning in filter(None, warnings):
             click.echo(warning, err=True)
         with progress_bar(f"frames, {fidelity}") as progress:

@@ -90,7 +90,7 @@ def takes(
 
     def decorate(function: Callable[_Given, _Returned]) -> Callable[_Given, _Returned]:
         parameters = [one for one in inspect.signature(function).parameters.values() if one.kind is not one.VAR_KEYWORD]
-        names, call = [*(one.name for one in parameters), *fields], door(function, renamed)
+        names, call = [*(parameter.name for parameter in parameters), *fields], door(function, renamed)
 
         @wraps(function)
         def called(*args: _Given.args, **keywords: _Given.kwargs) -> _Returned:

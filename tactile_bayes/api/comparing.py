@@ -217,7 +217,7 @@ def compare_answers(
         if one.kind != "outside_calibration"  # of a size alone: judged anew
     )
     compared = replace(compared, findings=by_severity((*compared.findings, *of_visits)))
-    scans = [scan for one in visits for scan in _scans(one)]
+    scans = [scan for visit in visits for scan in _scans(visit)]
     recorded = {name: value for name, value in settings.recorded().items() if name in _RECORDED}
     provenance = Provenance("compare", recorded | as_dict(comparing), digests, seed=settings.seed, scans=scans)
     report = compare_report(
@@ -248,7 +248,7 @@ def _compared(
     """Compare the visits, unless codes, places or missing lumps forbid it."""
     shown = [[answer for answer in maps if answer.shape is not None] for maps in visits]
     missing = [words for number, maps in enumerate(visits, start=1) if (words := _missing(maps, f"visit {number}"))]
-    contradicted = contradictions([_scans(one) for one in visits])
+    contradicted = contradictions([_scans(visit) for visit in visits])
     if contradicted:
         advice = "compare exams of one mass; where a code is wrong, correct it in the scans' session and map them again"
         return VisitComparison("not_one_mass", "; ".join(contradicted), advice)
@@ -257,7 +257,7 @@ def _compared(
     if why := without_calibration([one.report for maps in visits for one in maps]):
         return VisitComparison("no_estimate", why, "compare maps that have a size each")
     map_places = [[place for answer in maps if (place := patient_place(answer.report)) is not None] for maps in shown]
-    places = [PatientPlace.mean_of(one) for one in map_places]
+    places = [PatientPlace.mean_of(map_place) for map_place in map_places]
     shifts = tuple(
         None if first is None or later is None else place_shift(first, later, registration_mm=comparing.registration_mm)
         for first, later in ((places[0], later) for later in places[1:])
@@ -356,7 +356,7 @@ def _by_visit(
 
 
 def _scans(answers: Sequence[Answer]) -> list[Mapping[str, str]]:
-    return [scan for one in answers for scan in scans_of(one.report.provenance)]
+    return [scan for answer in answers for scan in scans_of(answer.report.provenance)]
 
 
 _RECORDED = ("size_calibration", "method", "interval", "scene", "between_map_sd", "repeatability")

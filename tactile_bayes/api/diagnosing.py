@@ -45,7 +45,7 @@ class Diagnosis(TextResult, eq=False):
             "chains": self.chains,
             "quantities": self.quantities,
             "research_use": RESEARCH_USE,
-            "findings": [as_dict(one) for one in self.posterior.findings],
+            "findings": [as_dict(finding) for finding in self.posterior.findings],
         }
 
     @property
@@ -86,7 +86,7 @@ class Diagnosis(TextResult, eq=False):
         return _FIGURES[kind](self.posterior.draws, path_of(path), title=title, force=force)
 
     def __repr__(self) -> str:
-        worst = max((one.get("rhat", np.nan) for one in self.quantities.values()), default=np.nan)
+        worst = max((quantity.get("rhat", np.nan) for quantity in self.quantities.values()), default=np.nan)
         chains = f"{self.chains} chains, R-hat up to {worst:.3f}" if self.chains > 1 else "1 chain"
         return f"<Diagnosis of {self.path.name}: method {self.posterior.method}, {chains}>"
 

@@ -60,7 +60,7 @@ def _properties(known: Any) -> tuple[tuple[str, float], ...]:
     if (
         isinstance(pairs, str)
         or not isinstance(pairs, Sequence)
-        or not all(isinstance(one, Sequence) and len(one) == 2 for one in pairs)
+        or not all(isinstance(pair, Sequence) and len(pair) == 2 for pair in pairs)
     ):
         raise UsageError(f'known is {known!r}; give a mapping such as {{"seat": 1.2}}')
     for name, value in pairs:
@@ -271,7 +271,7 @@ def exam_report(
     if not sources:
         raise UsageError("nothing was given to report; give maps, or an estimate")
     exam: ShownExam
-    if all(isinstance(one, str | Path) for one in sources):
+    if all(isinstance(source, str | Path) for source in sources):
         exam = exam_from_files([path_of(one) for one in sources], lambda: settings_of(settings), typed=settings)
     elif len(sources) == 1 and isinstance(sources[0], PooledSize):
         exam = sources[0].exam()
@@ -357,7 +357,7 @@ def export(
     if sources:
         named = [(Path(f"item {i}"), source) for i, source in enumerate(sources, start=1)]  # for error messages
         records = [_export_records(source, name) for name, source in named]
-        if to == "dicom" and not any(isinstance(one, MapFile) for one in records):  # a report refers to its maps
+        if to == "dicom" and not any(isinstance(record, MapFile) for record in records):  # a report refers to its maps
             records = [
                 *(_map_file(one, name, digest) for name, source in named for one, digest in _maps_of(source)),
                 *records,

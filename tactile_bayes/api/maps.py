@@ -182,10 +182,10 @@ def build_map(
         When an option is out of range, or a recording is given twice.
     """
     sources = [scans] if isinstance(scans, str | Path) or not isinstance(scans, Sequence) else list(scans)
-    loaded = [as_scan(one) for one in sources]
+    loaded = [as_scan(source) for source in sources]
     digests = (sha256(path_of(one)) if isinstance(one, str | Path) else "" for one in sources)
     facts = [scan_facts(scan, digest) for scan, digest in zip(loaded, digests, strict=True)]
-    for later, earlier in repeated_scans([[one] for one in facts]).items():
+    for later, earlier in repeated_scans([[fact] for fact in facts]).items():
         raise UsageError(
             f"scan {later + 1} is the recording of scan {earlier + 1}, whose frames would count twice; give it once"
         )
@@ -322,7 +322,7 @@ def map_of(given: Any, **stated: Any) -> Map:
     marks = stated.get("no_value", ())
     marks = [marks] if isinstance(marks, str) or not isinstance(marks, Iterable) else marks
     keywords = {name: plain(value) for name, value in stated.items()}
-    keywords["no_value"] = tuple(one if isinstance(one, str) else repr(plain(one)) for one in marks)
+    keywords["no_value"] = tuple(mark if isinstance(mark, str) else repr(plain(mark)) for mark in marks)
     options = GridOptions(**keywords)
     if path is not None:
         return Map(import_grid(path, options)[0])

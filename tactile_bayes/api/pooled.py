@@ -57,7 +57,7 @@ def pool_estimates(
 
 def refuse_repeated_maps(estimates: Sequence[SizeEstimate], *, way_out: str = "give each map once") -> None:
     """Refuse a map that is given twice: its readings would count twice, and the interval would be too narrow."""
-    if len({one.tactile_map.fingerprint for one in estimates}) < len(estimates):
+    if len({estimate.tactile_map.fingerprint for estimate in estimates}) < len(estimates):
         raise UsageError(f"a map is given twice; {way_out}")
 
 

@@ -169,7 +169,7 @@ def _read_repeat(exam: ExamFolder) -> _Repeat | str:
 def _calibration(repeats: Sequence[_Repeat], named: str | None) -> tuple[BodyCalibration, size_json.UsedCalibration]:
     """The one calibration that sized all exams: of this name or path, else of its own name, else a shipped one."""
     name, digest = repeats[0].calibration, repeats[0].calibration_sha256
-    digests = list(dict.fromkeys(one.calibration_sha256 for one in repeats))
+    digests = list(dict.fromkeys(repeat.calibration_sha256 for repeat in repeats))
     if len(digests) > 1:
         another = next(one for one in repeats if one.calibration_sha256 == digests[1])
         examples = ", ".join(f"{one.exam.name} by {one.calibration}" for one in (repeats[0], another))

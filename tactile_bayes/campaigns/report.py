@@ -83,7 +83,7 @@ class ExamRow(Record, eq=False):
             smallest_mm=None if smallest is None else smallest.median,
             detected_probability=report.detected_probability,
             centre_mm=centre_of(report.centre_mm),
-            masses=tuple((one.centre_mm, one.reported) for one in report.masses),
+            masses=tuple((mass.centre_mm, mass.reported) for mass in report.masses),
             findings=report.findings,
             **facts,
         )
@@ -199,10 +199,10 @@ def trial_lines(
         _trial_reading(_pooled_row(campaign, some, pooled.get(name)), POOLED_MODALITY) for name, some in visits.items()
     ]
     count: Counter[tuple[object, ...]] = Counter()
-    for one in readings:
-        key = (one["patient"], one["mass"], one["modality"])
+    for reading in readings:
+        key = (reading["patient"], reading["mass"], reading["modality"])
         count[key] += 1
-        one["replicate"] = count[key]
+        reading["replicate"] = count[key]
     return readings
 
 

@@ -284,7 +284,7 @@ class Campaign:
         """The exams except those whose mass is placed on a map that could not be made; these fail."""
         lost = [exam for exam in mapped if self._breasts.exams_with_places(exam) and not self._exams_with_places(exam)]
         for exam in lost:
-            named = ", ".join(one.name for one in self._breasts.exams_with_places(exam) if one.mass == exam.mass)
+            named = ", ".join(place.name for place in self._breasts.exams_with_places(exam) if place.mass == exam.mass)
             reason = f"the place of its mass is on the map of {named}, which was not made"
             self.faults[exam.name] = Fault("estimate", reason)
         return [exam for exam in mapped if exam not in lost]

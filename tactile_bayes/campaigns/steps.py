@@ -273,9 +273,9 @@ def _estimate_exam(folder: Path, settings: Settings, match: Match | None, side: 
     else:
         sized = estimate_matched(path, settings, match)
         tactile_maps = (sized.tactile_map, *(map_of_exam(path, one) for one in match.named))
-        findings += [OWN_AXES] if any(one.patient_from_plane is None for one in tactile_maps) else []
+        findings += [OWN_AXES] if any(tactile_map.patient_from_plane is None for tactile_map in tactile_maps) else []
     if side:
-        lump = next(((one.x_mm, one.y_mm) for one in sized.estimate.masses if one.reported), None)
+        lump = next(((mass.x_mm, mass.y_mm) for mass in sized.estimate.masses if mass.reported), None)
         place = patient_mm(sized.tactile_map, *(lump or (0.0, 0.0)))  # the plane's origin is the middle of the frames
         findings += side_findings(side, place, "the lump" if lump else "the scanned place", in_table=True)
     if not findings:
@@ -334,7 +334,7 @@ def make_growth(
     """
     answers = [[_answer(folder / name) for name in names] for names in visits]
     with_draws = [one for maps in answers for one in maps if one.shape is not None]
-    placed = all(one.report.centre_patient_mm is not None for one in with_draws)
+    placed = all(draw.report.centre_patient_mm is not None for draw in with_draws)
     files = [[folder / name / layout.MAP for name in names] for names in visits]
     dates = [date.fromisoformat(day) for day in course.dates if day]
     days = tuple(float((day - dates[0]).days) for day in dates) if len(dates) == len(visits) else None
@@ -446,7 +446,7 @@ def _with_sizes(report: EstimateReport, size: SizePosterior, settings: Settings)
     return replace(
         report,
         **replaced,
-        masses=tuple(replace(one, **replaced) if one.reported else one for one in report.masses),
+        masses=tuple(replace(mass, **replaced) if mass.reported else mass for mass in report.masses),
         variance_share=rounded(dict(size.variance_share)),
         diagnostics=diagnostics,
         provenance=provenance,

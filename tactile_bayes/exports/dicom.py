@@ -166,7 +166,7 @@ def map_picture(source: exam.MapFile, estimate: exam.EstimateFile | None) -> NDA
     """
     report = None if estimate is None or estimate.kind != "estimate" else estimate.report
     alone = replace(report, masses=()) if isinstance(report, EstimateReport) else None
-    unsized = [] if estimate is None or estimate.sized else [one.reason for one in estimate.masses]
+    unsized = [] if estimate is None or estimate.sized else [mass.reason for mass in estimate.masses]
     side = source.facts.get("side")
     with plain_matplotlib() as library:
         figure = map_figure(
@@ -315,7 +315,7 @@ def _shared_groups(source: exam.MapFile, values: FloatArray, directions: FloatAr
     highdicom = exam.import_extra("highdicom")
     cell = source.tactile_map.recipe.cell_mm
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    turn = [_decimal(0.0 if abs(one) < 1e-12 else one) for one in directions.ravel()]
+    turn = [_decimal(0.0 if abs(direction) < 1e-12 else direction) for direction in directions.ravel()]
     window = {"WindowCenter": _decimal((low + high) / 2), "WindowWidth": _decimal(max(high - low, 1e-6))}
     groups = item(
         PixelMeasuresSequence=highdicom.PixelMeasuresSequence((cell, cell), cell),
@@ -386,7 +386,7 @@ def structured_report(
     report = sr.MeasurementReport(
         observation_context=sr.ObservationContext(observer_device_context=observer),
         procedure_reported=coded(exam.EXAM),
-        imaging_measurements=[_group(estimate, one, maps, evidence) for one in estimate.masses],
+        imaging_measurements=[_group(estimate, mass, maps, evidence) for mass in estimate.masses],
         title=coded(exam.REPORT_TITLE),
     )
     digests = [f"SHA-256 of the estimate: {estimate.digest}", *(f"SHA-256 of a map: {one}" for one in estimate.maps)]
@@ -462,7 +462,7 @@ def _measurements(finding: exam.ExportedMass, evidence: Sequence[Any]) -> Iterat
     """Sizes and certainty, with references to the maps' values, or to their pictures where no values are exported."""
     sr = exam.import_extra("highdicom").sr
     values = [one for one in evidence if one.SOPClassUID == PARAMETRIC_MAP]
-    images = [sr.SourceImageForMeasurement(one.SOPClassUID, one.SOPInstanceUID) for one in values or evidence]
+    images = [sr.SourceImageForMeasurement(value.SOPClassUID, value.SOPInstanceUID) for value in values or evidence]
     for name, size in ((exam.LONG_AXIS, finding.largest), (exam.SHORT_AXIS, finding.smallest)):
         if size is not None:
             yield _sized(name, size, images)

@@ -178,7 +178,7 @@ class EstimateFile(Record, eq=False):
     @property
     def sized(self) -> bool:
         """True if any mass has a size."""
-        return any(one.largest is not None for one in self.masses)
+        return any(mass.largest is not None for mass in self.masses)
 
     @property
     def verdict_line(self) -> str:
@@ -234,7 +234,7 @@ def read_exam(path: Path) -> MapFile | list[EstimateFile]:
 
 def shared_facts(scans: Iterable[Mapping[str, str]]) -> dict[str, str]:
     """Facts of the exam on which all scans agree."""
-    facts_by_scan = [{(name, one[name]) for name in EXAM_FACTS if name in one} for one in scans]
+    facts_by_scan = [{(name, scan[name]) for name in EXAM_FACTS if name in scan} for scan in scans]
     shared = dict(set.intersection(*facts_by_scan)) if facts_by_scan else {}
     return {name: shared[name] for name in EXAM_FACTS if name in shared}
 

@@ -38,10 +38,10 @@ def bundle_json(estimate: exam.EstimateFile, identity: exam.Identity) -> str:
 def bundle_of(estimate: exam.EstimateFile, identity: exam.Identity) -> dict[str, Any]:
     """The Bundle as plain data: patient (if any is named), device, observations, report."""
     parts = _Resources(estimate, identity)
-    observations = [one for finding in estimate.masses for one in parts.observations(finding)]
+    observations = [observation for finding in estimate.masses for observation in parts.observations(finding)]
     patient = [parts.patient()] if parts.patient_url else []
     resources = [*patient, parts.device(), *observations, parts.report(observations)]
-    entries = [{"fullUrl": f"urn:uuid:{one['id']}", "resource": one} for one in resources]
+    entries = [{"fullUrl": f"urn:uuid:{resource['id']}", "resource": resource} for resource in resources]
     identifier = {"system": "urn:ietf:rfc:3986", "value": parts.url("bundle")}
     head = {"resourceType": "Bundle", "id": parts.id("bundle"), "identifier": identifier, "type": "collection"}
     return {**head, "entry": entries}
@@ -144,9 +144,9 @@ class _Resources:
             **({"basedOn": [order]} if number else {}),
             **self._common(),
             "code": _concept(exam.EXAM),
-            "result": [{"reference": f"urn:uuid:{one['id']}"} for one in observations],
+            "result": [{"reference": f"urn:uuid:{observation['id']}"} for observation in observations],
             "conclusion": " ".join(lines),
-            "conclusionCode": [_concept(one.outcome) for one in self.estimate.masses],
+            "conclusionCode": [_concept(mass.outcome) for mass in self.estimate.masses],
         }
 
 

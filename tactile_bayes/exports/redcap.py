@@ -110,10 +110,10 @@ FIELDS: Final = (
 def dictionary_csv() -> str:
     """The data dictionary of the form, for a new project or to append to one."""
     rows = []
-    for one in FIELDS:
-        choices = " | ".join(f"{code}, {answer}" for code, answer in enumerate(one.choices, start=1))
-        kind = "radio" if choices else "notes" if one.name in ("tb_reason", "tb_findings") else "text"
-        row = [one.name, FORM, "", kind, one.label, choices, one.note, one.validation, one.least, one.most]
+    for field in FIELDS:
+        choices = " | ".join(f"{code}, {answer}" for code, answer in enumerate(field.choices, start=1))
+        kind = "radio" if choices else "notes" if field.name in ("tb_reason", "tb_findings") else "text"
+        row = [field.name, FORM, "", kind, field.label, choices, field.note, field.validation, field.least, field.most]
         rows.append(row + [""] * (len(DICTIONARY_HEADER) - len(row)))
     return csv_text(DICTIONARY_HEADER, rows)
 
@@ -133,7 +133,7 @@ def records_csv(estimates: Sequence[EstimateFile], identity: Identity, *, id_fro
                 way_out = "give a scan's visit and mass in its session, or export them into two files"
                 raise UsageError(f"{both}; {way_out}")
             rows[name] = RecordRow(name, estimate, mass, identity)
-    cells = ([*(_cell(one, row) for one in FIELDS), "1"] for row in rows.values())
+    cells = ([*(_cell(field, row) for field in FIELDS), "1"] for row in rows.values())
     return csv_text([*(one.name for one in FIELDS), COMPLETE], cells)
 
 

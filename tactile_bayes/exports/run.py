@@ -150,7 +150,7 @@ def refuse_unsupported(to: ExportFormat, options: Iterable[str]) -> None:
     """Refuse parts of an identity that a format does not hold, rather than drop them."""
     for name in options:
         if name not in IDENTITY_FIELDS[to]:
-            held = ", ".join(_option(one) for one in IDENTITY_FIELDS[to]) or "nothing of a patient or study"
+            held = ", ".join(_option(field) for field in IDENTITY_FIELDS[to]) or "nothing of a patient or study"
             raise UsageError(f"{_option(name)} has no place in {to} files; they hold {held}")
 
 
@@ -167,7 +167,7 @@ def export(
     `identity` that the format does not hold are left out. With `id_from_scan` the scans' subject code is the patient ID
     where none is given.
     """
-    maps = [one for one in files if isinstance(one, MapFile)]
+    maps = [file for file in files if isinstance(file, MapFile)]
     estimates = [one for several in files if not isinstance(several, MapFile) for one in several]
     path_of = dict[str, Path]()
     inputs: list[MapFile | EstimateFile] = [*maps, *estimates]

@@ -73,7 +73,7 @@ def read_wide(path: Path, mapping: ColumnMap, readings: Sequence[ReadingColumns]
     """Convert a wide table to a tidy one with the columns of ``trial.table.json``; readings keep their line numbers."""
     named = [(one.size, one.sd, one.low, one.high, one.reader, one.date) for one in readings]
     rows = _rows(path, mapping, [name for names in named for name in names])
-    tidy = [_reading(row, one, mapping) for row in rows for one in readings]
+    tidy = [_reading(row, reading, mapping) for row in rows for reading in readings]
     keys = ("patient", "mass", "modality", "replicate")
     return _table(path, tidy, keys, lines=[row.line for row in rows for _ in readings])
 

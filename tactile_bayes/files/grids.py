@@ -62,7 +62,7 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
             raise BadDataError(what, way_out=way_out)
     for part, where in ((before, "before"), (after, "after")):
         if lines := [text_of_row for row in part if (text_of_row := " ".join(filter(None, row)))]:
-            notes.append(f"text {where} the numbers was left out: {first_of([repr(one[:40]) for one in lines], 1)}")
+            notes.append(f"text {where} the numbers was left out: {first_of([repr(line[:40]) for line in lines], 1)}")
     if len(rows[0]) > 2 and all(row[-1] == "" for row in rows):
         rows = [row[:-1] for row in rows]
         notes.append("every row ends with a separator: it begins no column")
@@ -130,7 +130,7 @@ def _values(rows: Sequence[list[str]], marks: Sequence[str], before: int) -> Flo
     if not faults:
         return np.array([[np.nan if field in none else float(field) for field in row] for row in rows])
     row, column, field = faults[0]
-    repeats = sum(one[2] == field for one in faults) - 1
+    repeats = sum(fault[2] == field for fault in faults) - 1
     way_out = f"if it means no value, give --no-value {field[:30]}"
     if len(faults) > 1 and all(one[1] == 1 for one in faults) and len(faults) >= len(rows) - 1:
         way_out = "leave out the column of names"

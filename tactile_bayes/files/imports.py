@@ -69,7 +69,7 @@ def import_arrays(path: Path, options: ArrayMap, others: Sequence[Source] = ()) 
         names = {"frames" if name == "counts" else name}
         if name in ("position_mm", "quaternion_wxyz"):
             names.add("pose_matrix")
-        with_array = (one.path for one in reversed(others) if one.path and names & set(one.arrays))
+        with_array = (other.path for other in reversed(others) if other.path and names & set(other.arrays))
         raise error.with_path(next(with_array, path)) from None
 
 
@@ -220,7 +220,7 @@ def _leave_out_gaps(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
     layout = "matrix" if "pose_matrix" in arrays else stated.pose_layout or "wxyz"
     parts = [arrays[name] for name in ("pose_matrix", "position_mm", "quaternion_wxyz") if name in arrays]
     time = arrays.get("pose_time_s", np.empty(0)).reshape(-1)
-    if not parts or any(one.dtype.kind not in "iuf" or one.ndim < 2 or len(one) != len(time) for one in parts):
+    if not parts or any(part.dtype.kind not in "iuf" or part.ndim < 2 or len(part) != len(time) for part in parts):
         return  # a later check names what is wrong
     numbers = np.hstack([one.reshape(len(time), -1) for one in parts]).astype(np.float64)
     if np.isfinite(numbers).all() and not is_identity(numbers, layout).any():
@@ -293,7 +293,7 @@ def _arrange_frames(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
         counts = np.moveaxis(counts, -1, 0)
     if counts.ndim == 2:
         shape_arrays = (arrays[name] for name in ("head_surface_mm", "gain_kpa_per_count") if name in arrays)
-        shape = stated.frame_shape or next((one.shape[:2] for one in shape_arrays if one.ndim > 1), None)
+        shape = stated.frame_shape or next((array.shape[:2] for array in shape_arrays if array.ndim > 1), None)
         each = f"frames of {counts.shape[1]} numbers (counts has shape {counts.shape})"
         if shape is None:
             raise BadDataError(each, way_out="give --frame-shape ROWS COLUMNS, or --head-geometry HEAD.json")

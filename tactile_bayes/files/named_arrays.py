@@ -231,7 +231,7 @@ def _matrix_arrays(matrix: bytes, order: str, name: str, levels: int) -> Iterato
     elements = _elements(matrix, order)
     flags = int(_numbers(next(elements), order)[0])
     kind = flags & 0xFF
-    shape = () if kind == _OPAQUE else tuple(int(one) for one in _numbers(next(elements), order))
+    shape = () if kind == _OPAQUE else tuple(int(number) for number in _numbers(next(elements), order))
     name_in_file = next(elements)[1].decode("ascii")
     name = name or name_in_file
     if kind == _STRUCT and math.prod(shape) == 1 and levels:

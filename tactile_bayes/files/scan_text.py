@@ -360,7 +360,7 @@ def read_frames(path: Path, stated: Stated) -> Source:
         what = f"is a table of poses by line {header.number}"
         raise BadDataError(what, way_out="give the frames, and it as --poses")
     blocks = _blocks(lines, math.prod(stated.frame_shape) if stated.frame_shape else None)
-    if blank_cells := sum(one == NO_SENSEL for line in blocks[0] for one in line.fields):
+    if blank_cells := sum(field == NO_SENSEL for line in blocks[0] for field in line.fields):
         cells = f"{blank_cells} cells {NO_SENSEL!r} from line {blocks[0][0].number} on"
         what = f"has {cells}, which Tekscan writes beside a sensor"
         raise BadDataError(what, way_out="export the rows and columns without them, and give a head of these")

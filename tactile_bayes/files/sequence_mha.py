@@ -71,7 +71,7 @@ def _numbers(texts: list[str], width: int) -> FloatArray:
 
 def _poses(keys: dict[str, str], stated: Stated) -> Source:
     frame_keys = [one for key in keys if (one := _OF_FRAME.fullmatch(key))]
-    frame_count = len({one[1] for one in frame_keys})
+    frame_count = len({frame_key[1] for frame_key in frame_keys})
     tools = dict.fromkeys(one[2] for one in frame_keys if one[2].endswith("Transform"))
     if not tools:
         raise BadDataError("has no transforms of frames", way_out="give poses that were recorded with the frames")

@@ -200,7 +200,7 @@ class EmulatedTracker(Device):
         return answer
 
     def record(self, index: int) -> bytes:
-        return b"".join(encode_record(self._protocol, one, index) for one in self._tools(index))
+        return b"".join(encode_record(self._protocol, tool, index) for tool in self._tools(index))
 
 
 # --- Emulated NDI tracker: the commands of the combined API that a host needs to follow one tool.
@@ -284,7 +284,7 @@ class EmulatedNdi(Device):
             case "PHSR":
                 listed = _LISTED.get(int(rest or "0", 16), "any")
                 handles = self._handles if self._port == listed or (self._port != "none" and listed == "any") else ()
-                return f"{len(handles):02X}{''.join(f'{one:02X}{_PORT_STATUS:03X}' for one in sorted(handles))}"
+                return f"{len(handles):02X}{''.join(f'{handle:02X}{_PORT_STATUS:03X}' for handle in sorted(handles))}"
             case "PHRQ":
                 self._port, self._asked = "asked for", self._asked + 1
                 return f"{HANDLE + self._asked - 1:02X}"

@@ -205,7 +205,7 @@ class IgtlinkParser(Parser):
                 self._over = _HEADER.size + size
                 if kind.decode() not in self._others and len(self._others) < _MOST_KINDS:
                     self._others.add(kind.decode())
-                    pose_types = ", ".join(one.decode() for one in _POSES)
+                    pose_types = ", ".join(pose.decode() for pose in _POSES)
                     self.fault = f"{', '.join(sorted(self._others))} came, but no {pose_types}"
         if self._over:
             begin = _find_header(buffer, index + 1)

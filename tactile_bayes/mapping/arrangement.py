@@ -315,8 +315,8 @@ def check_arrangement(selection: SelectedFrames, *, latency_ms: float = 0.0, tho
     # an identity has no other lever arm to try
     lever = _LEVER[:1] if np.allclose(selection.scan.head.scanhead_from_tracker, np.eye(4)) else _LEVER
     combinations: list[Corrections] = [sum(parts, ()) for parts in product(_ARRAY, _FRAMES, lever, _ROTATIONS)]
-    others = sorted((one for one in combinations if 0 < len(one) <= MOST_CHANGES), key=len)
-    single = [one for one in others if len(one) == 1]
+    others = sorted((combination for combination in combinations if 0 < len(combination) <= MOST_CHANGES), key=len)
+    single = [other for other in others if len(other) == 1]
     stated = overlap.stated_fit[0]
     if _successive_correlation(overlap.array.varying) < LEAST_LASTING:
         return ArrangementCheck(stated, stated, 0.0, {one[0]: 0.0 for one in single})
@@ -328,7 +328,7 @@ def check_arrangement(selection: SelectedFrames, *, latency_ms: float = 0.0, tho
         check = _compared(overlap, [stated, *(overlap.judge(*one) for one in close)], tried=len(trials) + 1)
         if check.best is stated and not check.contradicting:
             return _with_sway(overlap, replace(check, excluded={**excluded, **check.excluded}))
-    judged = [stated, *(overlap.judge(*one) for one in trials)]
+    judged = [stated, *(overlap.judge(*trial) for trial in trials)]
     check = _compared(overlap, judged, tried=len(judged))
     if thorough or check.contradicting or check.best.corrections:
         judged += map(overlap.judge, others[len(single) :])

@@ -325,7 +325,7 @@ def _check_same_examination(scans: list[Scan]) -> None:
     for name in (*_SHARED_FACTS, "reference"):
         absent = {name: "the tracker's own frame"} if name == "reference" else {}  # poses are in another frame then
         facts = [absent | dict(scan.session) for scan in scans]
-        values = sorted({one[name] for one in facts if name in one})
+        values = sorted({fact[name] for fact in facts if name in fact})
         if len(values) > 1:
             raise BadDataError(
                 f"the scans differ in {name} ({', '.join(values)})", way_out="build one map per examination"

@@ -83,7 +83,7 @@ class ShiftFit(Record, eq=False):
         return _by_scan(self.parts, CoarseFrames.within_frames, self._changes(moves))
 
     def _changes(self, moves: Sequence[FloatArray]) -> FloatArray:
-        moved = np.concatenate([one.reshape(-1, 2) for one in moves])
+        moved = np.concatenate([move.reshape(-1, 2) for move in moves])
         return np.asarray(np.einsum("ni,ni->n", self.gradient, moved))
 
 
@@ -431,7 +431,7 @@ def mobility(strokes: Sequence[StrokeShift]) -> tuple[float, float]:
     Half the difference between the mean shifts of strokes towards +x and towards -x. A latency tau left in the poses
     gives the same: v tau.
     """
-    groups = [[one for one in strokes if one.known and one.direction == direction] for direction in (1, -1)]
+    groups = [[stroke for stroke in strokes if stroke.known and stroke.direction == direction] for direction in (1, -1)]
     if not all(groups):
         return float("nan"), float("nan")
     means = [np.mean([one.shift_mm for one in group]) for group in groups]

@@ -487,7 +487,7 @@ def fit_and_test(tactile_map: TactileMap, fit: BumpFit, options: SamplerSettings
         choice = choose_shape(problem, start, scene=options.requested_scene)
         return choice, field_detection(choice.plain, tactile_map, choice.plain.log_evidence)
 
-    p, q, r = (float(one) for one in fit.bump.shape_parameters(fit.theta))
+    p, q, r = (float(parameter) for parameter in fit.bump.shape_parameters(fit.theta))
     start, cosines = np.array([p + q, p - q, *fit.theta[1:3], r]), options.field_cosines
     choice, detection = choose_with(FIELD_COSINES if cosines == "auto" else cosines, start)
     if cosines != "auto" or not detection.log_bayes_factor > 0:

@@ -180,7 +180,7 @@ def _next_accuracy(result: MapDraws, options: SamplerSettings) -> float | None:
     if result.size is None or target is None:
         return None
     extremes = [result.size.summarise(name, probability=INTERVAL) for name in EXTREMES]
-    ratio = min(target * one.sd / one.mc_error for one in extremes)
+    ratio = min(target * extreme.sd / extreme.mc_error for extreme in extremes)
     if options.accuracy_mm is not None:
         ratio = min(ratio, *(options.accuracy_mm / one.mc_error for one in extremes))
     return None if ratio >= 1.0 else max(SAFETY * ratio * target, LEAST_ACCURACY_SD)

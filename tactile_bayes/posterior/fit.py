@@ -267,7 +267,7 @@ def choose_shape(problem: Problem, start: FloatArray, *, scene: SceneName = "aut
 def with_new_fit(choice: SceneChoice, fit: FieldFit) -> SceneChoice:
     """The choice with another fit and its tests for ellipse and tilt: without the neighbour in the model its flank
     looks like either."""
-    tests = {one.name: one for one in choice.structures}
+    tests = {structure.name: structure for structure in choice.structures}
     if fit.scene.shape == "ellipse":
         tests["ellipse"] = _ellipse_test(fit)
     tests["tilt"] = _tilt_test(fit)

@@ -337,7 +337,7 @@ class CollapsedTarget:
     def field_figures(self, theta: FloatArray) -> dict[str, float]:
         """Evidence-weighted correlation length (mm) and share of a cell's error variance in the field, at one shape."""
         weight = self.field_weights(theta)
-        length = np.concatenate([np.full(len(one.shares), one.field.length_mm) for one in self.fields])
+        length = np.concatenate([np.full(len(field.shares), field.field.length_mm) for field in self.fields])
         share = np.concatenate([one.shares for one in self.fields])
         return {"field_length_mm": float(weight @ length), "field_share": float(weight @ (share / (1.0 + share)))}
 
@@ -353,7 +353,7 @@ class CollapsedTarget:
         """Draw amplitudes (m, v), level (m,) and noise scale (m,) given the shape, exactly, after drawing the field."""
         unique, index = distinct_rows(theta)
         evidence, centre, power, slope, squares = (solved or self.conditional)(unique)
-        at_zero = np.concatenate([one.level()[:, 0] for one in self.fields])
+        at_zero = np.concatenate([field.level()[:, 0] for field in self.fields])
         level_variance = np.concatenate([one.inverse[:, 0, 0] for one in self.fields])
         h = choose_fields(evidence[index], rng)
         tau2 = squares[index, h] / rng.chisquare(self.dof, size=len(theta))

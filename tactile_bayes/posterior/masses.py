@@ -89,7 +89,7 @@ def other_rises(
 
 def _is_listed(x_mm: float, y_mm: float, rises: Sequence[Rise]) -> bool:
     """True for a place at one of the rises."""
-    return any(np.hypot(x_mm - one.x_mm, y_mm - one.y_mm) < 2 * SMOOTHING_MM for one in rises)
+    return any(np.hypot(x_mm - rise.x_mm, y_mm - rise.y_mm) < 2 * SMOOTHING_MM for rise in rises)
 
 
 def _assessed_rise(
@@ -299,7 +299,7 @@ def _second_lump_of_scene(tactile_map: TactileMap, first: Estimate) -> list[Rise
     lump, choice = _second_lump(first), first.scene
     if choice is None or lump is None or not on_map(tactile_map, lump.x_mm, lump.y_mm):
         return []
-    (asked,) = (one for one in choice.structures if one.name == "second lump")
+    (asked,) = (structure for structure in choice.structures if structure.name == "second lump")
     return [_rise(lump, asked.odds / (1.0 + asked.odds))] if asked.supported else []
 
 

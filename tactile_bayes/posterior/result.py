@@ -171,7 +171,7 @@ def pointwise_log_likelihood(target: CollapsedTarget, theta: FloatArray) -> Floa
     evidence = target.by_field(theta)
     log_share = evidence - np.logaddexp.reduce(evidence, axis=1)[:, None]
     window, fixed_columns = target.window, target.linear.plain[:-1]
-    templates = [window.of_cells(one) for one in target.scene.templates(theta, window)]
+    templates = [window.of_cells(template) for template in target.scene.templates(theta, window)]
     inverse_likelihood = np.full((len(theta), len(window.cells)), -np.inf)
     for h, precision in enumerate(_precisions(target)):
         for m in np.flatnonzero(log_share[:, h] > log(LEAST_SHARE)):
@@ -256,7 +256,7 @@ def fitted_cells(estimate: Estimate) -> FittedCells | None:
         return FittedCells(cells, estimate.fit.bump.predict(estimate.fit.theta[None], cells)[0])
     target, theta = estimate.scene.fit.target, np.median(estimate.draws.flat, axis=0)[None]
     window, value = target.window, target.window.cells.value
-    templates = [window.of_cells(one)[0] for one in target.scene.templates(theta, window)]
+    templates = [window.of_cells(template)[0] for template in target.scene.templates(theta, window)]
     regressors = np.stack([*target.linear.plain[:-1], *templates])
     precision = next(islice(_precisions(target), int(np.argmax(target.by_field(theta)[0])), None))
     middle, across = value.mean(), precision.times(regressors)

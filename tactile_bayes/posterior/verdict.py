@@ -152,7 +152,7 @@ def no_verdict(tactile_map: TactileMap) -> Abstention | None:
     if not findings:
         return None
     first, remedies = findings[0], dict.fromkeys(one.remedy for one in findings if one.remedy)
-    on_paper = dict.fromkeys(one.on_paper for one in findings if one.on_paper)
+    on_paper = dict.fromkeys(finding.on_paper for finding in findings if finding.on_paper)
     return cannot_show(first.text, "; ".join(remedies), "; ".join(on_paper))
 
 
@@ -442,7 +442,7 @@ def needed_amplitudes(tactile_map: TactileMap, centre_mm: tuple[float, float]) -
 def _log_factors(target: CollapsedTarget, power: FloatArray, amplitudes: FloatArray) -> FloatArray:
     """(widths, amplitudes) log Bayes factors of bumps put into the window, from their (widths, fields) powers."""
     null_dof, dof, sd = target.dof + 1, target.dof, target.amplitude_sd
-    rest = np.concatenate([np.maximum(one.rest(), 0.0) + one.floor for one in target.fields])[:, None]
+    rest = np.concatenate([np.maximum(field.rest(), 0.0) + field.floor for field in target.fields])[:, None]
     base = np.concatenate([one.log_prior - 0.5 * one.log_det for one in target.fields])[:, None]
     p = power[:, :, None]
     null = base + lgamma(null_dof / 2) - 0.5 * null_dof * np.log(pi * (rest + p * amplitudes**2))

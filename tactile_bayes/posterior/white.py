@@ -422,7 +422,7 @@ def _block_means(tactile_map: TactileMap, fit: BumpFit) -> _Blocks:
     _, index, number = np.unique(key, return_inverse=True, return_counts=True)
     is_full = number >= 0.5 * side**2
     columns = (cells.x_mm, cells.y_mm, cells.value, fit.bump.unit_bump(fit.theta[None], cells)[0], 1.0 / cells.count)
-    x, y, value, template, reading_variance = ((np.bincount(index, one) / number)[is_full] for one in columns)
+    x, y, value, template, reading_variance = ((np.bincount(index, column) / number)[is_full] for column in columns)
     return _Blocks(x, y, value, template, reading_variance / number[is_full])
 
 

@@ -478,7 +478,7 @@ class LinearModel:
     def projected(self, templates: list[Templates]) -> tuple[list[Projected], FloatArray | None]:
         """Inner products of one or two structures' templates, and those of two with each other."""
         cross = self.window.product(*templates) if len(templates) == 2 else None
-        return [self.window.project(one, self.weighted) for one in templates], cross
+        return [self.window.project(template, self.weighted) for template in templates], cross
 
     def under_each(self, templates: list[Templates], fields: list[FieldColumns]) -> LinearSolution:
         """Solutions for each structure's (m,) templates under all fields."""

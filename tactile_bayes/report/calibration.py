@@ -69,9 +69,9 @@ def repeatability_text(site: RepeatabilityFile) -> str:
     """Text of a site's repeatability, learned from repeated exams."""
     median, low, high = (100 * one for one in (site.median, site.low, site.high))
     apart = [
-        f"{one.name} (probability by chance {chance_text(one.by_chance, 4)})"
-        for one in site.repeats
-        if one.name in site.outlying
+        f"{repeat.name} (probability by chance {chance_text(repeat.by_chance, 4)})"
+        for repeat in site.repeats
+        if repeat.name in site.outlying
     ]
     lead = "CAUTION: exams lie further apart than the other masses lead one to expect; look at the maps of"
     lines = _names_lines(lead, apart)
@@ -154,7 +154,7 @@ def _eq6_lines(calibration: BodyCalibration) -> list[str]:
     low, high = calibration.depth.fat_mm
     depths = [one for one in (6.0, 12.0, 24.0) if low <= one <= high]
     lines = [f"Eq 6: d = m sigma / (e a^f) + b, {sigma}; m, e and f change with the depth of the fat and with sigma"]
-    lines += [f"  fat {one:.3g} mm: {constants_text(calibration.constants(fat_mm=one))}" for one in depths]
+    lines += [f"  fat {depth:.3g} mm: {constants_text(calibration.constants(fat_mm=depth))}" for depth in depths]
     lines.append(f"the pressure over the head tells the depth of the fat to {100 * calibration.depth.log_sd:.1f} %")
     if calibration.residual is not None:
         count = len(calibration.residual.points)

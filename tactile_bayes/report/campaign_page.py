@@ -102,7 +102,7 @@ class MassEntry(Record, eq=False):
         Findings of the comparison follow those of the exams.
         """
         every = self.exams
-        known = {one.text for exam in every for one in exam.findings}
+        known = {finding.text for exam in every for finding in exam.findings}
         compared = [] if self.growth is None else [one for one in self.growth.findings if one.text not in known]
         for severity in SEVERITIES:
             of: dict[str, list[str]] = {}
@@ -119,7 +119,7 @@ class MassEntry(Record, eq=False):
     @property
     def badness(self) -> tuple[int, int, int, float]:
         """Sort key: masses to be looked at first come first."""
-        size, findings = self.last.size, [one for exam in self.exams for one in exam.findings]
+        size, findings = self.last.size, [finding for exam in self.exams for finding in exam.findings]
         failed = sum(exam.failed for exam in self.exams)
         doubts = sum(10 if one.severity == "caution" else 1 for one in findings)
         return STATUSES.index(self.status), -failed, -doubts, 0.0 if size is None else -self.width

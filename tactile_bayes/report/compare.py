@@ -177,7 +177,7 @@ def growths(patient: str, mass: str, visits: Sequence[str], report: CompareRepor
     """Rows of one mass from its comparison; `visits` are codes in order of time."""
     if report.status != "compared":
         return [Growth(patient, mass, visits[0], visits[-1], report.status, report.reason, link=link)]
-    sizes = [one.max_size_mm for one in report.visits if one.max_size_mm is not None]
+    sizes = [visit.max_size_mm for visit in report.visits if visit.max_size_mm is not None]
     return [
         Growth(
             patient, mass, visits[0], visits[change.later - 1], "compared",
@@ -448,7 +448,7 @@ def _site_line(report: CompareReport) -> list[str]:
 
 def _model_line(report: CompareReport) -> str:
     spread = "" if report.between_map_sd is None else f"exams of a visit differ by {100 * report.between_map_sd:.0f} %"
-    known = [one.fat_mm for one in report.visits if one.fat_mm is not None]
+    known = [visit.fat_mm for visit in report.visits if visit.fat_mm is not None]
     all_known = len(known) == len(report.visits)
     depth = f"; fat under the head {', '.join(f'{one:.1f}' for one in known)} mm deep by visit" if all_known else ""
     return f"Model: one body, whose hidden properties cancel in the change; {spread}{depth}."

@@ -113,7 +113,7 @@ SizedMass = tuple[int, tuple[float, float], Quantity]  #: Number, x and y in mm,
 
 def sized_masses(masses: Sequence[MassReport]) -> list[SizedMass]:
     """Those of the masses that have a size."""
-    return [(one.number, one.centre_mm.median, one.max_size_mm) for one in masses if one.max_size_mm is not None]
+    return [(mass.number, mass.centre_mm.median, mass.max_size_mm) for mass in masses if mass.max_size_mm is not None]
 
 
 def touching_masses(masses: Sequence[SizedMass]) -> tuple[reports.Touching, ...]:
@@ -143,8 +143,8 @@ def together_words(pair: reports.Touching) -> str:
 def touching_findings(pairs: Sequence[reports.Touching]) -> list[Finding]:
     """A finding for each pair of masses that may be one lump."""
     return [
-        finding("touching", "masses {} and {} may be one lump: ".format(*one.masses) + together_words(one))
-        for one in pairs
+        finding("touching", "masses {} and {} may be one lump: ".format(*pair.masses) + together_words(pair))
+        for pair in pairs
     ]
 
 
@@ -255,10 +255,10 @@ def scene_report(choice: SceneChoice) -> reports.SceneReport:
         beside=scene.extra or None,
         structures=tuple(
             reports.StructureReport(
-                *(one.name, _if_finite(one.odds), one.bound, one.supported, one.used),
-                *(_if_finite(one.change_x_sd), _if_finite(one.change_y_sd), one.place),
+                *(structure.name, _if_finite(structure.odds), structure.bound, structure.supported, structure.used),
+                *(_if_finite(structure.change_x_sd), _if_finite(structure.change_y_sd), structure.place),
             )
-            for one in choice.structures
+            for structure in choice.structures
         ),
     )
 
@@ -382,13 +382,13 @@ def patient_mm(tactile_map: TactileMap, x_mm: float, y_mm: float) -> tuple[float
 
 def other_masses(masses: Sequence[MassReport]) -> list[MassReport]:
     """The masses besides the reported one."""
-    return [one for one in masses if not one.reported]
+    return [mass for mass in masses if not mass.reported]
 
 
 def mass_lines(masses: Sequence[MassReport]) -> list[str]:
     """One line per mass besides the reported one: place, size or why there is none, probability."""
     reported = next((one for one in masses if one.reported), None)
-    return [f"Mass {one.number} {mass_words(one, reported)}." for one in other_masses(masses)]
+    return [f"Mass {mass.number} {mass_words(mass, reported)}." for mass in other_masses(masses)]
 
 
 def mass_words(mass: MassReport, reported: MassReport | None) -> str:
@@ -460,7 +460,7 @@ def estimate_report(
         prior_sensitivity=None if moved is None else reports.PriorSensitivity(WIDER, {**moved.median}, {**moved.ends}),
         diagnostics=_finite(diagnostics) | ({} if size is None else size_diagnostics(size)),
         candidates=tuple(reports.PassedOver(*one.centre_mm, one.fault) for one in estimate.candidates),
-        other_rises=tuple(rounded(reports.OtherRise(**as_dict(one)), 6) for one in estimate.other_rises),
+        other_rises=tuple(rounded(reports.OtherRise(**as_dict(rise)), 6) for rise in estimate.other_rises),
         masses=masses,
         touching=touching_masses(sized_masses(masses)),
         left_out=tuple(estimate.left_out),

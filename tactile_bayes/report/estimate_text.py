@@ -187,7 +187,7 @@ def estimate_text(estimate: Estimate, report: EstimateReport) -> str:
     lines += _detail_lines(estimate, report)
     if estimate.scene is not None:
         lines += estimate_document.scene_lines(estimate.scene)
-        if beside := " and ".join(str(one.number) for one in estimate_document.other_masses(report.masses)):
+        if beside := " and ".join(str(mass.number) for mass in estimate_document.other_masses(report.masses)):
             lines.append(f"These odds are of this window alone: mass {beside} of the map is above.")
     if estimate.sensitivity is not None and (by_prior := estimate_document.sensitivity_line(estimate.sensitivity)):
         lines.append(by_prior)
@@ -209,9 +209,9 @@ def _no_estimate_lines(report: EstimateReport) -> list[str]:
     Where a finding is the reason, its own line above has it and its remedy.
     """
     smallest = [] if report.smallest_lump is None else [f"{smallest_text(report.smallest_lump)}."]
-    for one in report.findings:
-        if report.reason.endswith(f": {one.text}"):
-            return [no_estimate_line(report.reason.removesuffix(f": {one.text}")), *smallest]
+    for finding in report.findings:
+        if report.reason.endswith(f": {finding.text}"):
+            return [no_estimate_line(report.reason.removesuffix(f": {finding.text}")), *smallest]
     return [no_estimate_line(report.reason), *smallest, *_advice_lines(report)]
 
 
@@ -236,7 +236,7 @@ def _quantities(report: EstimateReport | PooledReport) -> dict[str, Quantity]:
 
 def size_decimals(sizes: Iterable[Quantity]) -> int:
     """Decimal places for all sizes of a report, from the least certain one."""
-    return min((decimals(one.mc_error, most=SIZE_DECIMALS) for one in sizes), default=SIZE_DECIMALS)
+    return min((decimals(size.mc_error, most=SIZE_DECIMALS) for size in sizes), default=SIZE_DECIMALS)
 
 
 def size_table(report: EstimateReport | PooledReport, shown: Collection[str] = _NAMES) -> list[str]:

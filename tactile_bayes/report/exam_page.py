@@ -63,7 +63,7 @@ def exam_page(exam: ShownExam) -> str:
         and {"ruler": svg.size_ruler(_intervals(exam, size)), "sentences": list(exam_words.size_sentences(exam))},
         nothing=[] if size else list(exam_words.nothing_sentences(exam)),
         narrowing=width_lines(exam.report.leading.variance_share or {}, paper=True),
-        masses=[exam_words.mass_row(one) for one in masses],
+        masses=[exam_words.mass_row(mass) for mass in masses],
         most_masses=MOST_MASSES,
         maps=len(exam.maps),
         repeats=list(zip(svg.small_pictures(shown, room_mm=_REPEAT_MM), alone, strict=True)) if shown else [],

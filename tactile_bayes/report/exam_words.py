@@ -127,7 +127,7 @@ def exam_map(tactile_map: TactileMap | None, report: EstimateReport, *, side: st
     """A map with its masses, from its estimate; `side` is the breast, as the scans have it."""
     number = next((one.number for one in report.masses if one.reported), 1)
     masses = [] if report.centre_mm is None else [_mass(number, report, report.centre_mm, tactile_map, side)]
-    masses += [_mass(one.number, one, one.centre_mm, tactile_map, side) for one in other_masses(report.masses)]
+    masses += [_mass(mass.number, mass, mass.centre_mm, tactile_map, side) for mass in other_masses(report.masses)]
     return ExamMap(tactile_map, report, tuple(masses))
 
 

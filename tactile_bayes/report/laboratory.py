@@ -47,7 +47,7 @@ def sbc_document(
         "elsewhere": as_dict(others) | {"too_many": others.too_many},
         "draws": sbc.DRAWS,
         "maps_per_s": maps_per_s,
-        "parameters": [as_dict(one) | {"inside_band": one.inside, "verdict": verdict(one)} for one in tests],
+        "parameters": [as_dict(test) | {"inside_band": test.inside, "verdict": verdict(test)} for test in tests],
         "p_together": min(1.0, len(tests) * min(one.ecdf_p for one in tests)) if tests else None,
         "research_use": RESEARCH_USE,
     }
@@ -89,15 +89,15 @@ def _lines(document: dict[str, Any]) -> Iterator[str]:
     yield f"ranks among {sbc.DRAWS} draws, drawn by: {drawn}"
     yield ""
     yield f"{'parameter':<11}{'chi2 p':>7}{'ECDF p':>8}  {'50 % holds':<16}{'90 % holds':<16}verdict"
-    for one in tests:
-        held = "".join(f"{100 * c['covered']:.1f} +- {100 * c['error']:.1f} %".ljust(16) for c in one["coverage"])
-        fault = one["verdict"].removeprefix("FAILS: ").removeprefix("ranks are ")
-        yield f"{one['name']:<11}{one['chi2_p']:>7.3f}{one['ecdf_p']:>8.3f}  {held}{fault}"
+    for test in tests:
+        held = "".join(f"{100 * c['covered']:.1f} +- {100 * c['error']:.1f} %".ljust(16) for c in test["coverage"])
+        fault = test["verdict"].removeprefix("FAILS: ").removeprefix("ranks are ")
+        yield f"{test['name']:<11}{test['chi2_p']:>7.3f}{test['ecdf_p']:>8.3f}  {held}{fault}"
     yield "+- is one binomial standard error of a calibrated interval."
 
 
 def _conclusion(tests: Sequence[dict[str, Any]], together: float) -> Iterator[str]:
-    failed, band = [one["name"] for one in tests if not one["inside_band"]], f"{100 * sbc.BAND:g} % band"
+    failed, band = [test["name"] for test in tests if not test["inside_band"]], f"{100 * sbc.BAND:g} % band"
     if failed:
         yield f"FAILS for {', '.join(failed)}: the ranks leave their simultaneous {band}."
         chance = f"{100 * (1 - sbc.BAND ** len(tests)):.0f} % of runs"
@@ -186,7 +186,7 @@ def heads_text(by_head: ByHead) -> str:
         f"{'head':<26}{'Table 1 (4.1)':>18}{'all (4.3)':>11}{'Table 2 (2.4)':>18}{'off':>7}",
     ]
     for head, rows in sorted(by_head.items(), key=lambda item: model_comparison.table_distance(item[1])):
-        frames, maps = (_span([getattr(one, name) for one in rows]) for name in ("centred_frame", "map"))
+        frames, maps = (_span([getattr(row, name) for row in rows]) for name in ("centred_frame", "map"))
         every, name = f"{_mean(rows, 'all_frames'):.1f}", head_words(head).replace("shoulders-", "")
         lines.append(f"{name:<26}{frames:>18}{every:>11}{maps:>18}{model_comparison.table_distance(rows):>7.2f}")
     return "\n".join(lines)
@@ -200,7 +200,7 @@ def _span(shares: Sequence[float], to: str = " to ") -> str:
 
 def _mean(cases: Rows, name: str) -> float:
     """In percent."""
-    return float(sum(100 * getattr(one, name) for one in cases) / len(cases))
+    return float(sum(100 * getattr(case, name) for case in cases) / len(cases))
 
 
 def _mean_msd_words(heads: Sequence[Rows]) -> str:
@@ -220,7 +220,7 @@ def _other_definitions(cases: Rows) -> list[str]:
         f"{'':<32}{'frame':>16}{'frame / mean':>16}{'map':>16}",
     ]
     for i, name in enumerate(model_comparison.OTHER_DEFINITIONS):
-        cells = (_span(shares, "-") for shares in zip(*(one.others[i] for one in cases), strict=True))
+        cells = (_span(shares, "-") for shares in zip(*(case.others[i] for case in cases), strict=True))
         lines.append(f"{name.replace('root mean square', 'RMS'):<32}" + "".join(f"{cell:>16}" for cell in cells))
     return [*lines, ""]
 
@@ -229,8 +229,8 @@ def _table(title: str, name: str, heads: Sequence[Rows]) -> list[str]:
     """One table with diameters across: this head / the nearest head (printed)."""
     lines = [title, f"{'h/d':>5}" + "".join(f"{f'd {d:g} mm':>15}" for d in model_comparison.TABLE_DIAMETERS_MM)]
     printed = _PRINTED.get(name)
-    for depth in dict.fromkeys(one.scene.depth_ratio for one in heads[0]):
-        of_depth = ([getattr(one, name) for one in rows if one.scene.depth_ratio == depth] for rows in heads)
+    for depth in dict.fromkeys(head.scene.depth_ratio for head in heads[0]):
+        of_depth = ([getattr(row, name) for row in rows if row.scene.depth_ratio == depth] for rows in heads)
         cells = ["/".join(f"{100 * share:.1f}" for share in shares) for shares in zip(*of_depth, strict=True)]
         if printed is not None:
             cells = [f"{cell} ({value:.1f})" for cell, value in zip(cells, printed[depth], strict=True)]

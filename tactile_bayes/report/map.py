@@ -244,7 +244,7 @@ def map_figure(
         raise BadDataError("the map holds no data to draw", way_out="make it from a scan with frames in the window")
     view = orientation_of(tactile_map)
     shown_findings = (tactile_map if report is None else report).findings if findings is None else findings
-    looked_at = [] if report is None else [one for one in report.candidates if one.fault]
+    looked_at = [] if report is None else [candidate for candidate in report.candidates if candidate.fault]
     foot = _caption(tactile_map, view)
     with figure_file(path, size_in=_MOST_IN, trim=True, foot=foot, force=force, findings=shown_findings) as figure:
         left, right = figure.subplots(1, 2, width_ratios=(1.55, 1.0))

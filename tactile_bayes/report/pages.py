@@ -50,7 +50,7 @@ def cut(text: str, longest: int = 400) -> str:
 
 def foot(scans: Iterable[Mapping[str, str]], more: str = "") -> str:
     """Last line of a page: the program, `more` of it, the first scans by their digests, and what sizes come from."""
-    digests = [one["sha256"][:12] for one in scans if one.get("sha256")][:_MOST_SCANS]
+    digests = [scan["sha256"][:12] for scan in scans if scan.get("sha256")][:_MOST_SCANS]
     named_scans = [f"scan{'s' if len(digests) > 1 else ''} {', '.join(digests)}"] if digests else []
     made = "; ".join(filter(None, [f"tactile-bayes {__version__}", more, *named_scans]))
     return f"{made}. Sizes come from simulated bodies; no scan of a person has been used. {RESEARCH_USE}"

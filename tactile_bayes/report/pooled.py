@@ -42,7 +42,7 @@ def maps_lying_apart(reports: Sequence[EstimateReport]) -> dict[int, str] | None
     reported = {i: [one for one in masses if one.reported] for i, masses in _masses_by_map(reports).items()}
     if len(reported) < 2:
         return None
-    all_masses = [one for masses in reported.values() for one in masses]
+    all_masses = [mass for masses in reported.values() for mass in masses]
     common = _common_mass(reported) or max(all_masses, key=_amplitude, default=None)
     distances = {i: _distance_mm(one, common) for i, masses in reported.items() for one in masses if common is not None}
     words = "its mass lies {:.0f} mm from that of the other maps and may be another one"
@@ -52,7 +52,7 @@ def maps_lying_apart(reports: Sequence[EstimateReport]) -> dict[int, str] | None
 def _masses_by_map(reports: Sequence[EstimateReport]) -> dict[int, tuple[MassReport, ...]]:
     """Masses of the maps with a lump, by the map's place in the list; none where one has no place in the patient."""
     by_map = {i: one.masses for i, one in enumerate(reports) if one.masses}
-    return {} if any(one.centre_patient_mm is None for masses in by_map.values() for one in masses) else by_map
+    return {} if any(mass.centre_patient_mm is None for masses in by_map.values() for mass in masses) else by_map
 
 
 def _distance_mm(one: MassReport, other: MassReport) -> float:
@@ -71,10 +71,10 @@ def _common_mass(maps: Mapping[int, Sequence[MassReport]]) -> MassReport | None:
     def worth(common: MassReport) -> tuple[int, int, int, float]:
         """On how many maps it is found, sized and reported, and the median of its amplitudes."""
         matches = [one for one in (_matching_mass(masses, common) for masses in maps.values()) if one is not None]
-        sized, reported = sum(one.max_size_mm is not None for one in matches), sum(one.reported for one in matches)
+        sized, reported = sum(match.max_size_mm is not None for match in matches), sum(one.reported for one in matches)
         return len(matches), sized, reported, float(np.median([_amplitude(one) for one in matches]))
 
-    best = max((one for masses in maps.values() for one in masses), key=worth, default=None)
+    best = max((mass for masses in maps.values() for mass in masses), key=worth, default=None)
     return best if best is not None and worth(best)[0] > 1 else None
 
 
@@ -116,7 +116,7 @@ def pooled_report(
         one_place_probability=pooled.one_place,
         variance_share=None if size is None else dict(size.variance_share),
         figures={} if size is None else dict(size.figures),
-        left_out=(*([head] if any(head in one.left_out for one in reports) else []), *sized_by.omissions()),
+        left_out=(*([head] if any(head in report.left_out for report in reports) else []), *sized_by.omissions()),
         fat_mm=sized_by.fat_mm,
         unknowns=dict(sized_by.unknowns),
         site=None if sized_by.site is None else site_words(sized_by.site),
@@ -127,7 +127,7 @@ def pooled_report(
 
 
 def _pooled_map(index: int, name: str, report: EstimateReport, pooled: PooledEstimate) -> PooledMap:
-    size, reported = report.max_size_mm, [one.number for one in report.masses if one.reported]
+    size, reported = report.max_size_mm, [mass.number for mass in report.masses if mass.reported]
     return PooledMap(
         map=name,
         mass=(*reported, len(report.masses)) if len(report.masses) > 1 and reported else (),
@@ -196,7 +196,7 @@ def pooled_summary(report: PooledReport) -> str:
     lines = finding_summary(findings, "caution", most=2)
     sizes = [one.max_size_mm for one in report.maps if one.max_size_mm is not None]
     if sizes:
-        words = first_of([_size_words(one, with_ends=report.status == DISAGREE) for one in sizes], MOST_NAMED)
+        words = first_of([_size_words(size, with_ends=report.status == DISAGREE) for size in sizes], MOST_NAMED)
         alike = _alike(report) if report.status == DISAGREE else ""
         shown = f"A lump was found on {len(sizes)} of {len(report.maps)} maps"
         lines.append(f"{shown}, alone sized at {words} mm{alike}.")

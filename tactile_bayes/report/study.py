@@ -54,10 +54,10 @@ if TYPE_CHECKING:
 def study_table(rows: Sequence[StudyRow]) -> str:
     """Amplitude and width of every case, for a reader: the table as CSV is wider than a terminal."""
     lines = [f"{'seat':12}{'d, mm':>7}{'h/d':>7}{'E2/E1':>7}{'amplitude':>11}{'sigma, mm':>11}  shows"]
-    for one in rows:
-        lump = f"{one.seat:12}{one.d_mm:>7g}{one.depth_ratio:>7g}{one.stiffness_ratio:>7g}"
-        bump = f"{one.amplitude:>11.3f}{one.sigma_x_mm:>11.2f}"
-        lines.append(f"{lump}{bump}  {'yes' if one.detectable else 'no'}")
+    for row in rows:
+        lump = f"{row.seat:12}{row.d_mm:>7g}{row.depth_ratio:>7g}{row.stiffness_ratio:>7g}"
+        bump = f"{row.amplitude:>11.3f}{row.sigma_x_mm:>11.2f}"
+        lines.append(f"{lump}{bump}  {'yes' if row.detectable else 'no'}")
     return "\n".join([*lines, "With all columns, to calibrate by: -o TABLE.csv.", ""])
 
 
@@ -143,7 +143,7 @@ def _four_lumps(settings: StudySettings, path: Path, *, seat: float, force: bool
     with figure_file(path, size_in=(10.0, 7.6), foot=_caption("Dotted: Eq 3", settings, seat), force=force) as four:
         for axes, (d, h) in zip(four.subplots(2, 2).ravel(), PHANTOMS.values(), strict=True):
             frames = scene_frames(TableScene("", d, h, seat), settings)
-            theirs, ours = (one.as_taxels(HEAD_PITCH_MM) for one in frames)
+            theirs, ours = (frame.as_taxels(HEAD_PITCH_MM) for frame in frames)
             share = 100 * mean_squared_difference(ours.pressure_kpa, theirs.pressure_kpa)
             _draw_frames(axes, theirs, ours)
             title = f"d {d:g} mm, h/d {h:g}; MSD of all frames {share:.1f} %"
@@ -155,7 +155,7 @@ def lookalikes_text(lookalikes: Lookalikes | None) -> str:
     if lookalikes is None:
         return "figure 5b: no two visible lumps of sizes that differ by half"
     lumps = (lookalikes.small, lookalikes.large)
-    pair = " and ".join(f"d {one.d_mm:g} mm at h/d {one.depth_ratio:.3g}" for one in lumps)
+    pair = " and ".join(f"d {lump.d_mm:g} mm at h/d {lump.depth_ratio:.3g}" for lump in lumps)
     share = f"{100 * lookalikes.difference:.1f} % of what the lump adds ({100 * lookalikes.of_mean:.2f} % of the mean)"
     if lookalikes.difference <= ALIKE:
         return f"figure 5b: indistinguishable are {pair}: their frames differ by {share}"

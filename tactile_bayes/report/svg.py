@@ -316,7 +316,7 @@ def colour_bar(exam: ExamMap) -> str:
 
 def colour_steps(limits: tuple[float, float], words: str, *, more: bool) -> str:
     """Inline SVG of the colours, with the values at their ends and what they are of; `more`: some lie above."""
-    low, high = (f"{one:.2f}" if abs(one) < 100 else f"{one:.0f}" for one in limits)
+    low, high = (f"{limit:.2f}" if abs(limit) < 100 else f"{limit:.0f}" for limit in limits)
     width = _BAR_MM / _BAR_STEPS  # plain boxes: not every printer of SVG knows gradients
     parts = [
         f'<rect x="{14 + width * i:g}" y="0.5" width="{width + 0.05:g}" height="3" fill="#{bytes(colour).hex()}"/>'
@@ -473,8 +473,8 @@ def smallest_pictures(tactile_map: TactileMap, smallest: SmallestLump) -> Iterat
     (width, height), side = frame.size_mm, frame.scale * smallest.spacing_mm
     for number, depth in enumerate(smallest.depths_mm):
         parts = [f'<rect width="{width:.2f}" height="{height:.2f}" fill="#fff" stroke="#333" stroke-width="0.3"/>']
-        for one in smallest.places:
-            (x, y), d = frame.at((one.x_mm, one.y_mm)), one.d_mm[number]
+        for place in smallest.places:
+            (x, y), d = frame.at((place.x_mm, place.y_mm)), place.d_mm[number]
             shade = next(grey for most, grey in _SHADES if (np.inf if d is None else d) <= most)
             box = f'x="{x - side / 2:.2f}" y="{y - side / 2:.2f}" width="{side:.2f}" height="{side:.2f}"'
             parts.append(f'<rect {box} fill="{shade}" stroke="#777" stroke-width="0.1"/>')

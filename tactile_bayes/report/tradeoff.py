@@ -39,7 +39,7 @@ def advice(tradeoff: Tradeoff) -> list[str]:
     if answer is None:
         return [_advice_without_size(tradeoff), *tradeoff.notes]
     lines = [f"Advice: {_cheapest_setting(tradeoff, answer)}"]
-    far = [f"{one.label} {one.ends_off_mm:.1f} mm" for one in tradeoff.rows if tradeoff.exceeds_tolerance(one)]
+    far = [f"{row.label} {row.ends_off_mm:.1f} mm" for row in tradeoff.rows if tradeoff.exceeds_tolerance(row)]
     if far:
         lines.append(f"What moves the ends more than {limit:g} mm: {'; '.join(far)}.")
     silent = [one.label for one in tradeoff.rows if one.answer.reported is None]
@@ -163,7 +163,7 @@ def settings_text(tradeoff: Tradeoff) -> str:
         f"{'':<{width}}{units}{'mm':>7}{'mm':>15}{'off':>7}{'off':>7}",
     ]
     for axis, rows in groupby(tradeoff.rows, key=lambda one: one.axis):
-        lines += [axis, *(line for one in rows for line in _row(one, tradeoff))]
+        lines += [axis, *(line for row in rows for line in _row(row, tradeoff))]
     if tradeoff.pooled:
         lines += ["maps pooled", *(line for one in tradeoff.pooled for line in _pooled(one, tradeoff))]
     lines += _exact_maps(tradeoff)
@@ -177,7 +177,7 @@ def _label_width(tradeoff: Tradeoff) -> int:
 
 def gives_sizes(tradeoff: Tradeoff) -> bool:
     """True if sizes are reported, False if widths, for lack of a calibration."""
-    return any(SIZE in one.answer.quantities for one in tradeoff.rows) or tradeoff.reference.answer is None
+    return any(SIZE in row.answer.quantities for row in tradeoff.rows) or tradeoff.reference.answer is None
 
 
 def _row(one: MeasuredSetting, tradeoff: Tradeoff) -> list[str]:
@@ -227,7 +227,7 @@ def _exact_maps(tradeoff: Tradeoff) -> Iterator[str]:
     columns = ((ELEMENT, 6, 2), (AMPLITUDE, 7, 4), (WIDTHS[0], 7, 3), (WIDTHS[1], 7, 3))
     yield from ("", f"{'the map':<25}{'mesh':>6}{'a':>7}{'sig. x':>7}{'sig. y':>7}   off, %")
     yield f"{'':<25}{'mm':>6}{'':>7}{'mm':>7}{'mm':>7}{'a':>7}{'x':>7}{'y':>7}{'size':>7}"
-    for label, answer in (("the finest", best), *((one.label, one.answer) for one in tradeoff.rows)):
+    for label, answer in (("the finest", best), *((row.label, row.answer) for row in tradeoff.rows)):
         shown, line = answer.quantities, f"{label:<25}"
         for name, width, digits in columns:
             line += f"{f'{shown[name].median:.{digits}f}' if name in shown else '':>{width}}"
@@ -244,7 +244,7 @@ def _notes(tradeoff: Tradeoff) -> Iterator[str]:
     elif reference.answer is not None:
         error = f"its own Monte-Carlo error is {reference.mc_error_mm:.2g} mm, "
     yield f"* is the default. CPU seconds of this machine, warm, the least of the runs; the interval is {interval}."
-    if any("optimise" in one.label or one.axis == "fit window" for one in tradeoff.rows) and gives_sizes(tradeoff):
+    if any("optimise" in row.label or row.axis == "fit window" for row in tradeoff.rows) and gives_sizes(tradeoff):
         yield "Least squares and other windows: sized as if the calibration were learned so; `estimate` refuses that."
     if reference.answer is not None:
         yield (
@@ -281,7 +281,7 @@ def draw_tradeoffs(by_title: Mapping[str, Tradeoff], path: Path, *, force: bool 
 
 
 def _draw_settings(figure: Figure, axes: Axes, tradeoff: Tradeoff) -> None:
-    shown = [one for one in tradeoff.rows if math.isfinite(_height(one, tradeoff))]
+    shown = [row for row in tradeoff.rows if math.isfinite(_height(row, tradeoff))]
     for i, axis in enumerate(dict.fromkeys(one.axis for one in shown)):
         rows = [one for one in shown if one.axis == axis]
         axes.plot(*_points(rows, tradeoff), _MARKS[i % 6], color=_COLOURS[i % 6], label=axis, zorder=3)
@@ -318,7 +318,7 @@ def _height(one: MeasuredSetting, tradeoff: Tradeoff) -> float:
 
 
 def _points(rows: Sequence[MeasuredSetting], tradeoff: Tradeoff) -> tuple[list[float], list[float]]:
-    return [max(one.seconds, 1e-4) for one in rows], [_height(one, tradeoff) for one in rows]
+    return [max(row.seconds, 1e-4) for row in rows], [_height(one, tradeoff) for one in rows]
 
 
 def _draw_level(axes: Axes, value: float | None, colour: str, style: str, name: str) -> None:

@@ -37,12 +37,12 @@ def plan_text(plan: PlanReport) -> str:
         "",
         "                                     mean error, %     interval, factor",
         "patients  maps  power                 tactile  other   tactile   ratio",
-        *(_design_line(one) for one in plan.designs),
+        *(_design_line(design) for design in plan.designs),
         "",
         *(
-            f"{one.patients} patients, from {one.from_maps} to {one.to_maps} maps: power {one.power_gain:+.3f}, "
-            f"tactile error {one.tactile_percent_change:+.1f} points"
-            for one in plan.gains
+            f"{gain.patients} patients, from {gain.from_maps} to {gain.to_maps} maps: power {gain.power_gain:+.3f}, "
+            f"tactile error {gain.tactile_percent_change:+.1f} points"
+            for gain in plan.gains
         ),
         "Power: tactile error smaller and p < 0.05, in brackets the simulation's own 95 % interval.",
         "Intervals of the tactile error and of the ratio of errors: median factor from lower to upper end.",

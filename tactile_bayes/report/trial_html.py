@@ -48,7 +48,7 @@ def sizes_figure(report: TrialReport, trial: Trial) -> str:
     ends = [end for one in modalities for end in (*one.ex_vivo_mm, *(one.size_mm + _replicate_sds(one)))]
     reach = 1.06 * float(max(ends, default=1.0))
     slopes = {name: one.slope_through_origin for name, one in report.modalities.items()}
-    return _svg([partial(_draw_sizes, one, sds, slopes[one.name], reach) for one in modalities])
+    return _svg([partial(_draw_sizes, modality, sds, slopes[modality.name], reach) for modality in modalities])
 
 
 def differences_figure(report: TrialReport, trial: Trial) -> str:
@@ -56,7 +56,7 @@ def differences_figure(report: TrialReport, trial: Trial) -> str:
 
     All panels have the same axes, so that modalities can be compared by eye.
     """
-    detected = [one.only_detected() for one in trial.sizes().values()]
+    detected = [size.only_detected() for size in trial.sizes().values()]
     methods = {name: one.method_comparison for name, one in report.modalities.items()}
     return _svg([partial(_draw_differences, one, methods[one.name]) for one in detected], alike=True)
 
@@ -137,7 +137,7 @@ def _draw_ecdf(calibration: Calibration, prediction: Prediction, axes: Axes) -> 
 
 
 def _draw_coverage(calibration: Calibration, axes: Axes) -> None:
-    nominal = np.array([one.probability for one in calibration.levels])
+    nominal = np.array([level.probability for level in calibration.levels])
     share = np.array([one.covered / one.n for one in calibration.levels])
     low, high = (np.array([one.interval[i] for one in calibration.levels]) for i in (0, 1))
     axes.plot([0, 1], [0, 1], color=_LINE, linewidth=1.2, label="if calibrated")
@@ -162,7 +162,7 @@ def plan_figure(plan: PlanReport, path: Path, *, force: bool = False) -> None:
 
 def _draw_plan(axes: Axes, plan: PlanReport, aim: Aim) -> None:
     for maps, mark, colour in zip(sorted({one.maps for one in plan.designs}), cycle("os^Dv"), cycle(_COLOURS)):
-        designs = [one for one in plan.designs if one.maps == maps]
+        designs = [design for design in plan.designs if design.maps == maps]
         patients, label = [one.patients for one in designs], f"{maps} map{'s' if maps > 1 else ''} of each mass"
         if aim == "power":
             level = np.array([one.power for one in designs])
@@ -248,7 +248,7 @@ def _variance_cells(report: ModalityReport) -> list[str]:
     """SDs of masses, readers and maps, percent."""
     parts = report.replicates.variance_components
     variances = (None, None, None) if parts is None else (parts.mass, parts.reader, parts.map)
-    return [trial_words.number(None if one is None else 100 * one**0.5, ".0f") for one in variances]
+    return [trial_words.number(None if variance is None else 100 * variance**0.5, ".0f") for variance in variances]
 
 
 def _median_cells(one: ModalityErrors, names: Iterable[str]) -> list[str]:

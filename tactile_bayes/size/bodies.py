@@ -133,7 +133,7 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
             return self
         if self.site is not None and not self.site.uses_fat:
             return self._without_depth(NO_PROFILE)
-        if all(one is None for one in profiles):
+        if all(profile is None for profile in profiles):
             return self._without_depth("the map has no pressure profile of the head")
         fat_mm, why_not = self.depth.from_maps(profiles)
         if fat_mm is None:
@@ -188,7 +188,7 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         v = np.array(0.0 if sigma_mm is None else np.log(sigma_mm) - self.centre.log_width)
         fat_mm = fat_mm or self.fat_mm
         w = np.array(0.0 if fat_mm is None or self.depth is None else np.log(fat_mm) - self.centre.log_fat)
-        mu, f, b = (float(one) for one in eq6_coefficients(self.eq6.mean, self.eq6.powers, v, w))
+        mu, f, b = (float(coefficient) for coefficient in eq6_coefficients(self.eq6.mean, self.eq6.powers, v, w))
         log_e = -f * self.eq6.log_amplitude_one_deep
         log_m = mu - self.centre.log_width + f * self.centre.log_amplitude + log_e
         return {"m": float(np.exp(log_m)), "b_mm": b, "e": float(np.exp(log_e)), "f": f}
@@ -351,7 +351,7 @@ def known_body(
             raise UsageError(f"the calibration has no property {name}; {suggestion(name, names or ('none',))}")
         check_number(f"known {name}", value, 0, open_ends=name != "seat")
         columns = ("d_mm", "depth_ratio") if name == "depth_mm" else (name,)
-        if all(one in calibration.bodies for one in columns):
+        if all(column in calibration.bodies for column in columns):
             low, high = np.prod([calibration.bodies[one] for one in columns], axis=0).tolist()
             most = None if hidden is not None and name in hidden.inverted else high * BEYOND
             check_number(f"known {name}", value, low / BEYOND, most)

@@ -365,7 +365,7 @@ def one_size_probability(centre: FloatArray, noise: FloatArray, known: BetweenMa
 
 def one_size_by_draws(log_sizes: Sequence[FloatArray], known: BetweenMaps | None) -> float:
     """`one_size_probability` of maps by the draws of each one's log size."""
-    centre, noise = (np.array([of(one) for one in log_sizes]) for of in (np.nanmean, np.nanvar))
+    centre, noise = (np.array([of(size) for size in log_sizes]) for of in (np.nanmean, np.nanvar))
     return one_size_probability(centre, noise, known)
 
 

@@ -376,7 +376,7 @@ class FatDepth(Record, eq=False):
 
     def _log_depths(self, profiles: Sequence[tuple[float, ...] | None]) -> FloatArray:
         """(n,) ln F of the profiles that resemble the table's."""
-        known = np.array([one for one in profiles if one is not None], dtype=np.float64)
+        known = np.array([profile for profile in profiles if profile is not None], dtype=np.float64)
         known = known.reshape(-1, len(self.centre))
         return self.log_depth(known[self.relative_leverage(known) <= MOST_LEVERAGE])
 

@@ -54,7 +54,7 @@ class PatientPlace(Record, eq=False):
         """Mean place of a visit's maps; None for none."""
         if not places:
             return None
-        centre = np.mean([one.centre_mm for one in places], axis=0)
+        centre = np.mean([place.centre_mm for place in places], axis=0)
         covariance = np.sum([one.covariance_mm2 for one in places], axis=0) / len(places) ** 2
         return cls(centre, covariance)
 
@@ -109,7 +109,7 @@ def one_place_probability(places: Sequence[PatientPlace], *, registration_mm: fl
     """
     if len(places) < 2:
         return 1.0
-    centres = np.stack([one.centre_mm for one in places])
+    centres = np.stack([place.centre_mm for place in places])
     weights = np.linalg.inv(np.stack([one.covariance_mm2 + 0.5 * registration_mm**2 * np.eye(2) for one in places]))
     mean = np.linalg.solve(weights.sum(axis=0), np.einsum("kij,kj->i", weights, centres))
     q = float(np.einsum("ki,kij,kj->", centres - mean, weights, centres - mean))
@@ -176,7 +176,7 @@ class AmplitudeLaw(Record):
         self, parts: Sequence[AveragedMaps], fitted: Sequence[BodyCalibration]
     ) -> tuple[FloatArray, FloatArray]:
         """(v, n) ln a corrected to the mean depth of fat, and its (v,) remaining variances by posture and exams."""
-        log_amplitude = np.stack([one.log_amplitude for one in parts])
+        log_amplitude = np.stack([part.log_amplitude for part in parts])
         exams = self.exam_factor**2 * np.array([np.mean(one.variance) for one in parts])
         trust, posture = np.zeros(len(parts)), self.posture_sd**2
         depths = [one.fat_mm for one in fitted if one.fat_mm is not None]
@@ -289,10 +289,10 @@ def joint_sizes(
     middle = np.mean([one.by_map.mean(axis=0) for one in parts], axis=0)
     points = draws.paired_points(middle, replicates, DIMENSIONS, rng)
     tau = between.at(points[:, 0], *[(one.centre, one.noise) for one in parts])  # one for all visits
-    sizes = [one for maps, fit in zip(visits, fits, strict=True) for one in log_sizes(fit, maps)]
+    sizes = [size for maps, fit in zip(visits, fits, strict=True) for size in log_sizes(fit, maps)]
     oval, _ = lump_shape(fits[0], flat, sizes, priors.shape)
     half = oval.at(points[:, 2:5])
-    averaged = [one.averaged(tau) for one in parts]
+    averaged = [part.averaged(tau) for part in parts]
     if law is None:
         law = SHARED_WITHOUT_DEPTH if fits[0].fat_mm is None else SHARED_BODY
     correlation = law.correlation(np.array([float(np.nanmean(one.mean)) for one in averaged]))
@@ -323,7 +323,7 @@ def _covariance(
 ) -> FloatArray:
     """(n, v, v) covariance of ln d at the visits given each draw of the maps."""
     terms, exams, widths = (
-        np.stack([getattr(one, name) for one in parts], axis=1) for name in ("terms", "variance", "log_width")
+        np.stack([getattr(part, name) for part in parts], axis=1) for name in ("terms", "variance", "log_width")
     )
     bodies = np.stack(
         [at.body_sd(one.log_amplitude, one.log_width, score) for one, at in zip(parts, fitted, strict=True)], axis=1

@@ -101,12 +101,12 @@ def distances(answers: Sequence[SizeAnswer], reference: SizeAnswer | None) -> Di
     """
     if reference is None or reference.reported is None or not answers:
         return None, None, None
-    if any(one.quantities.keys() != reference.quantities.keys() for one in answers):
+    if any(answer.quantities.keys() != reference.quantities.keys() for answer in answers):
         return None, None, None
     name, widths = SIZE if SIZE in reference.quantities else WIDTHS[0], [x for x in WIDTHS if x in reference.quantities]
 
     def distance(names: Sequence[str], ends: Sequence[str]) -> float:
-        pairs = [(one.quantities[name], reference.quantities[name]) for one in answers for name in names]
+        pairs = [(answer.quantities[name], reference.quantities[name]) for answer in answers for name in names]
         gaps = [getattr(ours, end) - getattr(theirs, end) for ours, theirs in pairs for end in ends]
         return float(np.sqrt(np.mean(np.square(gaps))))
 
@@ -211,12 +211,12 @@ class Tradeoff(Record):
     @property
     def default(self) -> MeasuredSetting:
         """The program's default."""
-        return next(one for one in self.rows if one.default)
+        return next(row for row in self.rows if row.default)
 
     def cheapest_sufficient(self) -> MeasuredSetting | None:
         """The cheapest usable setting within the tolerance, or the default where that costs hardly more."""
         within = [
-            one for one in self.rows if one.usable and not self.exceeds_tolerance(one) and one.ends_off_mm is not None
+            row for row in self.rows if row.usable and not self.exceeds_tolerance(row) and row.ends_off_mm is not None
         ]
         if not within:
             return None
@@ -272,7 +272,7 @@ def run_tradeoff(
 
     `relevant` returns the settings that can make a difference beside the default's answer; without it all are measured.
     """
-    default = next(one.options for one in choices if one.default)
+    default = next(choice.options for choice in choices if choice.default)
     run(default, 0)  # run twice: the first run also imports
     seconds, answer = run(default, 0)
     choices = choices if relevant is None else relevant(answer)
@@ -283,7 +283,7 @@ def run_tradeoff(
         work.progress(number, len(choices))
     tradeoff = Tradeoff(tuple(rows), compared_with, work.tolerance_mm)
     best = set(map(id, tradeoff.frontier()))
-    return replace(tradeoff, rows=tuple(replace(one, frontier=id(one) in best) for one in rows))
+    return replace(tradeoff, rows=tuple(replace(row, frontier=id(row) in best) for row in rows))
 
 
 # --- Cost of accuracy on one map: whole estimates at many settings against a long run of the default's posterior.
@@ -343,7 +343,7 @@ def relevant_settings(settings: list[EstimateSetting], answer: SizeAnswer) -> li
     windows are measured by laplace: chains for each would take minutes.
     """
     if answer.reported is None and not isinstance(answer, Unconverged):
-        without_accuracy = [one for one in settings if one.axis != ACCURACY]
+        without_accuracy = [setting for setting in settings if setting.axis != ACCURACY]
         return [replace(one, weight=min(one.weight, 1.0)) if one.axis == METHOD else one for one in without_accuracy]
     default = settings[0].options
     if answer.method != "ensemble" or default.method == "ensemble":

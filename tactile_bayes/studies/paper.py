@@ -355,7 +355,7 @@ def find_lookalikes(
     shares, added = {}, {}
     for d in diameters_mm:
         frames = [centred_frame(d, h, settings=coarse, seat=seat) for h in depth_ratios]
-        shares[d] = CubicSpline(depth_ratios, np.stack([one.share for one in frames]))(tried)
+        shares[d] = CubicSpline(depth_ratios, np.stack([frame.share for frame in frames]))(tried)
         added[d] = CubicSpline(depth_ratios, np.stack([one.added for one in frames]))(tried)
     pairs = []  # the gap, then diameter and depth of either lump
     for d, e in itertools.combinations(sorted(diameters_mm), 2):

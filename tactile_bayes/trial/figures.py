@@ -330,19 +330,19 @@ class Sample(Record):
     @property
     def patients(self) -> npt.NDArray[np.int64]:
         """Patients with a mass in any modality."""
-        return np.unique(np.concatenate([one.patient for one in self.sizes]))
+        return np.unique(np.concatenate([size.patient for size in self.sizes]))
 
     def value(self) -> float:
         """The statistic from all patients."""
-        return self._combined([np.array(evaluate(self.statistic, one)) for one in self.sizes]).item()
+        return self._combined([np.array(evaluate(self.statistic, size)) for size in self.sizes]).item()
 
     def left_out(self) -> FloatArray:
         """(g,) statistic without each patient."""
-        return self._combined([self._without_each(one, self.patients) for one in self.sizes], " without one patient")
+        return self._combined([self._without_each(size, self.patients) for size in self.sizes], " without one patient")
 
     def redrawn(self, draws: FloatArray) -> FloatArray:
         """(b,) statistic for each row of (b, g) counts of patients; NaN where undefined."""
-        return self.combine(*(self._redrawn_one(one, self.patients, draws) for one in self.sizes))
+        return self.combine(*(self._redrawn_one(size, self.patients, draws) for size in self.sizes))
 
     def _combined(self, values: Sequence[FloatArray], when: str = "") -> FloatArray:
         """The combined statistics; `UndefinedError` with the reason and `when` where one does not exist."""

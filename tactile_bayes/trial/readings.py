@@ -305,7 +305,7 @@ class Trial(Record, eq=False):
 
     def sized_readings(self, modality: str) -> list[Reading]:
         """Readings of a modality that have a size, in order of mass and replicate."""
-        sized = (one for one in self.readings if one.modality == modality and one.size_mm is not None)
+        sized = (reading for reading in self.readings if reading.modality == modality and reading.size_mm is not None)
         return sorted(sized, key=lambda one: (one.key, one.replicate))
 
 

@@ -232,7 +232,7 @@ def reader_components(readings: Sequence[Reading]) -> Components | None:
 
     Readings without a reader are left out when any has one. None with fewer than 2 masses or 2 replicates.
     """
-    chosen = [one for one in readings if one.reader] or readings
+    chosen = [reading for reading in readings if reading.reader] or readings
     mass, reader = _codes([one.key for one in chosen]), _codes([one.reader for one in chosen])
     masses = len(set(mass.tolist()))
     if len(chosen) - masses < 2 or masses < 2:

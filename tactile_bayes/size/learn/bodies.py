@@ -272,7 +272,7 @@ def size_errors(
 ) -> SizeErrors:
     """Errors of a table's bodies, each by all its exams, given the true values of the properties in `known`."""
     bodies = np.unique(table.body)
-    errors = np.array([size_error(calibration, table.rows(table.body == one), known=known) for one in bodies])
+    errors = np.array([size_error(calibration, table.rows(table.body == body), known=known) for body in bodies])
     return SizeErrors(*errors.T)
 
 

@@ -297,7 +297,7 @@ def fit_residual(bodies: BodyResiduals) -> FittedResidual:
         # incomplete Cholesky factor lie at the table's ends first, and left bodies out with larger errors (0122)
         chosen = np.random.default_rng(SEED).choice(len(bodies.x), points_now, replace=False)
         points = bodies.x[chosen]
-        fits = [_mode_near(bodies, one, points) for one in starts]
+        fits = [_mode_near(bodies, start, points) for start in starts]
         theta, _ = min(fits, key=lambda one: one[1])
         starts = [theta]
     return weights_posterior(bodies, points, theta)
@@ -328,7 +328,7 @@ def body_spread(features: FloatArray, error: FloatArray, noise: FloatArray) -> t
     """
 
     def density(spreads: FloatArray) -> FloatArray:
-        return np.array([_log_density(features, error, noise, one) + _spread_prior(one) for one in spreads])
+        return np.array([_log_density(features, error, noise, spread) + _spread_prior(spread) for spread in spreads])
 
     start = np.zeros(features.shape[1])
     start[0] = _BODY_SD[0]

@@ -289,7 +289,7 @@ def learn_repeatability(repeats: Sequence[RepeatedExams], *, fewest: int = FEWES
 
     Those of one mass are left out together when its exams are compared with the others'.
     """
-    repeats = [one for one in repeats if len(one.centre) > 1]
+    repeats = [repeat for repeat in repeats if len(repeat.centre) > 1]
     masses = sorted({one.mass for one in repeats})
     if len(masses) < fewest:
         what = f"{len(masses)} {'mass has' if len(masses) == 1 else 'masses have'} repeated exams with sizes"
