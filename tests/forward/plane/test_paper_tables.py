@@ -134,7 +134,7 @@ FAULTS = {
     "replicate 0": (HEADER + "P1,1,tactile,0,3,detected\n", ["replicate", "at least 1"]),
     "replicate 1.5": (HEADER + "P1,1,tactile,1.5,3,detected\n", ["replicate", "whole number"]),
     "unknown status": (HEADER + "P1,1,tactile,1,3,Detected\n", ["status", "did you mean detected?", "not_done"]),
-    "capital modality": (HEADER + "P1,1,CBE,1,3,detected\n", ["modality", "'CBE'", "lower case"]),
+    "capital modality": (HEADER + "P1,1,CBE,1,3,detected\n", ["modality", "'CBE'", "write cbe"]),
     "blank patient": (HEADER + ",1,tactile,1,3,detected\n", ["patient", "is blank"]),
     "padded cell": (HEADER + "P1 ,1,tactile,1,3,detected\n", ["patient", "'P1 '", "remove"]),
     "line end in cell": (HEADER + '"P\n1",1,tactile,1,3,detected\n', ["line 2", "'P\\n1'", "unprintable"]),
