@@ -18,6 +18,7 @@ from tactile_bayes.options import CompareOptions, NonNegative, Positive
 from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_document import share_words
+from tactile_bayes.report.estimate_text import spread_percent
 from tactile_bayes.report.pages import Growth, signed
 from tactile_bayes.size.pooling import Repeatability
 from tactile_bayes.size.visits import VOLUME, Change, JointSizes, VisitComparison, straight_line
@@ -447,7 +448,8 @@ def _site_line(report: CompareReport) -> list[str]:
 
 
 def _model_line(report: CompareReport) -> str:
-    spread = "" if report.between_map_sd is None else f"exams of a visit differ by {100 * report.between_map_sd:.0f} %"
+    sd = report.between_map_sd
+    spread = "" if sd is None else f"exams of a visit differ by {spread_percent(sd)}"
     known = [visit.fat_mm for visit in report.visits if visit.fat_mm is not None]
     all_known = len(known) == len(report.visits)
     depth = f"; fat under the head {', '.join(f'{one:.1f}' for one in known)} mm deep by visit" if all_known else ""

@@ -25,6 +25,7 @@ from tactile_bayes.report.compare import (
     rate_sentences,
     verdict_sentence,
 )
+from tactile_bayes.report.estimate_text import spread_percent
 from tactile_bayes.report.figure_file import exam_title, figure_file
 from tactile_bayes.report.map import draw_cells, draw_edges, ellipse_of
 from tactile_bayes.report.pages import cut, foot, page
@@ -184,6 +185,7 @@ def growth_page(
         side_mm=2 * HALF_MM,
         chart=_chart(compared, report, course),
         another=compared.another,
+        spread=None if report.between_map_sd is None else spread_percent(report.between_map_sd),
         change=svg.size_ruler(changes, unit="%", label="Change of the largest diameter in percent"),
         sentences=change_sentences(report),
         rates=rate_sentences(report),
