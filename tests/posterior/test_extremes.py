@@ -44,7 +44,7 @@ NOTHING = {
     "no readings": (grid_map(np.ones((9, 9)), count=0), SamplerSettings(), "no covered cell"),
     "one cell": (few(1), SamplerSettings(), "too few covered cells"),
     "three cells": (few(3), SamplerSettings(), "too few covered cells"),
-    "one row": (grid_map(bump_values()[25:26]), SamplerSettings(noise="field", background="free"), "all in one line"),
+    "one row": (grid_map(bump_values()[25:26]), SamplerSettings(), "all in one line"),
     "flat": (grid_map(np.ones((51, 51))), SamplerSettings(), "nothing was felt"),
     "flat, level unknown": (unknown_level(np.full((51, 51), 7.0)), FREE, "nothing was felt"),
     "noise only": (grid_map(1 + NOISE), SamplerSettings(), ""),
