@@ -8,7 +8,6 @@ import logging
 import os
 import signal
 import stat
-import sys
 import threading
 import time
 import zlib
@@ -19,7 +18,6 @@ from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from types import ModuleType
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 from tactile_bayes import __version__
@@ -208,9 +206,6 @@ def _check_header(first: bytes, header: Mapping[str, Any], *, path: Path) -> Non
 # --- Executors for batches: this process, local worker processes or a dask cluster.
 
 
-_STARTING: Final = threading.Lock()
-
-
 class LocalWorkers(Executor):
     """Local worker processes, spawned and not forked: libraries with threads do not survive a fork.
 
@@ -239,8 +234,7 @@ class LocalWorkers(Executor):
     def _run_item(self, fn: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Run an item in this thread's process, which is started if it has none."""
         if getattr(self._local, "process", None) not in self._running:
-            of_script = any(getattr(one, "__module__", "") == "__main__" for one in args)
-            self._local.process = self._start(of_script=of_script)
+            self._local.process = self._start()
         process = self._local.process
         pipe = self._running[process]
         try:
@@ -255,22 +249,16 @@ class LocalWorkers(Executor):
             raise value
         return value
 
-    def _start(self, *, of_script: bool) -> BaseProcess:
-        """A new process; only one whose function is `of_script` runs the user's script, which may have no guard."""
+    def _start(self) -> BaseProcess:
         import multiprocessing
 
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
         process = context.Process(target=_serve_items, args=(theirs,), daemon=True)
-        with _STARTING, self._lock:
+        with self._lock:
             if self._stopped:
                 raise BrokenExecutor("the processes were stopped")
-            script = sys.modules["__main__"]
-            sys.modules["__main__"] = script if of_script else ModuleType("__main__")
-            try:
-                process.start()
-            finally:
-                sys.modules["__main__"] = script
+            process.start()
             self._running[process] = ours
         theirs.close()
         return process

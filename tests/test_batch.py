@@ -201,20 +201,6 @@ def test_a_worker_killed_while_it_hands_over_its_result_holds_up_nobody(tmp_path
     assert told == "[20000000, 20000000, 20000000]\n"
 
 
-@pytest.mark.long
-def test_a_script_without_a_guard_runs_once(tmp_path, child_environment):
-    """Each worker ran it again: pages of tracebacks, and at the end a lack of memory was suspected."""
-    script = tmp_path / "run.py"
-    script.write_text(
-        "import math\n"
-        "from tactile_bayes.batch import open_executor, run_batch\n"
-        "with open_executor(workers=2) as executor:\n"
-        "    print([one.value for one in run_batch(math.sqrt, [4.0, 9.0], key=str, executor=executor)])\n"
-    )
-    told = subprocess.run([sys.executable, str(script)], env=child_environment, capture_output=True, text=True)
-    assert (told.stdout, told.stderr) == ("[2.0, 3.0]\n", "")
-
-
 def waits_to_write(pid: int) -> bool:
     """Whether a process sleeps in the middle of sending: the pipe is full and nobody reads."""
     where = Path(f"/proc/{pid}/syscall").read_text().split()[0]
