@@ -257,7 +257,7 @@ def _compared(
     if why := without_calibration([one.report for maps in visits for one in maps]):
         return VisitComparison("no_estimate", why, "compare maps that have a size each")
     map_places = [[place for answer in maps if (place := patient_place(answer.report)) is not None] for maps in shown]
-    places = [PatientPlace.mean_of(map_place) for map_place in map_places]
+    places = [PatientPlace.mean_of(of_visit) for of_visit in map_places]
     shifts = tuple(
         None if first is None or later is None else place_shift(first, later, registration_mm=comparing.registration_mm)
         for first, later in ((places[0], later) for later in places[1:])

@@ -297,7 +297,7 @@ def _corrected(table: Path | Sheet, base: str, options: LearnOptions, progress: 
             declared = [name for name in _MAPS if getattr(options, name) is not None]
             _refuse(declared, "is for tables of amplitudes and widths: map files state how they were made", *_MAPS)
             rows = read_table(table, "phantom_maps.table.json")
-            names = [str(column) for column in rows.columns["file"]]
+            names = [str(file) for file in rows.columns["file"]]
             folder = table.parent if isinstance(table, Path) else Path()
             inputs |= {f"map_{i}": folder / name for i, name in enumerate(names, start=1)}
         else:

@@ -334,7 +334,7 @@ def make_growth(
     """
     answers = [[_answer(folder / name) for name in names] for names in visits]
     with_draws = [one for maps in answers for one in maps if one.shape is not None]
-    placed = all(draw.report.centre_patient_mm is not None for draw in with_draws)
+    placed = all(answer.report.centre_patient_mm is not None for answer in with_draws)
     files = [[folder / name / layout.MAP for name in names] for names in visits]
     dates = [date.fromisoformat(day) for day in course.dates if day]
     days = tuple(float((day - dates[0]).days) for day in dates) if len(dates) == len(visits) else None

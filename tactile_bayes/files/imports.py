@@ -5,7 +5,6 @@ Arrays are in mm, kPa and s and read without pickle; `arrays_layout.LAYOUT` desc
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
@@ -24,6 +23,7 @@ from tactile_bayes.files.reading import kind_of
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.scan_text import is_identity, read_frames, read_poses, visible_poses
 from tactile_bayes.files.sequence_mha import is_sequence, read_sequence
+from tactile_bayes.findings import LEADS
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.select import LEAST_FRAMES, unit_question
 from tactile_bayes.presets import KPA_PER_UNIT, MM_PER_UNIT, PRESSURE_RANGE_KPA, PRESSURE_WINDOW_KPA
@@ -243,7 +243,7 @@ def _arrange_poses(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
             notes.append(f"{name} of shape {(width, pose_count)} read along its columns")
     if "quaternion_wxyz" in arrays and stated.pose_layout in ("xyzw", "euler"):
         if stated.pose_layout == "euler" and np.abs(arrays["quaternion_wxyz"]).max() <= _TURN:
-            caution = f"CAUTION: angles lie within {_TURN:.1f} and are read as degrees"
+            caution = f"{LEADS['caution']}angles lie within {_TURN:.1f} and are read as degrees"
             notes.append(f"{caution}: radians are to be multiplied by 57.296")
         arrays["quaternion_wxyz"] = quaternions(arrays["quaternion_wxyz"], stated.pose_layout)
     if "position_mm" in arrays:
@@ -342,8 +342,8 @@ def _check_order(counts: np.ndarray, stated: Stated, notes: list[str]) -> None:
         apart[:, np.r_[0 : lines.shape[1] : 2, 1 : lines.shape[1] : 2]] = lines
         rough[f"every second {name} runs backwards"] = _roughness(backwards)
         rough[f"every second {name} stands behind all the others"] = _roughness(apart)
-    other, roughness = min(rough.items(), key=operator.itemgetter(1))
-    as_stated = _roughness(frames)
+    other = min(rough, key=rough.__getitem__)
+    roughness, as_stated = rough[other], _roughness(frames)
     transposed = _roughness(frames.reshape(-1, *frames.shape[:0:-1]).swapaxes(1, 2))
     if roughness >= min(_OTHER_ORDER * as_stated, transposed):  # of transposed frames the check of arrangements speaks
         return
@@ -351,7 +351,7 @@ def _check_order(counts: np.ndarray, stated: Stated, notes: list[str]) -> None:
     if stated.frame_order is None:
         way_out = "put the readings in the order of the array; --frame-order rows takes them as they are"
         raise BadDataError(what, way_out=way_out)
-    notes.append(f"CAUTION: {what}: the size may be wrong")
+    notes.append(f"{LEADS['caution']}{what}: the size may be wrong")
 
 
 def _roughness(frames: FloatArray) -> float:
@@ -415,9 +415,8 @@ def _pressure_note(kpa: FloatArray, unit: str, *, rounding: str) -> str:
     if middle >= PRESSURE_RANGE_KPA[1]:
         what = f"frames in {unit}: {means_of}, and an array's range ends at {PRESSURE_RANGE_KPA[1]:g} kPa"
         raise BadDataError(what, way_out=question or "give their unit, --unit")
-    return (
-        f"{'CAUTION: ' if question else ''}frames in {unit}{rounding}; {means_of}{f': {question}' if question else ''}"
-    )
+    lead, end = (LEADS["caution"], f": {question}") if question else ("", "")
+    return f"{lead}frames in {unit}{rounding}; {means_of}{end}"
 
 
 # --- Checks of arrays in the layout.

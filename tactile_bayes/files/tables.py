@@ -21,6 +21,7 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.reading import TABLE_BYTES, ZIP_MAGIC, decoded, decoding, first_bytes, kind_of, read_bytes
+from tactile_bayes.findings import counted
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import MM_PER_UNIT
 
@@ -298,8 +299,8 @@ def _check_length(line: int, cells: Sequence[str], header: Sequence[str]) -> Non
     way_out = "give every row a cell for each column"
     if len(cells) > len(header):
         way_out += " (a decimal comma? write 12.5, not 12,5)"
-    plural = "s" * (len(cells) > 1)
-    raise BadDataError(f"line {line}: {len(cells)} cell{plural} under {len(header)} columns", way_out=way_out)
+    what = f"line {line}: {counted(len(cells), 'cell')} under {len(header)} columns"
+    raise BadDataError(what, way_out=way_out)
 
 
 def _cell(line: int, text: str, field: Mapping[str, Any], *, decimal_comma: bool) -> Any:

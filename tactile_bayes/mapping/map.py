@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tactile_bayes.declarations import Meta, Record, field, set_fields
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.findings import Finding, capitalised, finding
+from tactile_bayes.findings import Finding, capitalised, counted, finding
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.scans import HeadShape
 
@@ -230,7 +230,7 @@ def broken_assumptions(quality: Mapping[str, float], *, strokes_lengthwise: int 
         few_used = quality.get("frames_used", 0.0) < MOST_USED * quality.get("frames_total", 0.0)
         whose = f"the {quality['frames_used']:.0f} frames used make" if few_used else "the scan has"
         text = (
-            f"{whose} {strokes:.0f} stroke{'' if strokes == 1 else 's'} only, and sizes were learned from 4 to 7 "
+            f"{whose} {counted(int(strokes), 'stroke')} only, and sizes were learned from 4 to 7 "
             "(simulated ones from 3 came out 6 % large)"
         )
         remedy = f"scan with {LEAST_STROKES} strokes or more, side by side"
@@ -260,8 +260,8 @@ def side_findings(
     place = f"the landmarks put {what} {abs(patient_mm[0]):.0f} mm to the patient's {other} of the xiphoid"
     text = f"the {'table' if in_table else 'scan'} says {side} breast, and {place}: side or landmarks are wrong"
     check = "check which breast it was, and that sternal notch and xiphoid are not exchanged"
-    correct = "`import SCAN.mcap -o NEW.mcap` corrects them by --session and --landmarks"
-    correct = "correct the row" if in_table else correct
+    by_import = "`import SCAN.mcap -o NEW.mcap` corrects them by --session and --landmarks"
+    correct = "correct the row" if in_table else by_import
     return (finding("side", text, f"{check}; {correct}", check),)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.findings import Finding, finding
+from tactile_bayes.findings import Finding, counted, finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 from tactile_bayes.mapping import cells
 from tactile_bayes.presets import KPA_PER_UNIT, PRESSURE_WINDOW_KPA
@@ -475,9 +475,7 @@ def _without_poses(selections: list[SelectedFrames]) -> BadDataError:
 def _short(selections: Sequence[SelectedFrames]) -> str:
     """Beginning of a way out, where scans have too few frames."""
     frames = sum(len(part.scan.frames) for part in selections)
-    return f"the scan has {frames} frame{'' if frames == 1 else 's'} only: record for longer; " * (
-        frames < LEAST_FRAMES
-    )
+    return f"the scan has {counted(frames, 'frame')} only: record for longer; " if frames < LEAST_FRAMES else ""
 
 
 def _outside_window(selections: list[SelectedFrames], window: tuple[float, float]) -> BadDataError:

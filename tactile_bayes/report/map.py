@@ -186,9 +186,10 @@ def _notes(tactile_map: TactileMap) -> Iterator[str]:
 def _advice(quality: Mapping[str, float]) -> Iterator[str]:
     """Advice on the pressure window and on skewed strokes."""
     gated = quality.get("dropped_low", 0.0) + quality.get("dropped_high", 0.0)
-    if gated > _MUCH_GATED * quality.get("frames_total", np.inf) and quality["level_p05_kpa"] < CONTACT_KPA:
+    many = gated > _MUCH_GATED * quality.get("frames_total", np.inf)
+    if many and quality["level_p05_kpa"] < CONTACT_KPA:
         yield "the head was lifted: keep it on the skin"
-    elif gated > _MUCH_GATED * quality.get("frames_total", np.inf):
+    elif many:
         ends = f"{quality['level_p05_kpa']:.1f} to {quality['level_p95_kpa']:.1f} kPa"
         high = quality.get("dropped_high", 0.0) / gated
         press = "less hard" if high > _MOSTLY else "harder" if high < 1 - _MOSTLY else "more evenly"

@@ -259,7 +259,7 @@ class ModalityRatio(Figures):
 def mape_ratios(sizes: Mapping[str, ModalitySizes], *, intervals: Intervals) -> dict[str, ModalityRatio]:
     """Ratio of every other modality to the tactile one; empty without a tactile one."""
     ratios = {}
-    for name in [size for size in sizes if size != REFERENCE] if REFERENCE in sizes else []:
+    for name in [other for other in sizes if other != REFERENCE] if REFERENCE in sizes else []:
         pair = sizes[name], sizes[REFERENCE]
         looked_for, both_detected = on_common_masses(*pair), on_common_masses(*(one.only_detected() for one in pair))
         figures = {

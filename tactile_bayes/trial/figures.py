@@ -156,7 +156,7 @@ def squares(sums: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
     The last six terms are 1, x', y', x'x', x'y', y'y', where ' is about the means of all masses.
     """
-    n, a, b, aa, ab, bb = sums[..., -6:].T
+    n, a, b, aa, ab, bb = np.moveaxis(sums[..., -6:], -1, 0)
     return aa - a * a / n, bb - b * b / n, ab - a * b / n
 
 
