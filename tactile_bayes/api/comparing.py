@@ -195,8 +195,12 @@ def compare_answers(
     *,
     names: Names,
     files: Files = (),
+    numbers: Sequence[str] = (),
 ) -> Comparison:
-    """Compare the visits of one mass, from answers for their maps in order of time."""
+    """Compare the visits of one mass, from answers for their maps in order of time.
+
+    `numbers` of the visits for findings and reasons, with codes where these are others; by default from 1 on.
+    """
     if len(visits) < 2 or not all(visits):
         raise UsageError("a comparison needs two visits of a map or more each: `compare VISIT1.nc --with VISIT2.nc`")
     comparing.check_visits(len(visits))
@@ -208,10 +212,11 @@ def compare_answers(
     calibration, digests = common_calibration(answers, settings, names=all_names, inputs=inputs)
     for index, earlier in repeated_scans([_scans([one]) for one in answers]).items():  # they are no two exams
         raise UsageError(f"{all_names[index]} and {all_names[earlier]} are of one scan; give one map of each scan")
-    compared = _compared(visits, calibration, settings, comparing)
+    by_number = dict(zip(numbers or map(str, range(1, len(visits) + 1)), visits, strict=True))
+    compared = _compared(by_number, calibration, settings, comparing)
     of_visits = (
         one.labelled(f"visit {number}" if len(maps) == 1 else f"visit {number}, map {i}")
-        for number, maps in enumerate(visits, start=1)
+        for number, maps in by_number.items()
         for i, answer in enumerate(maps, start=1)
         for one in answer.report.findings
         if one.kind != "outside_calibration"  # of a size alone: judged anew
@@ -243,37 +248,40 @@ def compare_estimates(
 
 
 def _compared(
-    visits: Sequence[Sequence[Answer]], calibration: BodyCalibration, settings: Settings, comparing: CompareOptions
+    visits: Mapping[str, Sequence[Answer]], calibration: BodyCalibration, settings: Settings, comparing: CompareOptions
 ) -> VisitComparison:
-    """Compare the visits, unless codes, places or missing lumps forbid it."""
-    shown = [[answer for answer in maps if answer.shape is not None] for maps in visits]
-    missing = [words for number, maps in enumerate(visits, start=1) if (words := _missing(maps, f"visit {number}"))]
-    contradicted = contradictions([_scans(visit) for visit in visits])
+    """Compare the visits, by their numbers, unless codes, places or missing lumps forbid it."""
+    shown = {number: [answer for answer in maps if answer.shape is not None] for number, maps in visits.items()}
+    missing = [words for number, maps in visits.items() if (words := _missing(maps, f"visit {number}"))]
+    contradicted = contradictions({number: _scans(maps) for number, maps in visits.items()})
     if contradicted:
         advice = "compare exams of one mass; where a code is wrong, correct it in the scans' session and map them again"
         return VisitComparison("not_one_mass", "; ".join(contradicted), advice)
     if missing:
         return VisitComparison("no_estimate", "; ".join(missing), "scan the mass again, or leave that visit out")
-    if why := without_calibration([one.report for maps in visits for one in maps]):
+    if why := without_calibration([one.report for maps in visits.values() for one in maps]):
         return VisitComparison("no_estimate", why, "compare maps that have a size each")
-    map_places = [[place for answer in maps if (place := patient_place(answer.report)) is not None] for maps in shown]
+    map_places = [
+        [place for answer in maps if (place := patient_place(answer.report)) is not None] for maps in shown.values()
+    ]
     places = [PatientPlace.mean_of(of_visit) for of_visit in map_places]
     shifts = tuple(
         None if first is None or later is None else place_shift(first, later, registration_mm=comparing.registration_mm)
         for first, later in ((places[0], later) for later in places[1:])
     )
+    first, *later = visits
     doubts = [
-        f"the masses of visits 1 and {number} lie {one.distance_mm:.0f} mm apart "
+        f"the masses of visits {first} and {number} lie {one.distance_mm:.0f} mm apart "
         f"(one mass: SD {one.sd_mm:.0f} mm each way)"
-        for number, one in enumerate(shifts, start=2)
+        for number, one in zip(later, shifts, strict=True)
         if one is not None and one.doubtful
     ]
     doubts += [
         f"the masses on the maps of visit {number} lie too far apart for one"
-        for number, maps in enumerate(map_places, start=1)
+        for number, maps in zip(visits, map_places, strict=True)
         if one_place_probability(maps, registration_mm=comparing.registration_mm) < LEAST_PROBABILITY
     ]
-    unknown = [str(number) for number, place in enumerate(places, start=1) if place is None]
+    unknown = [number for number, place in zip(visits, places, strict=True) if place is None]
     if not comparing.same_mass and doubts:
         advice = "compare exams of one mass; if it is one, --same-mass says so (a wider posture: --registration-mm)"
         on_paper = "look whether they are of one mass"
@@ -299,7 +307,7 @@ def _missing(maps: Sequence[Answer], visit: str) -> str:
 
 
 def _sized(
-    visits: Sequence[Sequence[Answer]],
+    visits: Mapping[str, Sequence[Answer]],
     calibration: BodyCalibration,
     settings: Settings,
     *,
@@ -308,16 +316,17 @@ def _sized(
 ) -> VisitComparison:
     """Compare the sizes of visits of one mass, or say why they have none."""
     # sorted, so that the result does not depend on the order of a visit's maps
-    shapes: list[list[ShapeDraws]] = [
-        sorted((answer.shape for answer in maps if answer.shape is not None), key=lambda one: one.order)
-        for maps in visits
-    ]
+    by_number: dict[str, list[ShapeDraws]] = {
+        number: sorted((answer.shape for answer in maps if answer.shape is not None), key=lambda one: one.order)
+        for number, maps in visits.items()
+    }
+    shapes = list(by_number.values())
     fitted = visit_calibrations(shapes, calibration)
-    far = _by_visit(shapes, fitted, far=True)
+    far = _by_visit(by_number, fitted, far=True)
     if far:
         return VisitComparison("no_estimate", f"too {UNLIKE_LEARNED}: {'; '.join(far)}", "", shifts)
     priors = size_priors(settings)
-    fingerprints = sorted(answer.fingerprint for maps in visits for answer in maps)
+    fingerprints = sorted(answer.fingerprint for maps in visits.values() for answer in maps)
 
     def joint(between: BetweenMaps | None) -> JointSizes:
         rng = np.random.default_rng([settings.seed, *fingerprints])
@@ -326,7 +335,7 @@ def _sized(
     sizes = joint(None)
     if np.isnan(sizes.log_size).mean() > MOST_INVALID:
         return VisitComparison("no_estimate", "too many draws have no positive size", "", shifts)
-    outside = _by_visit(shapes, fitted)
+    outside = _by_visit(by_number, fitted)
     fat = calibration.depth
     depths = None if fat is None else fat.disagreement_mm([one.profile for maps in shapes for one in maps])
     findings = [
@@ -334,7 +343,7 @@ def _sized(
         *(finding("outside_calibration", f"{UNLIKE_LEARNED}: {text}") for text in outside),
         *([] if depths is None else [fat_apart(depths)]),
     ]
-    for number, (maps, at) in enumerate(zip(shapes, fitted, strict=True), start=1):
+    for (number, maps), at in zip(by_number.items(), fitted, strict=True):
         chance = one_size_by_draws(log_sizes(at, maps), priors.between_maps)
         if chance < LEAST_PROBABILITY:
             findings.append(disagreement("its maps show different sizes", chance).labelled(f"visit {number}"))
@@ -343,12 +352,12 @@ def _sized(
 
 
 def _by_visit(
-    shapes: Sequence[Sequence[ShapeDraws]], fitted: Sequence[BodyCalibration], *, far: bool = False
+    shapes: Mapping[str, Sequence[ShapeDraws]], fitted: Sequence[BodyCalibration], *, far: bool = False
 ) -> list[str]:
     """Texts on maps whose medians lie outside the calibration of their visit, or `far` outside, each once."""
     texts = [
         f"visit {number}: {text}"
-        for number, (maps, at) in enumerate(zip(shapes, fitted, strict=True), start=1)
+        for (number, maps), at in zip(shapes.items(), fitted, strict=True)
         for one in maps
         for text in at.outside(*one.middle, far=far)
     ]

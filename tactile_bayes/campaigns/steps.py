@@ -339,7 +339,7 @@ def make_growth(
     dates = [date.fromisoformat(day) for day in course.dates if day]
     days = tuple(float((day - dates[0]).days) for day in dates) if len(dates) == len(visits) else None
     comparing = CompareOptions(days=days, same_mass=not placed)
-    compared = compare_answers(answers, settings, comparing, names=visits, files=files)
+    compared = compare_answers(answers, settings, comparing, names=visits, files=files, numbers=course.numbers)
     report = compared.report.checked()
     drawn_maps = [
         [DrawnMap(read_map(path), one.report) for path, one in zip(paths, maps, strict=True)]

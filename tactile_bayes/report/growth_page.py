@@ -155,11 +155,17 @@ class Course(Record):
 
     def of(self, visit: Visit) -> str:
         """A visit in words: its number, by which sentences and findings name it, its code, and its date or its day."""
-        index, number = visit.visit - 1, str(visit.visit)
-        code = self.visits[index] if self.visits else number
+        index = visit.visit - 1
         day = "" if visit.day is None or not index else f"day {visit.day:g}"
         when = self.dates[index] if self.dates else day
-        return f"Visit {number}{'' if code == number else f' (coded {code})'}{when and f', {when}'}"
+        return f"Visit {self.numbers[index] if self.visits else visit.visit}{when and f', {when}'}"
+
+    @property
+    def numbers(self) -> list[str]:
+        """Numbers of the visits that have codes, with the code where it is not the number."""
+        return [
+            f"{number}{'' if code == str(number) else f' (coded {code})'}" for number, code in enumerate(self.visits, 1)
+        ]
 
 
 def growth_page(

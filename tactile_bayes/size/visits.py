@@ -87,12 +87,12 @@ def place_shift(earlier: PatientPlace, later: PatientPlace, *, registration_mm: 
     return PlaceShift((float(shift[0]), float(shift[1])), float(np.sqrt(along @ spread @ along)), probability)
 
 
-def contradictions(visits: Sequence[Sequence[Mapping[str, str]]]) -> list[str]:
-    """Contradictions between the exam facts that the scans of all visits give, in words."""
+def contradictions(visits: Mapping[str, Sequence[Mapping[str, str]]]) -> list[str]:
+    """Contradictions between the exam facts that the scans of all visits give, in words; `visits`: by number."""
     texts = []
     for key, plural in CODES.items():
-        first_visit: dict[str, int] = {}
-        for number, scans in enumerate(visits, start=1):
+        first_visit: dict[str, str] = {}
+        for number, scans in visits.items():
             for scan in scans:
                 if scan.get(key):
                     first_visit.setdefault(scan[key], number)

@@ -133,16 +133,16 @@ def test_visits_without_an_order_and_an_excision_before_all_are_refused_before_a
     assert "table of exams, line 2, column date: of this mass and all its others are after excision" in early.stderr
 
 
-def test_one_visit_has_no_growth_and_landmarks_are_not_needed(tmp_path: Path) -> None:
+def test_one_visit_has_no_growth_landmarks_are_not_needed_and_findings_have_the_tables_codes(tmp_path: Path) -> None:
     for visit, sigma in enumerate(WIDTHS["P1"]):
         written(tmp_path / f"P1-{visit}-1.nc", sigma=sigma, seed=visit, landmarks=False)
-    lines = [line for line in rows() if line.startswith("P1") and ",1,1," in line and "-1.nc" in line]
+    lines = [line for line in rows(("pre", "post")) if line.startswith("P1") and "-1.nc" in line]
     one = campaign(tmp_path, lines[:1]).stdout
     assert "growth" not in one
     assert not (tmp_path / "out" / "growth.csv").exists()
     both = campaign(tmp_path, lines).stdout
     assert "1 grown (growth.csv)" in both
     (row,) = rows_of(tmp_path / "out" / "growth.csv")
-    assert "CAUTION: no landmarks show where the mass of visit" in row["findings"]
+    assert "CAUTION: no landmarks show where the mass of visit 1 (coded pre) lies" in row["findings"]
     campaign(tmp_path, lines[:1])  # files that this run would not make go
     assert not (tmp_path / "out" / "growth").exists()

@@ -49,11 +49,11 @@ def test_a_visits_place_is_the_mean_of_its_maps():
     ],
 )
 def test_codes_that_differ_are_named(key, values, words):
-    visits = [[{"sha256": "0", key: value}] for value in values]
-    assert contradictions(visits) == [f"the scans name {words}"]
-    assert contradictions([visits[0], visits[0]]) == []
-    assert contradictions([visits[0], [{"sha256": "1"}]]) == []
+    first, later = ([{"sha256": "0", key: value}] for value in values)
+    assert contradictions({"1": first, "2": later}) == [f"the scans name {words}"]
+    assert contradictions({"1": first, "2": first}) == []
+    assert contradictions({"1": first, "2": [{"sha256": "1"}]}) == []
 
 
 def test_a_visits_own_scans_may_not_contradict_each_other():
-    assert contradictions([[{"side": "left"}, {"side": "right"}], [{"side": "left"}]])
+    assert contradictions({"1": [{"side": "left"}, {"side": "right"}], "2": [{"side": "left"}]})
