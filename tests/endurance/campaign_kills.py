@@ -1,7 +1,7 @@
 """SIGKILL at random moments of a small campaign: same bytes, nothing redone, nothing left behind.
 
-    python tests/endurance/campaign_kills.py DIR [--what local|repeats|client|worker|scheduler] [--kills 50]
-        [--seed 114]
+    python tests/endurance/campaign_kills.py DIR [--what local|pool|repeats|client|worker|scheduler]
+        [--kills 50] [--seed 114]
 
 makes a small campaign in DIR, runs it once undisturbed, and then again and again, kills it, and starts it again in the
 same folder until it ends by itself. Then the folder must hold the undisturbed run's bytes, the journal no step twice,
@@ -9,6 +9,9 @@ and no temporary file may be left. The exit code is 1 where any of it fails.
 
 local
     12 exams of 6 patients with one worker or two, killed when they have used a random CPU time. The workers must end.
+pool
+    The exams of ``local`` with two workers, of which one is killed at a random step. Another takes its place and the
+    run goes on; an exam over which two ended has failed, and the next run makes it.
 repeats
     6 masses with 3 exams each, 5 of which are found, so that the campaign learns the site's repeatability. Each folder
     begins where all exams are estimated; half of the kills come while the spread is learned, the others while sizes and
@@ -39,9 +42,10 @@ from campaign_cluster import Cluster
 from campaign_scale import entries
 from campaign_scans import Faults, make
 
+from tactile_bayes.batch import DIED_TWICE
 from tactile_bayes.files.manifest_csv import JOURNAL
 
-WHAT: Final = ("local", "repeats", "client", "worker", "scheduler")
+WHAT: Final = ("local", "pool", "repeats", "client", "worker", "scheduler")
 MASSES, REPEATS = 6, 3
 MOST_CPU_S, GRACE_S, SETTLED_S = 9.0, 10.0, 10.0
 MOST_KILLS_IN_A_FOLDER = 3
@@ -61,6 +65,8 @@ class Tally:
     different: int = 0
     stray: int = 0
     left_by_kills: int = 0
+    failed: int = 0
+    """Runs with an exam over which two workers ended."""
     untold: int = 0
     """Losses of the scheduler that the client did not tell in one line with code 1."""
     during: Counter[str] = field(default_factory=Counter)
@@ -168,6 +174,24 @@ class Study:
             self._check()
         return self.tally
 
+    def disturb_pool(self) -> Tally:
+        """Kill workers of runs that go on, and check as `disturb`."""
+        while self._more():
+            self._begin(None)
+            again, most = True, self.tally.kills + self._rng.randint(1, MOST_KILLS_IN_A_FOLDER)
+            while again:
+                process = start(self._folder, "out", "--workers", "2")
+                while self._more(most) and self._wait_for_a_moment(process):
+                    if workers := _pool_of(process):
+                        self._rng.choice(workers).kill()
+                        self._note("a worker of two")
+                process.wait()
+                self._must_end_well(process)
+                again = DIED_TWICE in (self._out / "failures.csv").read_text()
+                self.tally.failed += again
+            self._check()
+        return self.tally
+
     def disturb_cluster(self, cluster: Cluster, victim: str) -> Tally:
         """Kill the client, a worker or the scheduler of a dask cluster, and check as `disturb`."""
         cluster.start()
@@ -203,7 +227,8 @@ class Study:
 
     def _wait_for_a_moment(self, process: subprocess.Popen[bytes]) -> bool:
         """Wait for a step drawn of those that are missing, and for a random moment more; whether the run goes on."""
-        target = self._rng.randint(len(_steps_in(self._out)), self._steps - 1)
+        last = self._steps - 1
+        target = self._rng.randint(min(len(_steps_in(self._out)), last), last)
         while process.poll() is None and len(_steps_in(self._out)) < target:
             time.sleep(0.003)
         time.sleep(self._rng.uniform(0.0, 0.5))
@@ -259,6 +284,13 @@ def _running_workers(cluster: Cluster) -> list[str]:
     return names
 
 
+def _pool_of(process: subprocess.Popen[bytes]) -> list[psutil.Process]:
+    """The worker processes of a run."""
+    with contextlib.suppress(psutil.Error):
+        return [one for one in psutil.Process(process.pid).children() if "spawn_main" in " ".join(one.cmdline())]
+    return []
+
+
 def entries_or_none(journal: Path) -> list[str]:
     """Keys of the whole lines of a journal that may have been cut off."""
     lines = journal.read_bytes().split(b"\n")[1:-1] if journal.exists() else []
@@ -271,7 +303,7 @@ def _steps_in(out: Path) -> list[str]:
 
 def prepare(folder: Path, what: str) -> None:
     """Scans, table of exams and the undisturbed run."""
-    if what == "local":
+    if what in ("local", "pool"):
         make(folder, patients=6, exams=2, bodies=3, faults=Faults(cut=11, damaged=0), empty_every=3)
     elif what == "repeats":
         make(folder, patients=MASSES, exams=REPEATS, bodies=MASSES, faults=Faults(0, 0), empty_every=0)
@@ -343,6 +375,8 @@ def main(folder: Path, *, what: str, kills: int, seed: int, port: int) -> Tally:
     study = Study(folder, kills=kills, seed=seed)
     if what == "local":
         return study.disturb(lambda rng, _: rng.uniform(0.05, MOST_CPU_S))
+    if what == "pool":
+        return study.disturb_pool()
     if what == "repeats":
         begun = all_estimated(folder)
         return study.disturb(moments_of_learning(folder, begun), begun=begun)
