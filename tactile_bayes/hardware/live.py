@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Final
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 import numpy as np
 
@@ -456,17 +456,17 @@ class LiveServer:
 
     def _answer_request(self, connection: Any, request: Any) -> Any:
         """Answer with the page or a refusal; None accepts a websocket."""
-        address = urlsplit(request.path)
-        token = parse_qs(address.query).get("token", [""])[0]
+        path, _, query = request.path.partition("?")
+        token = parse_qs(query).get("token", [""])[0]
         if not hmac.compare_digest(token.encode(), self._token.encode()):
             return connection.respond(HTTPStatus.FORBIDDEN, "give the whole address that `record` printed\n")
         if request.headers.get_all("Host") != [self._authority]:
             return connection.respond(HTTPStatus.FORBIDDEN, "not under this name\n")
-        if address.path == "/live":
+        if path == "/live":
             if request.headers.get_all("Origin") != [f"http://{self._authority}"]:
                 return connection.respond(HTTPStatus.FORBIDDEN, "not from another site\n")
             return None
-        if address.path != "/":
+        if path != "/":
             return connection.respond(HTTPStatus.NOT_FOUND, "nothing here\n")
         nonce = secrets.token_urlsafe(16)
         page = _PAGE.read_text(encoding="utf-8").replace("NONCE", nonce)

@@ -185,6 +185,15 @@ def test_a_header_given_twice_is_refused(header):
     server.close()
 
 
+def test_a_path_that_is_no_address_is_refused_without_a_word_on_the_terminal(caplog):
+    server = LiveServer("127.0.0.1", 0)
+    with handshake(server, path="//[/live") as line:
+        line.settimeout(10.0)
+        assert b" 404 " in line.recv(4096).splitlines()[0]
+    server.close()
+    assert not [record for record in caplog.records if record.levelname == "ERROR"]
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("states", [0, 2], ids=["waiting", "full"])
 def test_pages_that_do_not_read_are_cut_off(states):
