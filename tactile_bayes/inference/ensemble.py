@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
 import warnings
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -24,7 +26,13 @@ def _arviz() -> Any:
     """Arviz, imported on first use: that takes longer than an estimate."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # its notice of the next major version, which is pinned away
-        import arviz
+        try:
+            import arviz
+        except (OSError, RuntimeError):  # no home, or one that cannot be written, to note in that it gave the notice
+            from unittest.mock import patch
+
+            with tempfile.TemporaryDirectory() as home, patch.dict(os.environ, HOME=home, XDG_CACHE_HOME=home):
+                import arviz
     return arviz
 
 
@@ -41,11 +49,8 @@ def convergence(draws: FloatArray) -> dict[str, float]:
     unit) of (chain, draw) draws; NaN ranks as the smallest value."""
     finite_draws = np.where(np.isfinite(draws), draws, np.nanmin(draws))
     errors = {"mcse_median": 0.5, "mcse_low": 0.025, "mcse_high": 0.975}
-    quantile = {
-        name: float(_arviz().mcse(finite_draws, method="quantile", prob=probability))
-        for name, probability in errors.items()
-    }
-    return _agreement(finite_draws) | quantile
+    error_at = partial(_arviz().mcse, finite_draws, method="quantile")
+    return _agreement(finite_draws) | {name: float(error_at(prob=share)) for name, share in errors.items()}
 
 
 class DrawGroup(Record, eq=False):

@@ -61,6 +61,14 @@ def test_figures_are_what_their_names_say(tmp_path: Path) -> None:
         assert (tmp_path / name).read_bytes().startswith(MAGIC[Path(name).suffix])
 
 
+@pytest.mark.long
+def test_a_home_that_cannot_be_written_costs_no_figure(tmp_path: Path, run_python) -> None:
+    write(tmp_path / "post.nc", 4)
+    nowhere = {"HOME": "/proc", "XDG_CACHE_HOME": "/proc/none", "MPLCONFIGDIR": str(tmp_path)}
+    done = run_python("-m", "tactile_bayes", "diagnose", "post.nc", cwd=tmp_path, env=nowhere)
+    assert done.returncode == 0, done.stderr
+
+
 def test_one_chain_has_a_pareto_shape_and_no_ranks(tmp_path: Path) -> None:
     write(tmp_path / "post.nc", 1)
     done = run_here("diagnose", tmp_path / "post.nc", cwd=tmp_path)
