@@ -122,15 +122,25 @@ def records_csv(estimates: Sequence[EstimateFile], identity: Identity, *, id_fro
     """CSV with one record per mass of each estimate.
 
     Record IDs begin with the identity's `patient_id`, or with the scans' subject codes where `id_from_scan` is true;
-    without either they derive from the estimates' content.
+    without either they derive from the estimates' content. One patient or one date for the scans of several is refused.
     """
+    facts_of = [estimate.facts for estimate in estimates]
+    patients = sorted({facts["subject"] for facts in facts_of if "subject" in facts})
+    if identity.patient_id and len(patients) > 1:
+        fault = f"{identity.patient_id} cannot be patients {', '.join(patients)} of the scans"
+        raise UsageError(f"{fault}; export each by itself, or give --patient-id-from-scan")
+    for patient in patients if identity.study_date else ():
+        visits = sorted({facts["visit"] for facts in facts_of if facts.get("subject") == patient and "visit" in facts})
+        if len(visits) > 1:
+            fault = f"{identity.study_date} cannot be the date of visits {', '.join(visits)} of patient {patient}"
+            raise UsageError(f"{fault}; export each by itself")
     rows = dict[str, RecordRow]()
     for estimate in estimates:
         for mass in estimate.masses:
             name = _record_id(estimate, mass, identity, id_from_scan=id_from_scan)
             if name in rows:
                 both = f"{estimate.path} and {rows[name].estimate.path} would both be record {name}"
-                way_out = "give a scan's visit and mass in its session, or export them into two files"
+                way_out = "pool exams of one visit (estimate --pool), or give a scan's visit and mass in its session"
                 raise UsageError(f"{both}; {way_out}")
             rows[name] = RecordRow(name, estimate, mass, identity)
     cells = ([*(_cell(field, row) for field in FIELDS), "1"] for row in rows.values())

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from export_files import exported
+from in_process import run_here
 
 from tactile_bayes.exports.redcap import COMPLETE
 
@@ -109,6 +110,31 @@ def test_a_record_is_named_by_content_or_by_what_was_told(tables: Any, exam: Pat
     assert rows_of(tmp_path / "a.csv")[0]["record_id"] == "S01-left-2-1"
     exported(exam, "map.json", "--to", "csv", "--patient-id", "K7", "-o", tmp_path / "b.csv")
     assert rows_of(tmp_path / "b.csv")[0]["record_id"] == "K7-left-2-1"
+
+
+@pytest.mark.parametrize(
+    ("facts", "stated", "fault"),
+    [
+        (
+            {"subject": "S02"},
+            ("--patient-id", "K7"),
+            "K7 cannot be patients S01, S02 of the scans; export each by itself",
+        ),
+        ({"visit": "3"}, ("--study-date", "2026-11-24"), "2026-11-24 cannot be the date of visits 2, 3 of patient S01"),
+        ({}, ("--patient-id-from-scan",), "pool exams of one visit (estimate --pool), or give a scan's visit"),
+    ],
+)
+def test_estimates_of_several_are_not_one_persons_one_days_or_one_record(
+    facts: dict[str, str], stated: tuple[str, ...], fault: str, estimate: dict[str, Any], tmp_path: Path
+) -> None:
+    for name, own in {"a": {}, "b": facts}.items():
+        scans = [{"sha256": "0" * 64, "subject": "S01", "visit": "2", **own}]
+        made = estimate["provenance"] | {"scans": scans, "inputs": [{"role": "map", "sha256": name * 64}]}
+        (tmp_path / name).write_text(json.dumps(estimate | {"provenance": made}))
+    done = run_here("export", "a", "b", "--to", "csv", "-o", "out.csv", *stated, cwd=tmp_path)
+    assert done.returncode == 2
+    assert fault in done.stderr
+    assert not (tmp_path / "out.csv").exists()
 
 
 def test_no_cell_is_a_formula_or_breaks_the_line(estimate: dict[str, Any], tmp_path: Path) -> None:
