@@ -80,11 +80,11 @@ def _print_table_summary(search: FolderExams, output: Path, kept: RawTable | Non
 
 
 def campaign_run_action(
-    exams: Path, output: Path, settings_file: Path | None, repeatability: str | None, **options: Any
+    exams: Path, output: Path, settings_file: Path | None, repeatability: Path | None, **options: Any
 ) -> None:
     """Map, estimate and pool the exams of a table, and report the trial."""
     campaign = {name: options.pop(name) for name in names_of(CampaignOptions)}
-    site = None if repeatability in (None, NONE) else Path(str(repeatability))
+    site = None if repeatability == Path(NONE) else repeatability
     estimate = make_settings(settings_file=settings_file, repeatability=site, **options)
     result = run_campaign(
         exams,

@@ -109,6 +109,7 @@ def campaign_init_command() -> None:
 @options.record_options(CampaignOptions, "normalise", "match_mm")
 @click.option(
     "--repeatability",
+    type=options.FilePath(),
     metavar="none|SITE.json",
     help="Spread between exams of one mass: a file as for `estimate`, or none (two intervals: the page leads with that "
     "for patients, the tables hold the narrower). Default: learned from this campaign's repeats, where 5 masses "

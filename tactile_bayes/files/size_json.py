@@ -49,7 +49,7 @@ def size_calibration_path(name: str) -> Path | None:
     if name in SHIPPED:
         return _FOLDER / SHIPPED[name]
     path = Path(name)
-    if path.name == name and not path.suffix and not path.exists():
+    if not name or (path.name == name and not path.suffix and not path.exists()):
         raise UsageError(f"no calibration or file is called {name!r}; give {', '.join(SHIPPED)} or a file")
     return path
 

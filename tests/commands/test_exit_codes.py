@@ -103,6 +103,11 @@ def test_what_nohup_ignores_stays_ignored() -> None:
             "Invalid value for 'MAP.nc...': the path is empty; give the name of a file or folder; "
             "see `tactile-bayes estimate --help`",
         ),
+        (
+            ("campaign", "run", "exams.csv", "-o", "out", "--repeatability", ""),
+            "Invalid value for '--repeatability': the path is empty; give the name of a file or folder; "
+            "see `tactile-bayes campaign run --help`",
+        ),
         (("mapp",), "No such command 'mapp'; did you mean map? See `tactile-bayes --help`"),
         (
             ("exam.mcap",),

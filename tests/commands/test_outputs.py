@@ -179,9 +179,10 @@ def test_an_output_is_never_the_size_calibration(case: str, tmp_path: Path, monk
     assert (tmp_path / "s").read_text() == "{}"
 
 
-def test_a_recording_without_a_view_refuses_a_size_calibration_that_is_none(tmp_path: Path) -> None:
-    words = ["record", "-o", str(tmp_path / "s.mcap"), "--head", "/dev/nothing", "--size-calibration", "sold"]
-    with pytest.raises(UsageError, match="no calibration or file is called 'sold'"):
+@pytest.mark.parametrize("name", ["sold", ""])
+def test_a_recording_without_a_view_refuses_a_size_calibration_that_is_none(name: str, tmp_path: Path) -> None:
+    words = ["record", "-o", str(tmp_path / "s.mcap"), "--head", "/dev/nothing", "--size-calibration", name]
+    with pytest.raises(UsageError, match=f"no calibration or file is called '{name}'"):
         cli.main(words, standalone_mode=False)
 
 
