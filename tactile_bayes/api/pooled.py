@@ -180,7 +180,7 @@ def common_calibration(
     """The one calibration for all maps, and the digests of all files by role."""
     ways = sorted({answer.normalise for answer in answers})
     if settings.size_calibration is None and len(ways) > 1:
-        way_out = "pool maps made by one recipe: make the others again with `map`"
+        way_out = "give maps made by one recipe: make the others again with `map`"
         raise BadDataError(f"the maps were normalised in several ways ({', '.join(ways)})", way_out=way_out)
     path, calibration = named_calibration(settings, ways[0])
     if calibration is None:

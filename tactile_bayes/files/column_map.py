@@ -89,7 +89,7 @@ def read_wide_excision(path: Path, mapping: ColumnMap, excision: ExcisionColumns
     sizes = [
         {
             **row.key(mapping),
-            "ex_vivo_mm": row.size(excision.size, factor),
+            "ex_vivo_mm": row.size(excision.size, factor, "was the mass not measured? then leave the cell blank"),
             "ex_vivo_second_mm": row.number(excision.second, factor),
             "sd_mm": row.number(excision.sd, factor),
             "date": row.value(excision.date, "date"),
@@ -138,12 +138,12 @@ class _Row(NamedTuple):
         value = self.value(column, "number")
         return None if value is None else factor * value
 
-    def size(self, column: str, factor: float) -> float:
-        """A size in mm, which is above 0."""
-        value: float = self.value(column, "number")
+    def size(self, column: str, factor: float, ask: str) -> float:
+        """A size in mm, which is above 0; `ask` is the way out of 0 and of a word."""
+        text = self.cells[column]
+        value: float = self.value(column, "number") if any(map(str.isdigit, text)) else 0.0
         if value == 0:
-            ask = 'does 0 mean that the mass was not found? then add not_detected = ["0"] to the mapping'
-            raise self.table.error(self.line, column, "is 0", way_out=ask)
+            raise self.table.error(self.line, column, f"is {text}", way_out=ask)
         if value < 0:
             raise self.table.error(self.line, column, f"is {value:g}", way_out="a size is above 0")
         return factor * value
@@ -168,7 +168,9 @@ def _reading(row: _Row, reading: ReadingColumns, mapping: ColumnMap) -> dict[str
     if text and text in mapping.not_detected:
         status = "not_detected"
     elif text and text not in mapping.not_done:
-        status, size = "detected", row.size(reading.size, factor)
+        ask = f'does {text} mean that the mass was not found? then add not_detected = ["{text}"] to the mapping'
+        ask += f'; that it was not looked for? not_done = ["{text}"]'
+        status, size = "detected", row.size(reading.size, factor, ask)
     spread = {f"{name}_mm": row.number(getattr(reading, name), factor) for name in ("sd", "low", "high")}
     probability = None if spread["low_mm"] is None else reading.probability
     if status == "detected" and reading.low and spread["low_mm"] is not None and probability is None:

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 from tactile_bayes.declarations import Meta, Record, field, from_plain, names_of, replace, schema_name, short_repr
 from tactile_bayes.errors import BadDataError, in_file, suggestion
-from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, decoding, kind_of, read_text, schema_kind
+from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, WAYS, decoding, kind_of, read_text, schema_kind
 from tactile_bayes.options import TrialSettings
 from tactile_bayes.scans import Scan
 
@@ -67,7 +67,8 @@ def parse_record(document: object, kind: type[T], *, path: Path) -> T:
     kind_expected = schema_kind(schema)
     kind_read = schema_kind(document.get("schema")) if isinstance(document, dict) else ""
     if kind_expected and kind_read and kind_read != kind_expected:
-        raise BadDataError(f"is {kind_read}, not {kind_expected}", way_out=f"give {kind_expected}", path=str(path))
+        way_out = WAYS.get((kind_read, kind_expected), f"give {kind_expected}")
+        raise BadDataError(f"is {kind_read}, not {kind_expected}", way_out=way_out, path=str(path))
     if schema and isinstance(document, dict) and document.get("schema", schema) != schema:
         raise BadDataError(f"schema is {short_repr(document['schema'])}", way_out=f"give {schema!r}", path=str(path))
     with in_file(path):

@@ -151,7 +151,7 @@ def decoding(what: str, *, way_out: str) -> Iterator[None]:
         raise BadDataError(f"{what} ({why})", way_out=way_out) from None
 
 
-_WAYS_OUT: Final = {
+WAYS_OUT: Final = {
     **dict.fromkeys((errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP), "check the path"),
     **dict.fromkeys((errno.EACCES, errno.EPERM), "ask for the right to read it"),
     **dict.fromkeys((errno.EMFILE, errno.ENFILE), "close other programs: too many files are open"),
@@ -164,7 +164,7 @@ def readable(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        way_out = _WAYS_OUT.get(error.errno or 0, "copy it to another disk and read it there")
+        way_out = WAYS_OUT.get(error.errno or 0, "copy it to another disk and read it there")
         raise BadDataError(f"cannot be read ({error.strerror or error})", way_out=way_out, path=str(path)) from None
 
 
@@ -175,6 +175,7 @@ HDF5_MAGIC: Final = b"\x89HDF\r\n\x1a\n"
 ZIP_MAGIC: Final = b"PK\x03\x04"
 _SCAN, _MAP, _ARCHIVE = "a scan", "a map or posterior (netCDF)", "an archive (.npz or a spreadsheet)"
 _IMAGE, _NETCDF_3 = "an image", "a netCDF-3 file"
+_ESTIMATE, _POOLED = "an estimate (JSON)", "a pooled estimate (JSON)"
 _BEGINNINGS = {
     MCAP_MAGIC: _SCAN,
     HDF5_MAGIC: _MAP,
@@ -187,21 +188,22 @@ _BEGINNINGS = {
 }
 _SCHEMA = re.compile(rb'"schema"\s*:\s*"tactile-bayes/([a-z0-9-]+)/')
 _DOCUMENTS = {
-    "estimate": "an estimate (JSON)",
-    "pooled": "a pooled estimate (JSON)",
+    "estimate": _ESTIMATE,
+    "pooled": _POOLED,
     "size-calibration": "a size calibration (JSON)",
     "site-calibration": "a size calibration corrected by phantoms (JSON)",
     "repeatability": "a site's repeatability (JSON)",
     "validate": "a trial report (JSON)",
     "plan": "a trial plan (JSON)",
 }
-_WAYS = {
+WAYS = {
     (_SCAN, _MAP): "build its map first: `tactile-bayes map {path} -o MAP.nc`",
     (_ARCHIVE, _SCAN): "bring it in first: `tactile-bayes import {path} -o SCAN.mcap`",
     (_ARCHIVE, _MAP): "bring it in first: `tactile-bayes import --help` says how",
     (_IMAGE, _MAP): "bring it in first: `tactile-bayes import {path} --as map -o MAP.nc`",
     (_NETCDF_3, _MAP): "convert it to netCDF-4, for example `nccopy -k nc4 {path} NEW.nc`",
     (_MAP, _SCAN): "give the scan that the map was built from",
+    (_POOLED, _ESTIMATE): "give the maps that were pooled",
 }
 _LOOKED_AT = 4096
 
@@ -236,7 +238,7 @@ def wrong_kind(path: Path, expected: str, *, what: str, way_out: str) -> BadData
     kind = kind_of(path)
     if not kind or kind == expected:
         return BadDataError(what, way_out=way_out, path=str(path))
-    remedy = _WAYS.get((kind, expected), way_out).format(path=path)
+    remedy = WAYS.get((kind, expected), way_out).format(path=path)
     return BadDataError(f"is {kind}, not {expected}", way_out=remedy, path=str(path))
 
 

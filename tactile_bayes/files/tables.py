@@ -254,8 +254,8 @@ def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Ta
         known = set(_keys(target, key["reference"]["fields"]))
         for row, value in enumerate(_keys(table, key["fields"])):
             if value not in known:
-                what = f"{_shown_key(value)} has no row in {target.path}"
-                way_out = "add its row there, correct the key, or leave its readings out"
+                what = f"{_shown_key(value)} has no size in {target.path}"
+                way_out = "add it there, correct the key, or leave its readings out"
                 raise table.error(row, " + ".join(key["fields"]), what, way_out=way_out)
 
 

@@ -265,8 +265,8 @@ def pilot_errors(
         map_sd = figure(log_sd_within, tactile.only_replicated()).value
     if map_sd is None:
         return errors
-    maps = float(np.mean([len(group) for group in tactile.replicates_mm if len(group)]))
-    shared = float(tactile_errors.std(ddof=1)) ** 2 - map_sd**2 / maps
+    averaged = float(np.mean([1 / len(group) for group in tactile.replicates_mm if len(group)]))
+    shared = float(tactile_errors.std(ddof=1)) ** 2 - map_sd**2 * averaged
     return errors | {"mass_sd": math.sqrt(max(shared, 0.0)), "map_sd": map_sd}
 
 

@@ -85,7 +85,7 @@ def test_maps_normalised_each_way_have_a_calibration_and_are_not_pooled_together
     assert "normalise gain (the calibration: mean)" in refused.stderr
     mixed = run_here("estimate", "gain1.nc", "mass1.nc", "mass2.nc", "--pool", *FAST, cwd=folder)
     assert mixed.returncode == 3
-    assert "normalised in several ways (gain, mean)" in mixed.stderr
+    assert "normalised in several ways (gain, mean); give maps made by one recipe" in mixed.stderr
 
 
 @pytest.mark.long

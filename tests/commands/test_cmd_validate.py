@@ -157,7 +157,7 @@ def test_faults_between_tables_name_file_line_and_way_out(tmp_path: Path) -> Non
     trial, ex = small(tmp_path, "P1,1,cbe,1,12,detected\nP9,1,cbe,1,12,detected\n")
     error = refusal(trial, "--excision", ex)
     assert isinstance(error, BadDataError)
-    assert str(error).startswith(f"{trial}: line 3, column patient + mass: 'P9' + '1' has no row in {ex}")
+    assert str(error).startswith(f"{trial}: line 3, column patient + mass: 'P9' + '1' has no size in {ex}")
     trial, ex = small(tmp_path, "P1,1,cbe,1,,detected\n")
     assert "line 2, column size_mm: is blank while status is detected" in str(refusal(trial, "--excision", ex))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,10 @@ from click.testing import CliRunner
 
 from tactile_bayes.cli import cli
 from tactile_bayes.errors import BadDataError
+from tactile_bayes.files.documents import read_record
 from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.files.reading import kind_of
+from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.size_json import read_size_calibration
 
@@ -45,6 +48,11 @@ WRONG: dict[str, tuple[Callable[[Path], object], Callable[[Path], object], str]]
         lambda path: path.write_text(json.dumps({"schema": "tactile-bayes/estimate/1", "status": "estimate"})),
         read_size_calibration,
         "is an estimate (JSON), not a size calibration (JSON)",
+    ),
+    "a pooled estimate as an estimate": (
+        lambda path: path.write_text(json.dumps({"schema": "tactile-bayes/pooled/1"})),
+        partial(read_record, kind=EstimateReport, way_out=""),
+        "is a pooled estimate (JSON), not an estimate (JSON); give the maps that were pooled",
     ),
     "a map as a calibration": (
         lambda path: path.write_bytes(b"\x89HDF\r\n\x1a\n"),

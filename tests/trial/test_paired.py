@@ -223,3 +223,12 @@ def test_a_pilot_gives_the_assumptions() -> None:
     assert found["map_sd"] == pytest.approx(0.1, rel=0.15)
     assert found["other_sd"] == pytest.approx(0.4, rel=0.15)
     assert simulate_design(PlanCase(patients=8, maps=1, **found, trials=50, seed=0)).power > 0
+
+
+def test_a_pilots_mass_sd_does_not_hold_the_scatter_of_masses_with_few_readings() -> None:
+    rng, n = np.random.default_rng(3), 4000
+    groups = tuple(
+        10 * np.exp(shared + rng.normal(0, 0.3, 1 + 8 * (i % 2))) for i, shared in enumerate(rng.normal(0, 0.1, n))
+    )
+    one = ModalitySizes("tactile", np.arange(n), np.full(n, 10.0), np.array([group.mean() for group in groups]), groups)
+    assert pilot_errors(one, one, map_sd=0.3)["mass_sd"] == pytest.approx(0.1, rel=0.15)

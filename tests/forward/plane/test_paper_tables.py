@@ -180,7 +180,7 @@ def test_a_row_without_its_partner_is_named(tmp_path: Path) -> None:
     trial = read_table(write(tmp_path, HEADER + ROW + "P2,1,tactile,1,9,detected\n"), TRIAL)
     excision = read_table(write(tmp_path, "patient,mass,ex_vivo_mm\nP1,1,12\n", name="ex.csv"), EXCISION)
     with pytest.raises(
-        BadDataError, match=r"table.csv: line 3, column patient \+ mass: 'P2' \+ '1' has no row in .*ex.csv"
+        BadDataError, match=r"table.csv: line 3, column patient \+ mass: 'P2' \+ '1' has no size in .*ex.csv"
     ):
         check_references(trial, TRIAL, targets={"excision": excision})
 
