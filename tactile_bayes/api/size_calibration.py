@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
@@ -26,6 +27,7 @@ from tactile_bayes.progress import Progress
 from tactile_bayes.scans import HeadShape
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import BumpDraws, ShapeDraws
+from tactile_bayes.size.eq6 import SizeCalibration
 from tactile_bayes.size.learn import bodies as learning
 from tactile_bayes.size.learn import eq6
 from tactile_bayes.size.learn.site import PhantomMap, correct_calibration
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
 
 _SOURCE: Final = "balls in a population of bodies, scanned by the solid model"
 TINY_MM: Final = 4.0  #: Tables of lumps all below are rather in cm: no palpable mass is so small.
+FAR_OFF: Final = 6.0  #: No lump of a table lies so far from its Eq 6 by both widths, unless it is in another unit.
 _MAPS: Final = ("normalise", "background", "fit_radius_mm", "noise")  #: How a table's maps were made, if it is silent.
 
 
@@ -52,6 +55,7 @@ class LearnedCalibration(Record, eq=False):
     lumps: eq6.SizeTable | None = None  #: The table as Eq 6 takes it, where that was learned.
     not_left_out: str = ""  #: Why no geometry could be left out; empty where they were, or the table is no study.
     other_fit: eq6.OtherFit | None = None  #: The table by the other of the two fits; None where that does not exist.
+    table_rows: int = 0  #: Rows of the table that Eq 6 was learned from, those left out too.
 
     def write(self, path: Path, *, force: bool = False) -> None:
         """Write the file that `estimate --size-calibration` takes."""
@@ -120,8 +124,21 @@ def _eq6(table: Path | Sheet, options: LearnOptions, progress: Progress | None) 
     made = (recipe.normalise, recipe.background, recipe.radius_mm, recipe.noise)
     settings = {**dict(zip(_MAPS, made, strict=True)), "least_stiffness_ratio": least, "fit": options.fit}
     cautions = table_cautions(rows.columns, least_stiffness_ratio=least)
-    learned = replace(calibration, left_out=left_out, cautions=cautions)
-    return LearnedCalibration(learned, settings, _files(table=table), options.seed, None, lumps, not_left_out, other)
+    learned = replace(calibration, left_out=left_out, cautions=(*cautions, *_far_off(calibration, lumps)))
+    files = _files(table=table)
+    return LearnedCalibration(
+        learned, settings, files, options.seed, None, lumps, not_left_out, other, table_rows=len(rows)
+    )
+
+
+def _far_off(calibration: SizeCalibration, lumps: eq6.SizeTable) -> list[str]:
+    """Caution on lumps that come out too large or too small by both widths, as one in cm does; empty without any."""
+    axes = zip((calibration.x, calibration.y), eq6.axis_rows(lumps), strict=False)
+    errors = [np.abs(eq6.log_error(axis.size_mm(one.sigma_mm, one.amplitude), one.d_mm)) for axis, one in axes]
+    off = int(np.sum(np.min(errors, axis=0) > math.log(FAR_OFF)))
+    return (
+        [f"Eq 6 sizes {off} of its lumps more than {FAR_OFF:g} times too large or small: is d_mm in mm?"] if off else []
+    )
 
 
 def table_cautions(columns: Mapping[str, Sequence[Any]], *, least_stiffness_ratio: float = 0.0) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -39,6 +39,12 @@ if TYPE_CHECKING:
 # --- Analysis of a trial from its tables: errors, lines, agreement and calibration of each modality.
 
 
+_FROM_FILES: Final = (
+    "Intervals from the column posterior are those of max_size_mm: without --repeatability for exams as alike as "
+    "simulated ones, narrower than the interval that `estimate` leads with"
+)
+
+
 class TrialResult(TextResult, eq=False):
     """How each modality's sizes compare with excision.
 
@@ -61,7 +67,8 @@ class TrialResult(TextResult, eq=False):
 
     def text_with(self, *, methods: bool) -> str:
         """The report as text, with or without the table of methods."""
-        return trial_text(self.report, left_out=self.trial.other_visits.lines(), methods=methods)
+        notes = [*self.trial.other_visits.lines(), *([_FROM_FILES] if "posterior_1" in self.trial.files else [])]
+        return trial_text(self.report, notes=notes, methods=methods)
 
     def write_json(self, path: Path, *, force: bool = False) -> None:
         """Write the file of ``validate -o``."""

@@ -217,11 +217,13 @@ LABELS = {
 }
 
 
-def calibration_text(calibration: SizeCalibration, *, not_left_out: str = "", other_fit: OtherFit | None = None) -> str:
+def calibration_text(
+    calibration: SizeCalibration, *, not_left_out: str = "", other_fit: OtherFit | None = None, table_rows: int = 0
+) -> str:
     """Text of a size calibration: fit, domain and r2 of each axis, and recipe.
 
     `not_left_out`: why the table's geometries could not be left out in turn, where that is so; `other_fit`: what the
-    other of the two fits makes of the same rows.
+    other of the two fits makes of the same rows; `table_rows`: of the table, those left out too.
     """
     method = "two-stage fit as printed +- SD of a bootstrap" if calibration.in_two_stages else "posterior mean +- SD"
     lines = [] if calibration.left_out is None else _left_out_lines(calibration.left_out)
@@ -233,6 +235,9 @@ def calibration_text(calibration: SizeCalibration, *, not_left_out: str = "", ot
     heads += [name for name, _ in _ranges(calibration.x.domain)]
     for head, *cells in zip(heads, *columns, strict=True):
         lines.append(f"{head:24}" + "".join(f"{cell:>22}" for cell in cells))
+    if (rows := int(calibration.x.fit.get("rows", 0))) < table_rows:
+        why = "no positive amplitude, not detectable, or softer than asked for"
+        lines.append(f"left out: {table_rows - rows} of the table's {table_rows} rows ({why})")
     lines.append(f"residual SD is given at amplitude {calibration.x.reference_amplitude:.3g}; fainter maps tell less")
     if not both:
         lines.append(f"correlation of the two residuals {calibration.residual_correlation:.2f}")

@@ -115,9 +115,10 @@ def _modality_lines(name: str, report: ModalityReport) -> Iterator[str]:
         yield f"{name}: two readings of one mass differ by {low} to {high} % at most in 95 % of pairs"
         if parts is not None:
             readers = "" if parts.reader is None else f", readers {100 * parts.reader**0.5:.0f}"
+            named = "" if parts.n == report.readings_detected else f" (the {parts.n} readings that name a reader)"
             yield (
                 f"{name}: SD of ln size, %: masses {100 * parts.mass**0.5:.0f}{readers}, maps "
-                f"{100 * parts.map**0.5:.0f}; ICC {shown(repeated.figure('icc'), '.2f')}"
+                f"{100 * parts.map**0.5:.0f}{named}; ICC {shown(repeated.figure('icc'), '.2f')}"
             )
     if report.calibration is not None:
         calibration = report.calibration
@@ -191,10 +192,10 @@ MOST_LABEL: Final = 11  #: Letters of a modality's name up to which its figures 
 MORE: Final = "More (lines, limits of agreement, repeatability, pairs, r2): validate -v."
 
 
-def trial_text(report: TrialReport, *, left_out: Sequence[str] = (), methods: bool = False) -> str:
+def trial_text(report: TrialReport, *, notes: Sequence[str] = (), methods: bool = False) -> str:
     """The report in a screen, or the full one where `methods`; the research-use line comes last.
 
-    `left_out` says in words which readings of other visits take no part.
+    `notes` say in words which readings take no part, and where intervals come from.
     """
     counts, made = report.counts, ""
     if counts.synthetic_readings:
@@ -203,7 +204,7 @@ def trial_text(report: TrialReport, *, left_out: Sequence[str] = (), methods: bo
     lines = [
         f"Sizes against excision: {counted(counts.masses, 'mass')} of {counted(counts.patients, 'patient')}, "
         f"{counted(counts.readings, 'reading')}{made}",
-        *left_out,
+        *notes,
         *(f"Doubtful: {doubt}" for doubt in report.doubts),
         *comparison_sentences(report),
         "",
@@ -276,7 +277,8 @@ def _methods(report: TrialReport) -> Iterator[str]:
                 shown(one.figure(f"within_mass_{key}"), spec)
                 for key, spec in (("sd_mm", ".2g"), ("cv_percent", ".1f"), ("cv_rms_percent", ".1f"))
             )
-            yield f"{name}: within one mass, mean SD {sd} mm, {cv} % (root mean square {rms} %)"
+            by = f"{counted(one.readings_detected, 'reading')} of {counted(one.detected, 'mass')}"
+            yield f"{name}: within one mass, by {by}: mean SD {sd} mm, {cv} % (root mean square {rms} %)"
         yield from _reasons(name, one, [key for key in one.reasons if key.removesuffix("_interval") not in _FIRST])
     for name, quotient in report.mape_ratio_to_tactile.items():
         yield ratio_line(name, quotient)

@@ -214,7 +214,7 @@ def _masses(trial: Trial) -> tuple[list[str], list[list[str]]]:
     cells: dict[tuple[int, str], str] = {}
     for name, one in sizes.items():
         for mass, ex_vivo, size, detected in zip(one.mass, one.ex_vivo_mm, one.size_mm, one.detected, strict=True):
-            residual = f"{size:.1f} [{size - ex_vivo:+.1f} mm, {100 * (size / ex_vivo - 1):+.0f} %]"
+            residual = f"{size:.1f} [{size - ex_vivo:+z.1f} mm, {100 * (size / ex_vivo - 1):+z.0f} %]"
             cells[int(mass), name] = residual if detected else "not found"
     rows = [
         [str(place), f"{ex_vivo:.1f}", *(cells.get((numbers[key], name), "-") for name in sizes)]

@@ -367,16 +367,17 @@ def summarise(
 
     `error_ratio` is the variance of the error of ex-vivo sizes over that of a modality's, for the Deming lines.
     """
-    readings, ex_vivo_mm, sizes = trial.readings, trial.ex_vivo_mm, trial.sizes()
+    ex_vivo_mm, sizes = trial.ex_vivo_mm, trial.sizes()
+    done = [reading for reading in trial.readings if reading.status != "not_done"]
     return TrialReport(
         schema="tactile-bayes/validate/1",
         interval_probability=intervals.probability,
         counts=Counts(
             patients=len({patient for patient, _ in ex_vivo_mm}),
             masses=len(ex_vivo_mm),
-            masses_without_any_reading=len(set(ex_vivo_mm) - {reading.key for reading in readings}),
-            readings=len(readings),
-            synthetic_readings=sum(reading.synthetic for reading in readings),
+            masses_without_any_reading=len(set(ex_vivo_mm) - {reading.key for reading in trial.readings}),
+            readings=len(done),
+            synthetic_readings=sum(reading.synthetic for reading in done),
             masses_of_several_visits=trial.other_visits.masses,
             readings_of_earlier_visits=trial.other_visits.earlier,
             readings_after_excision=trial.other_visits.later,

@@ -153,6 +153,14 @@ def test_either_fit_is_offered_and_tells_of_the_other(tmp_path: Path) -> None:
     assert "joint fit of all rows: m " in said["two-stage"]
 
 
+def test_a_lump_in_another_unit_and_rows_that_take_no_part_are_said(tmp_path: Path) -> None:
+    table = study_rows().replace("\n5,0.6,", "\n0.5,0.6,").replace("\n10,0.6,1.1,", "\n10,0.6,-0.1,")
+    (tmp_path / "t.csv").write_text(table)
+    done = run_here("calibrate", "size", "t.csv", "-o", "size.json", "--fit", "two-stage", cwd=tmp_path)
+    assert "CAUTION: Eq 6 sizes 1 of its lumps more than 6 times too large or small" in done.stdout
+    assert "left out: 1 of the table's 20 rows" in done.stdout
+
+
 def test_two_stages_without_depths_are_refused(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text(rows(30))
     done = run_here("calibrate", "size", "t.csv", "-o", "size.json", "--fit", "two-stage", cwd=tmp_path)

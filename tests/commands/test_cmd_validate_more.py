@@ -78,6 +78,7 @@ def test_a_wide_table_is_read_by_its_mapping(tmp_path: Path) -> None:
     )
     assert found["ultrasound"]["mape_detected_percent"] == pytest.approx(20)  # 1.2 cm of 10 mm
     assert found["tactile"]["readings"] == 5
+    assert document(*wide(tmp_path))["counts"]["readings"] == 7  # a blank cell is none
     assert found["tactile"]["coverage"][0]["probability"] == 0.9
 
 
@@ -87,6 +88,7 @@ def test_a_wide_table_is_read_by_its_mapping(tmp_path: Path) -> None:
         (WIDE.replace("1.2", "0"), MAPPING, 'line 2, column us_cm: is 0; does 0 mean that the mass was not found'),
         (WIDE.replace("1.2", "ND"), MAPPING, 'us_cm: is ND; does ND mean that the mass was not found? then add '
          'not_detected = ["ND"] to the mapping; that it was not looked for? not_done = ["ND"]'),
+        (WIDE.replace("P1,10", "P1,0"), MAPPING, "is 0; was the mass not measured? then leave the cell blank"),
         (WIDE.replace("1.2", "about 1"), MAPPING, "line 2, column us_cm: 'about 1' is not a number"),
         (WIDE.replace("1.2", "<1"), MAPPING, "'<1' is a bound, not a number; give the number measured"),
         (WIDE.replace("1.2", "1.2%"), MAPPING, "'1.2%' has a percent sign; write the number that is meant without it"),
@@ -135,6 +137,10 @@ def test_an_estimates_size_and_interval_are_read_directly(tmp_path: Path) -> Non
     assert (tactile["coverage"][0]["probability"], tactile["coverage"][0]["covered"]) == (0.9, 1)
     roles = {one["role"]: one["sha256"] for one in found["provenance"]["inputs"]}
     assert roles["posterior_1"] == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert (
+        "narrower than the interval that `estimate` leads with"
+        in validate(*with_posterior(tmp_path, ",detected,estimate.json")).stdout
+    )
 
 
 def test_a_posteriors_draws_are_read_directly(tmp_path: Path) -> None:
@@ -281,10 +287,21 @@ def test_the_page_stands_what_has_almost_nothing(tmp_path: Path) -> None:
             "<b>", "mri"
         )
     )
-    (tmp_path / "e.csv").write_text("patient,mass,ex_vivo_mm\nP1,1,10\n")
+    (tmp_path / "e.csv").write_text("patient,mass,ex_vivo_mm\nP1,1,10\nP2,1,9\n")
     result = validate(tmp_path / "t.csv", "--excision", tmp_path / "e.csv", "--html", tmp_path / "r.html")
     assert result.exit_code == 0, result.exception
+    assert "masses left out: 0 not done, 1 without a row." in (tmp_path / "r.html").read_text()
     assert "nan" not in (tmp_path / "r.html").read_text().replace("nance", "").lower().split("base64")[0]
+
+
+def test_figures_of_repeats_say_the_readings_they_are_of(tmp_path: Path) -> None:
+    rows = ["A,10", "B,11", ",12", "A,20", "B,21", ",23"]
+    cells = [f"P{i // 3},1,tactile,{i},detected,{row}" for i, row in enumerate(rows, start=3)]
+    (tmp_path / "t.csv").write_text("\n".join(["patient,mass,modality,replicate,status,reader,size_mm", *cells]) + "\n")
+    (tmp_path / "e.csv").write_text("patient,mass,ex_vivo_mm\nP1,1,10\nP2,1,19\n")
+    text = validate(tmp_path / "t.csv", "--excision", tmp_path / "e.csv", "-v").stdout
+    assert "within one mass, by 6 readings of 2 masses: mean SD" in text
+    assert "(the 4 readings that name a reader); ICC" in text
 
 
 def paper_trial(folder: Path) -> tuple[object, ...]:
