@@ -336,7 +336,7 @@ def _refuse_turned(given: Any) -> None:
     names = tuple(map(str, getattr(given, "dims", ())))
     if names == ("x", "y"):
         raise UsageError("the values are (x, y) by their dims; give (y, x): values.transpose('y', 'x')")
-    axes = [given.index, given.columns] if hasattr(given, "iloc") else [given[name] for name in names]
+    axes = [given.index, given.columns] if hasattr(given, "columns") else [given[name] for name in names]
     for axis, places in zip(("rows", "columns"), map(np.asarray, axes), strict=False):
         if places.dtype.kind in "iuf" and (np.diff(places) < 0).any():
             first, last = places[0], places[-1]

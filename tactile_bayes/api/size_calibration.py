@@ -417,9 +417,10 @@ def calibrate_size(
     correct: PathLike | None = None,
     path: PathLike | None = None,
     force: bool = False,
+    progress: Progress | None = None,
     **options: Any,
 ) -> Calibration:
-    """Learn a size calibration from lumps of known size.
+    """Learn a size calibration from lumps of known size, which takes some seconds.
 
     Parameters
     ----------
@@ -429,6 +430,8 @@ def calibrate_size(
         Name or path of a calibration over bodies that the table's lumps correct; the table may also list map files.
     path
         Also write the calibration there.
+    progress
+        Called with the numbers done and required: of effective draws for each axis, or of the maps that a table lists.
     **options
         As of `tactile_bayes.options.LearnOptions`, by default as on the command line.
 
@@ -441,14 +444,13 @@ def calibrate_size(
     ------
     BadDataError
         Naming the table, the line, the column, the value and the way out.
-    TypeError
-        When a keyword is none of these.
     UsageError
         When a keyword's value is out of range, or belongs to another form.
     """
     learn_options = LearnOptions(**{name: plain(value) for name, value in options.items()})
     target = None if path is None else output_path(path, "JSON")
-    learned = learn(table_of(table, "table"), learn_options, options, correct=None if correct is None else str(correct))
+    base = None if correct is None else str(correct)
+    learned = learn(table_of(table, "table"), learn_options, options, correct=base, progress=progress)
     if target is not None:
         learned.write(target, force=force)
     return learned.calibration

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -99,16 +99,19 @@ class SizeResult(Record, eq=False, dict=True):
         """
         return self._draws(None if self._size is None else self._size.another_exam, "max_size_mm")
 
+    _quantities: ClassVar[tuple[str, ...]] = SIZES  #: Names of all columns of draws.
+
     def _columns(self) -> dict[str, Draws]:
         draws_by_name = {name: self._draws(self._size, name) for name in SIZES}
         return {name: draws for name, draws in draws_by_name.items() if draws is not None}
 
     def to_dataframe(self) -> pandas.DataFrame:
-        """One row for each draw: chain, draw and a column for each quantity; no rows without an estimate."""
+        """One row for each draw: chain, draw and the quantities, NaN without a size; no rows without an estimate."""
         columns = self._columns()
         shape = next(iter(columns.values())).values.shape if columns else (0, 0)
         chain, draw = (index.ravel() for index in np.indices(shape))
-        values = {name: draws.values.ravel() for name, draws in columns.items()}
+        values = {name: np.full(chain.shape, np.nan) for name in self._quantities}
+        values |= {name: draws.values.ravel() for name, draws in columns.items()}
         return dataframe({"chain": chain, "draw": draw, **values})
 
     @door
@@ -351,8 +354,10 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
         if estimate.map_posterior is None or estimate.draws is None:
             return None
         unit = "mm" if name.endswith("_mm") else "rad" if name.endswith("_rad") else ""
-        values = getattr(estimate.map_posterior, name)
+        values = np.array(getattr(estimate.map_posterior, name))
         return Draws(values, unit, self.probability, estimate.draws.labels, estimate.draws.effective_draws)
+
+    _quantities: ClassVar[tuple[str, ...]] = (*SIZES, *OF_A_MAP)
 
     def _columns(self) -> dict[str, Draws]:
         shapes = {name: draws for name in OF_A_MAP if (draws := self._of_shape(name)) is not None}

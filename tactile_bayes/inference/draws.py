@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from scipy.special import ndtri
@@ -285,8 +285,12 @@ class Draws(Record, eq=False):
 
     def __array__(self, dtype: object = None, copy: bool | None = None) -> FloatArray:
         """The draws as an array."""
-        del copy
-        return np.asarray(self.values, dtype=dtype)  # type: ignore[call-overload, no-any-return]
+        return np.array(self.values, dtype=dtype, copy=copy)  # type: ignore[call-overload, no-any-return]
+
+    def __array_function__(self, function: Any, _types: Any, args: tuple[Any, ...], keywords: dict[str, Any]) -> Any:
+        """What a function of NumPy makes of the draws: `numpy.mean` would call the property of that name."""
+        arrays = tuple(one.values if isinstance(one, Draws) else one for one in args)
+        return self.values.__array_function__(function, (np.ndarray,), arrays, keywords)
 
     def __repr__(self) -> str:
         summary, unit = self.summary(), f" {self.unit}" if self.unit else ""

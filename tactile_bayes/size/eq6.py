@@ -154,6 +154,9 @@ class SizeCalibration(Record, eq=False):
 
     fat_mm: ClassVar[None] = None  #: Depth of fat of the calibration: none for Eq 6.
 
+    def __repr__(self) -> str:
+        return terms.calibration_words(type(self), "Eq 6 of lumps", self.recipe, self.x.domain, self.cautions)
+
     def at_fat(self, *_map: object) -> SizeCalibration:
         """This calibration: Eq 6 is the same for all maps, whatever their depth of fat."""
         return self

@@ -122,6 +122,13 @@ class Recipe(Record):
         return ", ".join(parts if self.head is None else [*parts, f"head {self.head}"])
 
 
+def calibration_words(kind: type, of: str, recipe: Recipe, domain: Domain, cautions: Sequence[str]) -> str:
+    """A calibration in a line for notebooks: cautions, what it was learned from, range of sizes and recipe."""
+    low, high = domain["d_mm"]
+    texts = [*(f"CAUTION: {text}." for text in cautions), f"{of} of {low:.3g} to {high:.3g} mm; {recipe}"]
+    return f"<{kind.__name__} {' '.join(texts)}>"
+
+
 class RoundLumps(Record, eq=False):
     """Half log axis ratio of a ball's map, and how far maps are from it."""
 

@@ -149,6 +149,18 @@ def test_a_result_has_its_draws_in_every_form(found: tb.SizeEstimate, tmp_path: 
         size.interval(95)
 
 
+def test_numpy_takes_draws_and_changes_none_of_the_estimates(found: tb.SizeEstimate) -> None:
+    """`numpy.mean` called a property, and widths in cm by an array of one's own changed those that are saved."""
+    draws = found.sigma_x_mm
+    assert draws is not None
+    assert float(np.mean(draws)) == pytest.approx(draws.mean)
+    assert np.concatenate([draws, draws], axis=1).shape == (1, 2 * draws.values.size)
+    for own in (np.array(draws), found.sigma_x_mm.values):  # type: ignore[union-attr]
+        own /= 10.0
+    assert repr(found.sigma_x_mm) == repr(draws)
+    assert draws.median == pytest.approx(5.4, abs=0.1)
+
+
 def test_a_repr_is_short_and_says_research(found: tb.SizeEstimate, folder: Path) -> None:
     for one in (found, tb.read_map(folder / "map.nc")):
         assert len(repr(one)) < 120
@@ -163,6 +175,10 @@ def test_no_lump_is_a_result(folder: Path) -> None:
     assert (empty.status, empty.max_size_mm, empty.amplitude) == ("no_estimate", None, None)
     assert empty.why in repr(empty)
     assert len(empty.to_dataframe()) == 0
+    widths = tb.estimate(folder / "map.nc", size_calibration="none", **FAST).to_dataframe()
+    assert list(empty.to_dataframe().columns) == list(widths.columns)
+    assert widths.max_size_mm.isna().all()
+    assert widths.sigma_x_mm.notna().all()
     assert empty.plot().axes
     for act in (empty.to_arviz, lambda: empty.save("x.nc")):
         with pytest.raises(UsageError, match="there are no draws"):
@@ -284,7 +300,12 @@ def test_tables_come_as_files_or_frames(tmp_path: Path) -> None:
     error = figures.loc[("tactile", "mape_percent")]
     assert error.low < error.value < error.high
     assert "<TrialResult" in repr(one)
-    learned = tb.calibrate_size(pandas.read_csv(DEMO / "phantoms.csv"), path=tmp_path / "size.json")
+    done: list[tuple[int, int]] = []
+    learned = tb.calibrate_size(
+        pandas.read_csv(DEMO / "phantoms.csv"), path=tmp_path / "size.json", progress=lambda *one: done.append(one)
+    )
+    assert done[-1] == (800, 800)
+    assert repr(learned).startswith("<SizeCalibration Eq 6 of lumps of 5 to 25 mm; normalise mean")
     assert (tmp_path / "size.json").stat().st_mode & 0o777 == 0o600
     by_mean = tb.build_map(DEMO / "scan.mcap", normalise="mean")
     given = tb.estimate(by_mean, size_calibration=learned, **FAST).answer.document

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas
 import pytest
 
 import tactile_bayes as tb
@@ -68,6 +69,7 @@ def test_masks_frames_of_pandas_and_files_are_taken(tmp_path: Path) -> None:
         (np.ones((3, 3)), {"units": "kPa"}, UsageError, "a grid needs spacing_mm"),
         (np.ones((3, 3, 3)), {"spacing_mm": 1}, BadDataError, r"mean has shape \(3, 3, 3\)"),
         (np.ones(3), {"spacing_mm": 1}, BadDataError, r"mean has shape \(3,\)"),
+        (pandas.Series([1.0, 2.0]), {"spacing_mm": 1}, BadDataError, r"mean has shape \(2,\)"),
         (np.array([["a"]]), {"spacing_mm": 1}, BadDataError, "mean is <U1; give real numbers"),
         ([[1.0, 2.0]], {"spacing_mm": 1}, UsageError, "a map is wanted, not list.*numpy.array"),
         (np.ones((3, 3)), {"spacing": 1}, TypeError, "has no keyword 'spacing'; did you mean spacing_mm"),

@@ -123,6 +123,7 @@ def test_python_gives_what_the_file_holds(folder: Path) -> None:
     given = tb.calibrate_size(table(), correct="solid")
     written = body_calibration(folder / "phantoms.json")
     assert isinstance(given, BodyCalibration)
+    assert "corrected by 12 phantoms, lumps of 5 to 30 mm; normalise gain" in repr(given)
     assert given.site is not None and written.site is not None  # noqa: PT018
     assert written.site.mean == pytest.approx(given.site.mean, rel=1e-8)
     assert written.site.covariance == pytest.approx(given.site.covariance, rel=1e-7)
