@@ -30,7 +30,7 @@ from tactile_bayes.files.documents import with_session
 from tactile_bayes.files.grids import GRID_SUFFIXES, grid_map, import_grid
 from tactile_bayes.files.instrument import head_geometry, read_scene, scene_of
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
-from tactile_bayes.files.named_arrays import Grid, Source, read_array_map
+from tactile_bayes.files.named_arrays import Grid, Source, read_array_map, step_of
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.forward.scene import SimulatedScan
@@ -326,21 +326,24 @@ def map_of(given: Any, **stated: Any) -> Map:
     options = GridOptions(**keywords)
     if path is not None:
         return Map(import_grid(path, options)[0])
-    _refuse_turned(given)
+    steps = _own_steps(given)
     values = given.filled(np.nan) if isinstance(given, np.ma.MaskedArray) else np.asarray(given)
-    return Map(grid_map(Grid({"mean": values}), options)[0])
+    return Map(grid_map(Grid({"mean": values}, steps=steps), options)[0])
 
 
-def _refuse_turned(given: Any) -> None:
-    """Refuse values of pandas or xarray whose own places say that they are turned or mirrored."""
+def _own_steps(given: Any) -> tuple[float, ...]:
+    """Steps of the own places of values of pandas or xarray, which are refused if these are turned or mirrored."""
     names = tuple(map(str, getattr(given, "dims", ())))
     if names == ("x", "y"):
         raise UsageError("the values are (x, y) by their dims; give (y, x): values.transpose('y', 'x')")
     axes = [given.index, given.columns] if hasattr(given, "columns") else [given[name] for name in names]
-    for axis, places in zip(("rows", "columns"), map(np.asarray, axes), strict=False):
-        if places.dtype.kind in "iuf" and (np.diff(places) < 0).any():
+    pairs = zip(("rows", "columns"), map(np.asarray, axes), strict=False)
+    numbered = [(axis, places) for axis, places in pairs if places.dtype.kind in "iuf"]
+    for axis, places in numbered:
+        if (np.diff(places) < 0).any():
             first, last = places[0], places[-1]
             raise UsageError(f"the {axis}' own places go from {first:g} to {last:g}; give the lowest first")
+    return tuple(step for axis, places in numbered if (step := step_of(f"the {axis}' own place", places)))
 
 
 # --- A scan of arrays that Python holds, as `import` makes one of a file.

@@ -210,10 +210,10 @@ def _read_arrays(path: Path, array: str) -> Grid:
         return [name for name in (*_BESIDE, *AXES) if name in names] if "mean" in names and not array else names
 
     arrays = read_named(path, choose)
-    notes = orient_by_axes(arrays)
+    notes, steps = orient_by_axes(arrays)
     if not array and "mean" in arrays:
         if "spacing_mm" not in arrays:
-            return Grid(arrays, notes=notes)
+            return Grid(arrays, notes=notes, steps=steps)
         stated = arrays.pop("spacing_mm")
         sides = stated.reshape(-1)  # MATLAB's numbers have two axes
         if sides.dtype.kind not in "iuf" or len(sides) not in (1, 2):
@@ -225,7 +225,7 @@ def _read_arrays(path: Path, array: str) -> Grid:
     if len(flat) == 1:
         ((name, values),) = flat.items()
         choice = () if array or len(arrays) == 1 else (f"the array {name!r} was taken",)
-        return Grid({"mean": values}, notes=(*choice, *notes))
+        return Grid({"mean": values}, notes=(*choice, *notes), steps=steps)
     has = ", ".join(f"{name} {one.shape}" for name, one in sorted(arrays.items())[:12]) or "nothing"
     if len(flat) > 1:
         raise BadDataError(f"holds several arrays of rows and columns ({has})", way_out="name one with --array NAME")
@@ -471,6 +471,10 @@ def _spacing(grid: Grid, *, stated_mm: float | None) -> tuple[float, list[str]]:
     if not _LEAST_SPACING_MM <= value < 1000:
         way_out = "looks like metres, give mm" if 0 < value < 1000 else "it must be positive, in mm"
         raise BadDataError(f"the spacing is {value:g} mm", way_out=way_out)
+    for step in grid.steps:  # in mm, cm, inches or m
+        if not np.isclose(value, step * np.array([1.0, 10.0, 25.4, 1000.0]), rtol=0.01, atol=0.0).any():
+            what = f"the spacing is {value:g} mm, and the places of the cells run in steps of {step:g}"
+            raise BadDataError(what, way_out="give --spacing-mm the side of the square cells, or leave out the places")
     return value, notes
 
 

@@ -43,6 +43,7 @@ class Grid(Record, eq=False):
     resolution_mm: tuple[float, float] | None = None  #: The same by an image's resolution, often of its printing.
     units: str = ""  #: Where the file states it.
     notes: tuple[str, ...] = ()  #: How it was read.
+    steps: tuple[float, ...] = ()  #: Between the places of its columns, and of its rows, in the unit that they have.
 
 
 Choose = Callable[[Sequence[str]], Iterable[str]]  #: Takes the names in a file and returns those to read.
@@ -97,13 +98,13 @@ def is_text(path: Path) -> bool:
 AXES: Final = ("x", "y")  #: Places of the columns and rows of a grid, or of each of its cells.
 
 
-def orient_by_axes(arrays: Arrays) -> tuple[str, ...]:
-    """Orient grids in place by the arrays `AXES` of their group, else of the file, and say how.
+def orient_by_axes(arrays: Arrays) -> tuple[tuple[str, ...], tuple[float, ...]]:
+    """Orient grids in place by the arrays `AXES` of their group, else of the file; say how, and the steps of places.
 
     The axes, which are removed, may be lines or, as MATLAB keeps them, matrices of one row or column. x then rises
     along a row, y from row to row.
     """
-    notes: list[str] = []
+    notes, steps = list[str](), set[tuple[float, ...]]()
     tables = {name for name, one in arrays.items() if one.ndim == 2 and min(one.shape) > 1}
     grids = {name for name in tables if name.rpartition(".")[2] not in AXES}
     groups = {name.rpartition(".")[0] for name in grids}
@@ -117,23 +118,30 @@ def orient_by_axes(arrays: Arrays) -> tuple[str, ...]:
             if line.size:
                 del arrays[prefix + axis]
         if x.size or y.size:
+            steps.add(tuple(step for key, line in zip(AXES, (x, y), strict=True) if (step := step_of(key, line))))
             notes += _orient(arrays, within, x, y)
             grids -= within
-    return tuple(dict.fromkeys(notes))
+    return tuple(dict.fromkeys(notes)), steps.pop() if len(steps) == 1 else ()
+
+
+def step_of(name: str, places: np.ndarray) -> float | None:
+    """Step between the places of cells, which must be even; None for less than two, or numbers from 0 or 1 on."""
+    with np.errstate(all="ignore"):
+        steps = np.diff(places.astype(np.float64))
+    if not len(steps):
+        return None
+    if not np.allclose(steps, steps.mean(), rtol=0.01, atol=0.0):
+        what = f"{name} runs in unequal steps ({steps.min():.4g} to {steps.max():.4g})"
+        raise BadDataError(what, way_out="a grid has square cells of one side: interpolate it")
+    return None if steps[0] == 1 and places[0] in (0, 1) else abs(float(steps.mean()))
 
 
 def _orient(arrays: Arrays, grids: Iterable[str], x: np.ndarray, y: np.ndarray) -> list[str]:
     """Orient grids in place by the places of their columns and rows, of which either may be empty, and say how."""
     notes = []
     for key, line in zip(AXES, (x, y), strict=True):
-        with np.errstate(all="ignore"):
-            steps = np.diff(line.astype(np.float64))
-        if not len(steps):
-            continue
-        if not np.allclose(steps, steps.mean(), rtol=0.01, atol=0.0):
-            what = f"{key} runs in unequal steps ({steps.min():.4g} to {steps.max():.4g})"
-            raise BadDataError(what, way_out="a grid has square cells of one side: interpolate it")
-        notes.append(f"{key} runs in steps of {abs(steps[0]):g}")
+        if len(line) > 1:
+            notes.append(f"{key} runs in steps of {abs(float(line[1]) - float(line[0])):g}")
     for name in grids:
         if len(x) != len(y) and arrays[name].shape == (len(x), len(y)):
             arrays[name] = arrays[name].T

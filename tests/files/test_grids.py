@@ -442,6 +442,10 @@ def test_a_grid_lies_as_its_places_say(tmp_path: Path, arrays: dict[str, Any]) -
     savemat(tmp_path / "grid.mat", {"exam": arrays})  # lines have two axes, and a group
     found, notes = import_grid(tmp_path / "grid.mat", GridOptions(spacing_mm=1.0, normalise="gain"))
     np.testing.assert_array_equal(found.mean, lump())
+    for twice in (["x", "y"], ["y"]):  # with cells of 2 mm, and of 1 by 2 mm
+        np.savez(tmp_path / "grid.npz", **{**arrays, **{name: 2 * arrays[name] for name in twice}})
+        with pytest.raises(BadDataError, match="is 1 mm, and the places of the cells run in steps of 2; give --spac"):
+            import_grid(tmp_path / "grid.npz", GridOptions(spacing_mm=1.0, normalise="gain"))
     np.savez(tmp_path / "grid.npz", **{**arrays, "x": arrays["x"] ** 3})
     with pytest.raises(BadDataError, match="x runs in unequal steps"):
         import_grid(tmp_path / "grid.npz", GridOptions(spacing_mm=1.0, normalise="gain"))
