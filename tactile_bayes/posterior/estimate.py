@@ -21,7 +21,7 @@ from tactile_bayes.posterior.correlated import CorrelatedAssessment
 from tactile_bayes.posterior.draw import DETECTED, ROTATION_ODDS, ModalBump, SamplerSettings, check_options
 from tactile_bayes.posterior.result import Estimate, prior_sensitivity
 from tactile_bayes.posterior.white import BumpFit, Candidate, MapDraws, WhiteAssessment
-from tactile_bayes.presets import CELL_PER_SIGMA, INTERVAL
+from tactile_bayes.presets import CELL_PER_SIGMA, FIELD_COSINES, INTERVAL
 from tactile_bayes.progress import Progress
 from tactile_bayes.scans import DEFAULT_HEAD, HeadShape
 from tactile_bayes.size import terms
@@ -247,8 +247,9 @@ def estimate_map(
             )
         calibration = calibration_for(tactile_map, calibration)
     estimate = _estimate_of_map(EstimationTask(tactile_map, calibration, options, rng, progress))
-    if estimate.code in NO_LUMP and options.scene != "none" and (reason := verdict.no_verdict(tactile_map)) is not None:
-        estimate = _no_estimate(reason, estimate.candidates)
+    if estimate.code in NO_LUMP and options.scene != "none":
+        reason = verdict.no_verdict(tactile_map) or verdict.hiding_settings(options)
+        estimate = estimate if reason is None else _no_estimate(reason, estimate.candidates)
     of_map = (*map_findings(tactile_map), *tactile_map.findings)
     return replace(estimate, findings=by_severity((*of_map, *estimate.findings)))
 
@@ -408,6 +409,11 @@ def _findings(result: MapDraws, *, cell_mm: float) -> Iterator[Finding]:
         beyond = [] if result.size is None else calibration.beyond_lumps(result.size.median_mm)
         for text in (*calibration.outside(*posterior.medians), *beyond):
             yield finding("outside_calibration", f"{terms.UNLIKE_LEARNED}: {text}")
+        if (cosines := result.figures.get("field_cosines", FIELD_COSINES)) < FIELD_COSINES:
+            text = f"the errors of the map were resolved by {cosines} basis functions along each axis, and sizes were "
+            text += f"learned with {FIELD_COSINES} or more"
+            remedy, on_paper = "leave field_cosines out of the settings", "have the size estimated anew without that"
+            yield finding("outside_calibration", text, remedy, on_paper)
     if posterior.irregular:
         yield _IRREGULAR
     if cell_mm > CELL_PER_SIGMA * min(posterior.medians[1:]):

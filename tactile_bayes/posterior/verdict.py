@@ -13,7 +13,7 @@ from tactile_bayes.errors import CANNOT_SHOW, Abstention, UsageError
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import TactileMap, orientation_of
 from tactile_bayes.mapping.plausibility import against_no_lump
-from tactile_bayes.options import BumpPrior
+from tactile_bayes.options import PRIORS, BumpPrior, FitSettings
 from tactile_bayes.posterior.bump import (
     Detection,
     covered_share,
@@ -154,6 +154,17 @@ def no_verdict(tactile_map: TactileMap) -> Abstention | None:
     first, remedies = findings[0], dict.fromkeys(one.remedy for one in findings if one.remedy)
     on_paper = dict.fromkeys(finding.on_paper for finding in findings if finding.on_paper)
     return cannot_show(first.text, "; ".join(remedies), "; ".join(on_paper))
+
+
+def hiding_settings(options: FitSettings) -> Abstention | None:
+    """Reason why a fit with priors of one's own, or in a small window, excludes no lump; None with neither."""
+    defaults = BumpPrior()
+    own = [name for name in PRIORS if getattr(options, name) != getattr(defaults, name)]
+    own += ["fit_radius_mm"] if (options.fit_radius_mm or FIT_RADIUS_MM) < 0.4 * FIT_RADIUS_MM else []
+    if not own:
+        return None
+    why = f"lumps are not detected reliably with {', '.join(f'{name} = {getattr(options, name):g}' for name in own)}"
+    return cannot_show(why, f"leave {' and '.join(own)} out of the settings", "have it estimated anew without them")
 
 
 def cannot_show(why: str, advice: str = "", on_paper: str = "") -> Abstention:

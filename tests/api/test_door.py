@@ -161,6 +161,13 @@ def test_numpy_takes_draws_and_changes_none_of_the_estimates(found: tb.SizeEstim
     assert draws.median == pytest.approx(5.4, abs=0.1)
 
 
+def test_a_noise_field_coarser_than_the_calibrations_is_a_caution(folder: Path, found: tb.SizeEstimate) -> None:
+    """With 6 basis functions the lump of 14.3 mm had 10.7 mm without a word."""
+    coarse = tb.estimate(folder / "map.nc", field_cosines=12, **FAST)
+    assert (found.verdict, coarse.verdict) == ("sound", "doubtful")
+    assert "resolved by 12 basis functions" in repr(coarse)
+
+
 def test_a_repr_is_short_and_says_research(found: tb.SizeEstimate, folder: Path) -> None:
     for one in (found, tb.read_map(folder / "map.nc")):
         assert len(repr(one)) < 120

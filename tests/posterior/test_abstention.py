@@ -75,6 +75,16 @@ def test_cells_too_large_to_show_a_lump_are_no_verdict_on_the_breast() -> None:
     assert found.code == "cannot_show"  # it once read "no lump found: 6 covered cells for 5 parameters"
 
 
+@pytest.mark.parametrize("own", [{"fit_radius_mm": 2.0}, {"amplitude_sd": 1e-4}])
+def test_settings_that_can_hide_a_lump_exclude_none(own: dict[str, float]) -> None:
+    """Over this lump both read "no lump found", and from which size on one would have shown."""
+    found = run(bump_values(x=0.0, y=0.0, sigma_x=10.0, sigma_y=10.0) + WHITE, **own)
+    ((name, value),) = own.items()
+    assert found.code == "cannot_show"
+    assert found.reason.endswith(f"lumps are not detected reliably with {name} = {value:g}")
+    assert found.advice == f"leave {name} out of the settings"
+
+
 @pytest.mark.parametrize(
     ("bump", "fault", "code", "advice"),
     [
