@@ -173,11 +173,15 @@ def _with_place(
     side = side_findings(estimate_document.side_of(scans), places[0] if places else None)
     others = [one for one in estimate.findings if not side or one.kind != "side"]  # the map's is of the scanned place
     sized = [
-        (number, (one.x_mm, one.y_mm), one.estimate.size.summarise("max_size_mm", probability=probability))
+        (
+            number,
+            (one.x_mm, one.y_mm),
+            [q.summarise("max_size_mm", probability=probability) for q in (size, size.leading)],
+        )
         for number, one in enumerate(estimate.masses, start=1)
-        if one.estimate.size is not None
+        if (size := one.estimate.size) is not None
     ]
-    touching = estimate_document.touching_findings(estimate_document.touching_masses(sized))
+    touching = estimate_document.touching_findings(sized)
     return replace(estimate, findings=by_severity((*side, *others, *touching)))
 
 

@@ -108,43 +108,47 @@ def from_xiphoid(x_mm: float, y_mm: float) -> str:
 # --- Masses of a map that may be one lump: whether they touch, and how long they are together.
 
 
-SizedMass = tuple[int, tuple[float, float], Quantity]  #: Number, x and y in mm, and largest size.
+SizedMass = tuple[int, tuple[float, float], Sequence[Quantity]]
+"""Number, x and y in mm, and the largest size: as `max_size_mm`, and with the interval that reports lead with."""
 
 
 def sized_masses(masses: Sequence[MassReport]) -> list[SizedMass]:
     """Those of the masses that have a size."""
-    return [(mass.number, mass.centre_mm.median, mass.max_size_mm) for mass in masses if mass.max_size_mm is not None]
+    return [
+        (mass.number, mass.centre_mm.median, (mass.max_size_mm, mass.leading.max_size_mm))
+        for mass in masses
+        if mass.max_size_mm is not None and mass.leading.max_size_mm is not None
+    ]
 
 
-def touching_masses(masses: Sequence[SizedMass]) -> tuple[reports.Touching, ...]:
-    """Pairs of sized masses whose outlines may touch.
+def touching_masses(masses: Sequence[SizedMass]) -> dict[reports.Touching, str]:
+    """Pairs of sized masses whose outlines may touch, each with its length in words, as reports lead with it.
 
-    Both lie in one body, so their errors go together: ends of the length are made of the same ends of both sizes. A
-    pair touches where the upper ends of its radii reach over the distance of the centres.
+    A pair touches where the upper ends of its radii reach over the distance of the centres.
     """
-    pairs = []
-    for (first, centre, size), (second, beside, other) in combinations(masses, 2):
-        distance = float(np.hypot(centre[0] - beside[0], centre[1] - beside[1]))
-        if distance <= (size.high + other.high) / 2:
-            ends = zip((size.median, size.low, size.high), (other.median, other.low, other.high), strict=True)
-            # one may lie within the other's outline
-            median, low, high = (max(distance + (a + b) / 2, a, b) for a, b in ends)
-            length = reports.Interval(median, low, high, size.probability)
-            pairs.append(reports.Touching((first, second), distance, length))
-    return tuple(pairs)
+    pairs = {}
+    for (first, centre, sizes), (second, beside, others) in combinations(masses, 2):
+        apart_mm = math.dist(centre, beside)
+        if apart_mm <= (sizes[0].high + others[0].high) / 2:
+            length, leading = (_together(apart_mm, *pair) for pair in zip(sizes, others, strict=True))
+            words = f"together {leading.median:.1f} mm long ({leading.low:.1f} to {leading.high:.1f})"
+            pairs[reports.Touching((first, second), apart_mm, length)] = words
+    return pairs
 
 
-def together_words(pair: reports.Touching) -> str:
-    """Joint length of two masses, with its interval."""
-    length = pair.together_mm
-    return f"together {length.median:.1f} mm long ({length.low:.1f} to {length.high:.1f})"
+def _together(apart_mm: float, one: Quantity, other: Quantity) -> reports.Interval:
+    """Length over two masses in one body: errors go together, so its ends are made of the same ends of both sizes."""
+    ends = zip((one.median, one.low, one.high), (other.median, other.low, other.high), strict=True)
+    # one may lie within the other's outline
+    median, low, high = (max(apart_mm + (a + b) / 2, a, b) for a, b in ends)
+    return reports.Interval(median, low, high, one.probability)
 
 
-def touching_findings(pairs: Sequence[reports.Touching]) -> list[Finding]:
+def touching_findings(masses: Sequence[SizedMass]) -> list[Finding]:
     """A finding for each pair of masses that may be one lump."""
     return [
-        finding("touching", "masses {} and {} may be one lump: ".format(*pair.masses) + together_words(pair))
-        for pair in pairs
+        finding("touching", "masses {} and {} may be one lump: {}".format(*pair.masses, words))
+        for pair, words in touching_masses(masses).items()
     ]
 
 
@@ -407,8 +411,8 @@ def mass_words(mass: MassReport, reported: MassReport | None) -> str:
         ends = f"{share_words(size)} interval {size.low:.1f} to {size.high:.1f} mm"
         outcome = f"largest size {size.median:.1f} mm ({ends})"
     if reported is not None:
-        for pair in touching_masses(sized_masses([reported, mass])):
-            outcome += f"; may be one lump with mass {reported.number}, {together_words(pair)}"
+        for words in touching_masses(sized_masses([reported, mass])).values():
+            outcome += f"; may be one lump with mass {reported.number}, {words}"
     return f"{place}: {outcome}; probability of a lump {chance_text(mass.detected_probability)}"
 
 
@@ -462,7 +466,7 @@ def estimate_report(
         candidates=tuple(reports.PassedOver(*one.centre_mm, one.fault) for one in estimate.candidates),
         other_rises=tuple(rounded(reports.OtherRise(**as_dict(rise)), 6) for rise in estimate.other_rises),
         masses=masses,
-        touching=touching_masses(sized_masses(masses)),
+        touching=tuple(touching_masses(sized_masses(masses))),
         left_out=tuple(estimate.left_out),
         prior=as_dict(prior),
         research_use=RESEARCH_USE,

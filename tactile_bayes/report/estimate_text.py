@@ -8,7 +8,7 @@ from typing import Any
 
 from tactile_bayes.declarations import from_plain
 from tactile_bayes.files.reports import EstimateReport, MassReport, PooledReport, SmallestLump
-from tactile_bayes.findings import capitalised, finding_lines, finding_summary, first_texts
+from tactile_bayes.findings import capitalised, counted, finding_lines, finding_summary, first_texts
 from tactile_bayes.inference.draws import ParameterDraws, Quantity
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.result import Estimate
@@ -175,12 +175,9 @@ LEAST_SHARE = 0.005  #: Of the width variance, below which the tracker's share i
 def estimate_text(estimate: Estimate, report: EstimateReport) -> str:
     """Full report of one map: sizes with intervals, sources of uncertainty, omissions; `report` is the estimate's."""
     if estimate.status == "no_estimate":
-        lines = [
-            *finding_lines(report.findings),
-            *_no_estimate_lines(report),
-            *estimate_document.mass_lines(report.masses),
-        ]
-        return "\n".join([*lines, *passed_over_lines(estimate), RESEARCH_USE]) + "\n"
+        lines = [*finding_lines(report.findings), *_no_estimate_lines(report)]
+        lines += [*estimate_document.mass_lines(report.masses), *passed_over_lines(estimate)]
+        return "\n".join([*lines, RESEARCH_USE]) + "\n"
     lines = [*finding_lines(report.findings, "caution"), *size_table(report), "", *_no_size_lines(report)]
     if report.position is not None:
         lines.append(estimate_document.place_line(report.position))
@@ -332,7 +329,7 @@ def passed_over_lines(estimate: Estimate) -> list[str]:
     faulty = [candidate for candidate in estimate.candidates if candidate.fault]
     lines = [f"Passed over near ({c.centre_mm[0]:.0f}, {c.centre_mm[1]:.0f}) mm: {c.fault}." for c in faulty]
     more = len(lines) - MOST_PASSED_OVER
-    return [*lines[:MOST_PASSED_OVER], f"Passed over {more} lower bumps."] if more > 0 else lines
+    return [*lines[:MOST_PASSED_OVER], f"Passed over {counted(more, 'lower bump')}."] if more > 0 else lines
 
 
 # --- An estimate in at most 12 lines: the size, what makes its interval wide, what would narrow it, its quality.
@@ -396,7 +393,7 @@ def _mass_lines(masses: Sequence[MassReport], *, room: int) -> list[str]:
     lines = estimate_document.mass_lines(masses)
     shown = lines[: max(room, 1)]
     if left := len(lines) - len(shown):
-        shown[-1] = f"{shown[-1].rstrip('.')}; and {left} more {'mass' if left == 1 else 'masses'}."
+        shown[-1] = f"{shown[-1].rstrip('.')}; and {counted(left, 'more mass')}."
     return shown
 
 

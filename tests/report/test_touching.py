@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from tactile_bayes.files.reports import Interval, MassReport, Place
+from tactile_bayes.declarations import replace
+from tactile_bayes.files.reports import AnotherExam, Interval, MassReport, Place
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.report.estimate_document import mass_words, sized_masses, touching_findings, touching_masses
 
@@ -58,7 +59,20 @@ def test_the_line_of_the_other_mass_tells_it(x: float, told: bool) -> None:
     first, second = mass(1, 0.0, 12.0), mass(2, x, 8.0)
     words = "may be one lump with mass 1, together 20.0 mm long (19.0 to 21.0)"
     assert (words in mass_words(second, first)) == told
-    found = touching_findings(touching_masses(sized_masses([first, second])))
+    found = touching_findings(sized_masses([first, second]))
     assert [one.text for one in found] == (
         ["masses 1 and 2 may be one lump: together 20.0 mm long (19.0 to 21.0)"] if told else []
     )
+
+
+def test_the_length_in_words_has_the_interval_that_reports_lead_with() -> None:
+    """For exams that differ as patients' do: each mass had the wider interval, and both together the narrower one."""
+    pair = [mass(1, 0.0, 12.0), mass(2, 10.0, 8.0)]
+    wider = [mass(1, 0.0, 12.0, half=3.0).max_size_mm, mass(2, 10.0, 8.0, half=2.0).max_size_mm]
+    pair = [replace(one, another_exam=AnotherExam(0.15, size, size, {})) for one, size in zip(pair, wider, strict=True)]
+    assert "together 20.0 mm long (17.5 to 22.5)" in mass_words(pair[1], pair[0])
+    assert [one.text for one in touching_findings(sized_masses(pair))] == [
+        "masses 1 and 2 may be one lump: together 20.0 mm long (17.5 to 22.5)"
+    ]
+    (found,) = touching_masses(sized_masses(pair))  # the file's is of `max_size_mm`
+    assert found.together_mm == Interval(20.0, 19.0, 21.0, 0.95)
