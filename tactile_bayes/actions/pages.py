@@ -19,6 +19,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.atomic import first_duplicate
 from tactile_bayes.files.reports import json_text
+from tactile_bayes.findings import finding_lines
 from tactile_bayes.options import CompareOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import compare_summary, compare_text
@@ -107,7 +108,8 @@ def report_action(
     page.write(exam_page(exam))
     if exam.main.tactile_map is None:
         click.echo("note: without its map the page has no picture and no coverage; give MAP.nc too", err=True)
-    click.echo(f"{output}: {headline(exam)}")
+    for line in (*finding_lines(exam.report.findings, "caution"), f"{output}: {headline(exam)}"):
+        click.echo(line)
     click.echo(RESEARCH_USE)
 
 

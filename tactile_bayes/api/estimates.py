@@ -28,6 +28,7 @@ from tactile_bayes.files.provenance import scans_of
 from tactile_bayes.files.reading import HDF5_MAGIC, first_bytes
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.files.size_json import read_repeatability
+from tactile_bayes.findings import finding_lines
 from tactile_bayes.options import IdentityOptions
 from tactile_bayes.report.estimate_document import side_of
 from tactile_bayes.report.exam_page import exam_page
@@ -255,7 +256,7 @@ def exam_report(
     Returns
     -------
     str
-        The page's headline.
+        The page's headline, below its cautions.
 
     Raises
     ------
@@ -284,7 +285,7 @@ def exam_report(
         exam = exam_from_estimates(estimates, own_settings)
     exam = replace(exam, labels=labels)
     page.write(exam_page(exam))
-    return headline(exam)
+    return "\n".join([*finding_lines(exam.report.findings, "caution", paper=True), headline(exam)])
 
 
 # --- Export of maps and estimates to the files that other systems take.

@@ -112,13 +112,12 @@ def exam_rows(campaign: Campaign, pooled: Pooled) -> list[ExamRow]:
 
 
 def _pooled_findings(pooled: Iterable[PooledReport]) -> dict[str, tuple[Finding, ...]]:
-    """Findings of pooled sizes by the exam that they are about, such as a lump that lies elsewhere."""
+    """Findings of pooled sizes by the exam that they are about, or by all exams of the mass."""
     return {
         name: tuple(
             replace(one, about="")
             for one in report.findings
-            if (one.about == f"map {number}" and one.kind != "several_masses")  # its row says which mass it is of
-            or one.kind == "maps_disagree"
+            if one.about in ("", f"map {number}") and one.kind != "several_masses"  # its row says which mass it is of
         )
         for report in pooled
         for number, name in enumerate((one.map for one in report.maps), start=1)

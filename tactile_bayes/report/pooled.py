@@ -140,14 +140,13 @@ def _pooled_map(index: int, name: str, report: EstimateReport, pooled: PooledEst
 
 
 def pooled_findings(pooled: PooledEstimate, reports: Sequence[EstimateReport]) -> Iterator[Finding]:
-    """Findings on the maps with a lump, each named by its map, and on the maps together."""
+    """Findings on each map, named by its number, also on one that shows no lump, and on the maps together."""
     if pooled.status == DISAGREE and pooled.one_place is not None and pooled.one_place < LEAST_PROBABILITY:
         yield disagreement(pooled.reason, pooled.one_place)
     elif pooled.status == DISAGREE and pooled.one_size is not None:
         yield disagreement(pooled.reason, pooled.one_size, pooled.one_size_apart)
-    sized = [i for i, report in enumerate(reports) if report.status == "estimate"]
-    for index in sized if pooled.status == DISAGREE else sorted(pooled.centres):
-        for one in reports[index].findings:
+    for index, report in enumerate(reports):
+        for one in report.findings:
             if one.kind != "outside_calibration":  # of the size alone
                 yield one.labelled(_number(index))
     apart = maps_lying_apart(reports)

@@ -31,7 +31,7 @@ from tactile_bayes.api.maps import Map
 from tactile_bayes.api.pooled import PooledSize
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import SizeEstimate
-from tactile_bayes.campaigns.report import ExamRow, done_line, grown_line
+from tactile_bayes.campaigns.report import ExamRow, _pooled_findings, done_line, grown_line
 from tactile_bayes.declarations import replace
 from tactile_bayes.exports.exam import Identity, MapFile, parse_estimate
 from tactile_bayes.exports.fhir import bundle_of
@@ -62,10 +62,10 @@ def one_of(kind: str) -> Finding:
     return finding(kind, f"words for {kind}", f"give --{kind}", f"ask about {kind}")
 
 
-def plain_map(seed: int) -> TactileMap:
+def plain_map(seed: int, *, amplitude: float = 0.3) -> TactileMap:
     """A map with a lump 60 mm to the patient's right of the xiphoid, and no finding."""
     noise = 0.01 * np.random.default_rng(seed).standard_normal((51, 51))
-    made = bump_map(noise=noise, amplitude=0.3, x=0.0, y=0.0, sigma_x=4.0, sigma_y=4.0)
+    made = bump_map(noise=noise, amplitude=amplitude, x=0.0, y=0.0, sigma_x=4.0, sigma_y=4.0)
     return replace(
         made,
         recipe=MapRecipe("scan", "gain", 1.0, (5.0, 14.0)),
@@ -347,18 +347,26 @@ def test_a_notebook_has_both_intervals_and_the_probability() -> None:
 
 def test_what_speaks_against_a_map_reaches_pool_comparison_and_campaign(tmp_path: Path) -> None:
     """Written to a file, estimated by commands; only what is of one size alone is judged anew from all maps."""
-    for number in (1, 2):
-        made = replace(plain_map(number), findings=(one_of("late_poses"),) if number == 2 else ())
+    for number in (1, 2, 3):
+        speaks_against = {2: (one_of("late_poses"),), 3: (one_of("side"),)}.get(number, ())
+        made = replace(plain_map(number, amplitude=0.0 if number == 3 else 0.3), findings=speaks_against)
         scans = ({"sha256": f"{number:064x}", "side": "right", "subject": "P"},)
         write_map(tmp_path / f"{number}.nc", made, provenance=Provenance("test", {}, scans=scans))
     sentence = "CAUTION: {}words for late_poses; give --late_poses"
 
     def run(*words: object) -> str:
-        done = run_here(*words, "--method", "laplace", cwd=tmp_path)
+        method = () if words[0] == "report" else ("--method", "laplace")
+        done = run_here(*words, *method, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
     assert run("estimate", "2.nc").startswith(sentence.format(""))
+    (tmp_path / "2.json").write_text(run("estimate", "2.nc", "--json"))
+    assert run("report", "2.json", "-o", "2.html").startswith(sentence.format(""))
+    paper = "CAUTION: words for late_poses; ask about late_poses.\nLump of about"
+    assert tb.exam_report(tmp_path / "2.json", tmp_path / "p.html").startswith(paper)
+    # a map without a lump is part of the answer, too
+    assert "map 2: words for side" in run("estimate", "1.nc", "3.nc", "--pool")
     assert run("estimate", "1.nc", "2.nc", "--pool").startswith(sentence.format("map 2: "))
     assert run("compare", "1.nc", "--with", "2.nc").startswith(sentence.format("visit 2: "))
     assert "CAUTION" not in run("estimate", "1.nc")
@@ -368,6 +376,20 @@ def test_what_speaks_against_a_map_reaches_pool_comparison_and_campaign(tmp_path
         told = {row["file"]: (row["verdict"], sentence.format("") in row["findings"]) for row in csv.DictReader(lines)}
     assert told == {"1.nc": ("sound", False), "2.nc": ("doubtful", True)}
     assert "words for late_poses" in (tmp_path / "out" / "index.html").read_text()
+
+
+def test_a_mass_whose_visits_were_not_compared_keeps_what_speaks_against_them() -> None:
+    report = replace(Made([one_of("side")]).compared.report, status="not_one_mass", reason="far apart", changes=())
+    (row,) = growths("P", "1", ["1", "2"], report, "")
+    assert one_of("side").sentence(paper=True) in row.words
+
+
+def test_what_a_pool_finds_of_all_its_maps_stands_in_each_exams_row() -> None:
+    """Bodies that differ: said by `estimate --pool`, and by the table of a campaign."""
+    both, second = one_of("fat_apart"), replace(one_of("late_poses"), about="map 2")
+    report = Made([both, second]).pooled.pooled_report
+    names = [one.map for one in report.maps]
+    assert _pooled_findings([report]) == {names[0]: (both,), names[1]: (both, one_of("late_poses"))}
 
 
 def test_the_live_view_says_a_caution_before_the_size() -> None:
@@ -388,7 +410,9 @@ def test_every_module_that_prints_a_result_is_behind_an_output_or_prints_no_size
 
 
 def test_every_kind_is_made_somewhere() -> None:
-    """A kind that nothing makes any more is dead."""
+    """A kind that nothing makes any more is dead; each is listed for users."""
     made = "".join(path.read_text() for path in Path(tb.__file__).parent.rglob("*.py"))
+    listed = (Path(__file__).parents[2] / "docs" / "formats.md").read_text()
     for kind in KINDS:
+        assert f"`{kind}`" in listed
         assert len(re.findall(rf'"{kind}"', made)) > 1, kind
