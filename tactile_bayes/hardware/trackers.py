@@ -341,7 +341,8 @@ class NdiTracker:
         except DeviceError:
             if not wired:
                 raise
-            api.ndiRESET(self._device)  # it still has an earlier session's line rate
+            with suppress(OSError):  # of a device that is no NDI tracker: the next line says so
+                api.ndiRESET(self._device)  # it still has an earlier session's line rate
             self._command("INIT:")
         if wired:
             self._command("COMM:%d%03d%d", api.NDI_115200, api.NDI_8N1, api.NDI_NOHANDSHAKE)

@@ -122,6 +122,17 @@ def test_a_tracker_left_at_another_rate_is_reset():
     assert library.told[:3] == ["INIT:", "a break", "INIT:"]
 
 
+def test_a_device_that_is_no_ndi_tracker_is_refused_in_words():
+    """Its failed reset was a traceback."""
+
+    class Deaf(FakeLibrary):
+        def ndiRESET(self, device):
+            raise OSError("Error 0x0106: Measurement System failed to reset on break")
+
+    with pytest.raises(DeviceError, match="INIT failed"):
+        NdiTracker(Deaf(refuse={"INIT": 0xF6}), "/dev/ttyUSB0")
+
+
 def test_new_frames_with_a_tool_in_sight_are_poses():
     seen = (*TURN, 254.0, -127.0, 25.4, 0.2)
     spoilt = OSError("POLARIS 0x04: Invalid CRC")
