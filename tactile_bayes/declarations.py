@@ -25,7 +25,7 @@ import math
 import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from datetime import date
+from datetime import date, time
 from functools import cache
 from pathlib import Path
 from threading import RLock
@@ -455,5 +455,5 @@ def _key_repr(key: object) -> str:
 
 def short_repr(value: object) -> str:
     """A value's repr for an error, in up to 60 characters."""
-    text = repr(value)
+    text = str(value) if isinstance(value, date | time) else repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import re
 import sys
@@ -176,7 +177,9 @@ def read_protocol(path: Path) -> tuple[str | None, dict[str, Any]]:
 
 # --- Session facts of a recording as TOML: side, posture, lubricant, examiner, subject and other text.
 
-SET_BY_RECORDING: Final = ("head_id", "tracker_id", "source", "clock", "rotation", "array_calibration_days")
+SET_BY_RECORDING: Final = (
+    *("head_id", "tracker_id", "source", "clock", "rotation", "tool", "reference", "array_calibration_days"),
+)
 """Keys that the recording itself writes."""
 OF_A_PERSON: Final = (
     *("name", "patient", "patient_name", "examiner_name", "date_of_birth", "birth_date", "address", "phone"),
@@ -190,7 +193,7 @@ Days = Annotated[str, Meta(pattern="^-?[0-9]{1,6}$", extra={"words": "a whole nu
 Posture = Literal["supine", "oblique", "sitting", "phantom"]
 _FACT_NAME: Final = "^[a-z][a-z0-9_]{0,39}$"
 FactName = Annotated[str, Meta(pattern=_FACT_NAME)]
-Fact = Annotated[str, Meta(max_length=2000)]
+Fact = Annotated[str, Meta(max_length=2000, extra={"words": "a text in quotes of up to 2000 letters"})]
 
 
 class Session(Record, forbid_unknown_fields=False):
@@ -239,5 +242,9 @@ def read_session(path: Path) -> dict[str, str]:
     for key in SET_BY_RECORDING:
         if key in document:
             raise BadDataError(f"{key} is set by the recording itself", way_out=f"leave {key} out", path=str(path))
+    for key in document:
+        near = difflib.get_close_matches(key, {*names_of(Session)}.difference(SET_BY_RECORDING), n=1, cutoff=0.8)
+        if near and near[0] not in document:
+            raise BadDataError(f"{key} is not known", way_out=f"did you mean {near[0]}?", path=str(path))
     check_session(document, path=path)
     return document

@@ -421,6 +421,9 @@ SESSIONS = {
     "subject = 7": "subject is 7; give a text in quotes",
     'patient_name = "x"': "patient_name may not be given; leave it out",
     'Side = "left"': "'Side' is not known; did you mean side?",
+    'reference = "7"': "reference is set by the recording itself",
+    'subjct = "P031"': "subjct is not known; did you mean subject?",
+    "date = 2026-11-27": "date is 2026-11-27; give a text in quotes",
     'side = "Left"': "side is 'Left'; did you mean left? Give one of left, right, phantom",
     "side = left": "is not TOML",
 }
