@@ -14,6 +14,7 @@ from tactile_bayes.declarations import Meta, Record, field, set_fields
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding, capitalised, counted, finding
 from tactile_bayes.geometry import BoolArray, FloatArray
+from tactile_bayes.mapping.select import LEAST_FRAMES
 from tactile_bayes.scans import HeadShape
 
 # --- Binomial smoothing of sums in cells.
@@ -198,7 +199,8 @@ def broken_assumptions(quality: Mapping[str, float], *, strokes_lengthwise: int 
 
     `strokes_lengthwise`: number of strokes along the head, counted where there are few across it.
     """
-    if lag := _beyond(quality, "stroke_lag_mm", "stroke_lag_sd_mm", MOST_LAG_MM):
+    enough = quality.get("frames_used", LEAST_FRAMES) >= LEAST_FRAMES  # of a few, a lag is noise
+    if enough and (lag := _beyond(quality, "stroke_lag_mm", "stroke_lag_sd_mm", MOST_LAG_MM)):
         cause = "each dragged it along" if lag > 0 else "the tracker's positions came late"
         text = (
             f"strokes in opposite directions see the lump some {2 * abs(lag):.0f} mm apart, as if {cause}: the size "

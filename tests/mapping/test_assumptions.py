@@ -144,6 +144,8 @@ def test_a_figure_that_its_error_does_not_tell_from_0_says_nothing() -> None:
     assert not list(broken_assumptions(unsure))
     assert not skewed(unsure)
     assert not list(broken_assumptions({}))
+    few = {"stroke_lag_mm": 255.7, "stroke_lag_sd_mm": 0.001, "frames_used": 12.0}
+    assert not list(broken_assumptions(few))  # strokes 511 mm apart, of which it saw one
 
 
 def test_a_scan_without_strokes_both_ways_has_no_lag_and_no_skew() -> None:
