@@ -262,12 +262,17 @@ class Jumps:
             jumps.add(time_s, place_mm)
         return jumps
 
+    @property
+    def crossed(self) -> bool:
+        """True where most steps are to the opposite side."""
+        return 2 * self.opposite > self.number
+
     def cautions(self) -> list[str]:
         """A line on their number, length and cause; empty without jumps."""
         if not self.number:
             return []
         cause = "two tools in one stream, damaged records, or metal near an electromagnetic tracker"
-        if 2 * self.opposite > self.number:
+        if self.crossed:
             cause = "the sensor crossed into the hemisphere that the tracker is not set to"
         times = "once" if self.number == 1 else f"{self.number:,} times"
         return [f"the poses jump {times}, by up to {self.longest_mm:.0f} mm, faster than a hand: {cause}"]
@@ -310,10 +315,14 @@ def overlap_cautions(frames: Span, poses: Span) -> list[str]:
 def scan_findings(scan: Scan) -> tuple[Finding, ...]:
     """Findings of a scan's recorder, and on its times and poses; what the recorder noted too is given once."""
     noted = with_times(scan.findings, Span.of(scan.frames.time_s), Span.of(scan.poses.time_s))
-    jumps = Jumps.of(scan.poses).cautions()
+    found = Jumps.of(scan.poses)
+    jumps, remedy = (
+        found.cautions(),
+        "set the tracker's hemisphere to the patient's side, and scan again" * found.crossed,
+    )
     noted = tuple(one for one in noted if one.text not in jumps)
     frozen = (finding("times_apart", text, *_LEFT_OUT) for text in _frozen_cautions(scan.poses))
-    return (*noted, *frozen, *(finding("poses_jump", text) for text in jumps))
+    return (*noted, *frozen, *(finding("poses_jump", text, remedy, remedy) for text in jumps))
 
 
 def _frozen_cautions(poses: TrackerPoses) -> list[str]:

@@ -481,6 +481,8 @@ def test_jumps_are_told_and_named_in_place_of_the_quaternions():
     (line,) = Jumps.of(opposite).cautions()
     assert "jump 2 times" in line
     assert "hemisphere" in line
+    (told,) = [one for one in scan_findings(replace(scan, poses=opposite)) if one.kind == "poses_jump"]
+    assert told.remedy == "set the tracker's hemisphere to the patient's side, and scan again"
     assert not Jumps.of(scan.poses).cautions()
     assert found in build_map(mixed, every=4).findings
     turned = scan.poses.quaternion_wxyz.copy()
