@@ -7,7 +7,7 @@ Frames: `base` (tracker, paper O), `scanhead` (paper S), `plane` (paper P), `pat
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,6 +149,9 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
     return Plane(rigid(rotation, -rotation @ centroid_mm), shortest, np.array([longest, middle, shortest]))
 
 
+LEAST_APART_MM: Final = 1.0  #: Landmarks at most so far apart are one place.
+
+
 def patient_from_base(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, *, normal: FloatArray) -> FloatArray:
     """Transform to the patient frame, from two landmarks and the direction into the body.
 
@@ -158,7 +161,7 @@ def patient_from_base(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, *, n
     """
     along = sternal_notch_mm - xiphoid_mm
     length = float(np.linalg.norm(along))
-    if not length > 1.0:
+    if not length > LEAST_APART_MM:
         raise BadDataError(
             f"sternal notch and xiphoid are {length:.2f} mm apart",
             way_out="correct them, or touch both before the scan",

@@ -211,7 +211,7 @@ class Keys:
         if key in names and self.recorder.tracker is None:
             self._say("no landmark without a tracker")
         elif key in names:
-            self.recorder.touch = LandmarkTouch(names[key], scanhead_from_tracker=self.scanhead_from_tracker)
+            self.recorder.begin_touch(LandmarkTouch(names[key], scanhead_from_tracker=self.scanhead_from_tracker))
             self._say(f"{names[key].replace('_', ' ')}: hold still")
         elif key == " " and self.waiting:
             self.waiting = False

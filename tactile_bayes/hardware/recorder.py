@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import select
 import time
 from collections import Counter
@@ -14,7 +15,7 @@ import numpy as np
 
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.findings import first_of
-from tactile_bayes.geometry import FloatArray, inverse, rotation_from_quaternion
+from tactile_bayes.geometry import LEAST_APART_MM, FloatArray, inverse, rotation_from_quaternion
 from tactile_bayes.hardware import readings
 from tactile_bayes.hardware.ports import SILENT_S, Port, Stream
 from tactile_bayes.mapping.select import Jumps, Span, disjoint, overlap_cautions
@@ -25,6 +26,7 @@ from tactile_bayes.mapping.select import Jumps, Span, disjoint, overlap_cautions
 _RATE_SHARE: Final = 0.02
 _RATE_LEAST_S: Final = 0.5
 _STUCK_POSES: Final = 10
+_LEAST_POSE_HZ: Final = 25.0  #: A map knows no place between poses more than 50 ms apart.
 _CAUTION_SHARE: Final = 0.01  #: Of lost frames, and of missing or flagged poses: any exam has fewer.
 
 
@@ -67,10 +69,13 @@ class RecordingReport:
         return (self.last_ns - self.first_ns) / 1e9
 
 
-def _cautions(report: RecordingReport, passed_s: float, silent_s: float, rate_hz: float) -> Iterator[str]:
+def _cautions(
+    report: RecordingReport, passed_s: float, silent_s: float, rate_hz: float, pose_s: float
+) -> Iterator[str]:
     """Cautions about frames that did not come, clocks and counters that jump, the pace of both, and the poses.
 
-    By the host's clock, `passed_s` is the time from the first frame to the last, `silent_s` from there to the stop.
+    By the host's clock, `passed_s` is the time from the first frame to the last, `silent_s` from there to the stop;
+    `pose_s` is the time from the first pose to the last without their longest gap.
     """
 
     def times(number: int) -> str:
@@ -105,6 +110,8 @@ def _cautions(report: RecordingReport, passed_s: float, silent_s: float, rate_hz
         yield f"the tracker's {report.tracker_remark}"
     if report.poses > _STUCK_POSES and report.poses_repeated >= report.poses - 1:
         yield "every pose is the same: the tracker does not follow the head"
+    elif report.poses > _STUCK_POSES and (fresh := report.poses - report.poses_repeated) < _LEAST_POSE_HZ * pose_s:
+        yield f"{fresh / pose_s:.0f} different poses a second, too few for a map: set the tracker to 50 or more"
 
 
 # --- Landmarks, touched with the head's apex: the mean of several poses, and their spread.
@@ -117,7 +124,7 @@ class LandmarkTouch:
     """Position of a landmark, such as ``nipple``: the mean of the apex's positions while it rests on the landmark."""
 
     def __init__(self, name: str, *, scanhead_from_tracker: FloatArray, samples: int = SAMPLES) -> None:
-        self.name = name
+        self.name, self.words = name, name.replace("_", " ")
         self._apex_mm = inverse(scanhead_from_tracker)[:3, 3]
         self._samples = samples
         self._points: list[FloatArray] = []
@@ -145,10 +152,12 @@ class LandmarkTouch:
         return self.spread_mm <= STEADY_MM
 
     def __str__(self) -> str:
+        if len(self._points) < self._samples:
+            return f"{self.words}: given up after {len(self._points)} of {self._samples} samples; touch it again"
         x, y, z = self.position_mm
         words = "" if self.steady else "; the head moved, touch it again"
         return (
-            f"{self.name.replace('_', ' ')} at {x:.1f} {y:.1f} {z:.1f} mm, spread {self.spread_mm:.2f} mm over "
+            f"{self.words} at {x:.1f} {y:.1f} {z:.1f} mm, spread {self.spread_mm:.2f} mm over "
             f"{len(self._points)} samples{words}"
         )
 
@@ -239,6 +248,7 @@ class Recorder:
         self._last_pose: readings.PoseReading | None = None
         self._pose_ns = -1
         self._stopped_ns: int | None = None
+        self._touched: dict[str, LandmarkTouch] = {}
 
     def start(self) -> None:
         """Start the devices and record them."""
@@ -251,6 +261,12 @@ class Recorder:
         """Start the tracker alone, for landmarks before the scan."""
         if self.tracker is not None:
             self.tracker.port.write(self.tracker.start)
+
+    def begin_touch(self, touch: LandmarkTouch | None) -> None:
+        """Average the next poses for a landmark; another one that was not complete is given up, and told."""
+        if self.touch and (touch is None or touch.name != self.touch.name):
+            self.report.landmarks.append(str(self.touch))
+        self.touch = touch
 
     def stop(self, why: str) -> None:
         """End the recording once data on their way have arrived."""
@@ -409,12 +425,17 @@ class Recorder:
         touch = self.touch
         if touch is None or not touch.add(reading):
             return
-        self.touch = None
-        self.report.landmarks.append(str(touch))
-        device_ns = max(0, self._pose_ns)
-        self.sink.add_landmark(touch.name, touch.position_mm, device_ns=device_ns, host_ns=max(0, host_ns))
-        self.observer.landmark(touch.name, touch.position_mm)
-        self._note(str(touch), "tracker", device_ns, host_ns, serious=not touch.steady)
+        self.touch, words, device_ns = None, str(touch), max(0, self._pose_ns)
+        for other in self._touched.values():
+            if other.name != touch.name and math.dist(other.position_mm, touch.position_mm) <= LEAST_APART_MM:
+                words += f"; not stored: this is the place of the {other.words}, touch both again"
+                break
+        else:
+            self._touched[touch.name] = touch
+            self.sink.add_landmark(touch.name, touch.position_mm, device_ns=device_ns, host_ns=max(0, host_ns))
+            self.observer.landmark(touch.name, touch.position_mm)
+        self.report.landmarks.append(words)
+        self._note(words, "tracker", device_ns, host_ns, serious=words != str(touch) or not touch.steady)
 
     def _note(self, text: str, device: str, device_ns: int, host_ns: int, *, serious: bool = True) -> None:
         self.sink.add_note(text, device=device, device_ns=device_ns, host_ns=max(0, host_ns), serious=serious)
@@ -466,8 +487,15 @@ class Recorder:
         stopped_ns = self._heard_ns if self._stopped_ns is None else self._elapsed_ns(self._stopped_ns)
         silent_s = (stopped_ns - self._heard_ns) / self.speed / 1e9
         spans = self._frame_span, self._pose_span
-        report.cautions = [*overlap_cautions(*spans), *_cautions(report, passed_s, silent_s, self.rate_hz)]
+        pose_s = self._pose_span.last_s - self._pose_span.first_s - self._pose_span.gap_s
+        report.cautions = [*overlap_cautions(*spans), *_cautions(report, passed_s, silent_s, self.rate_hz, pose_s)]
         report.cautions += self._jumps.cautions()
+        self.begin_touch(None)
+        report.cautions += [
+            f"the head moved by {touch.spread_mm:.0f} mm while it touched the {touch.words}: places may be wrong"
+            for touch in self._touched.values()
+            if not touch.steady
+        ]
         if self.head.parser.fault:
             report.cautions.append(f"the head's line: {self.head.parser.fault}")
         if self.tracker is not None and report.frames and not report.fault and disjoint(*spans):

@@ -25,7 +25,7 @@ from tactile_bayes.hardware.readings import (
     PoseReading,
     wrap_period,
 )
-from tactile_bayes.hardware.recorder import DeviceLine, Recorder, RecordingReport
+from tactile_bayes.hardware.recorder import DeviceLine, LandmarkTouch, Recorder, RecordingReport
 
 S = 1_000_000_000
 FRAME_NS = S // 200
@@ -59,13 +59,16 @@ class Kept:
     """A sink that remembers."""
 
     def __init__(self) -> None:
-        self.frames, self.poses, self.notes = [], [], []
+        self.frames, self.poses, self.notes, self.landmarks = [], [], [], []
 
     def add_frame(self, _counts, *, device_ns, **_):
         self.frames.append(device_ns)
 
     def add_pose(self, *_, device_ns, **__):
         self.poses.append(device_ns)
+
+    def add_landmark(self, name, *_, **__):
+        self.landmarks.append(name)
 
     def add_note(self, text, *, device, **_):
         self.notes.append((device, text))
@@ -380,6 +383,44 @@ def test_gaps_a_promise_not_kept_and_a_stuck_tracker_are_reported():
     assert "no frame for 0.52 s from 2.48 s on (longest gap)" in cautions
     assert any(text.startswith("the head promised 200 frames per second and measured 43") for text in cautions)
     assert "every pose is the same: the tracker does not follow the head" in cautions
+
+
+@pytest.mark.parametrize(("every", "caution"), [(5, True), (3, False)], ids=["20 Hz", "33 Hz"])
+def test_a_tracker_too_slow_for_a_map_is_told_while_the_patient_is_there(every: int, caution: bool) -> None:
+    """Half of the frames had no pose, or all, and only `map` said so."""
+    session = Session(rate_hz=100.0)
+    for i in range(300):
+        session.now_ns = i * 2 * FRAME_NS
+        session.pose(None, x_mm=float(i // every))
+        session.frame(session.now_ns)
+    slow = ["20 different poses a second, too few for a map: set the tracker to 50 or more"]
+    assert session.end().cautions == slow * caution
+
+
+def test_landmarks_in_a_hurry_in_one_place_or_in_motion_are_told() -> None:
+    """A second key gave the first landmark up without a word; two in one place could not be mapped at all."""
+    session = Session()
+    for name, places in (
+        ("xiphoid", "0"),
+        ("sternal_notch", "000"),
+        ("xiphoid", "000"),
+        ("nipple", "939"),
+        ("xiphoid", ""),
+    ):
+        session.recorder.begin_touch(LandmarkTouch(name, scanhead_from_tracker=np.eye(4), samples=3))
+        for x in places:
+            session.pose(None, x_mm=float(x))
+    report = session.end()
+    assert report.landmarks == [
+        "xiphoid: given up after 1 of 3 samples; touch it again",
+        "sternal notch at 0.0 0.0 0.0 mm, spread 0.00 mm over 3 samples",
+        "xiphoid at 0.0 0.0 0.0 mm, spread 0.00 mm over 3 samples; not stored: this is the place of the sternal notch, "
+        "touch both again",
+        "nipple at 7.0 0.0 0.0 mm, spread 3.46 mm over 3 samples; the head moved, touch it again",
+        "xiphoid: given up after 0 of 3 samples; touch it again",
+    ]
+    assert session.sink.landmarks == ["sternal_notch", "nipple"]
+    assert "the head moved by 3 mm while it touched the nipple: places may be wrong" in report.cautions
 
 
 def test_of_two_silent_devices_one_is_named(monkeypatch):
