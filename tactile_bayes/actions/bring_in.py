@@ -158,7 +158,8 @@ def _import_scan(source: Path, output: Path, request: ImportRequest) -> list[str
     scan = corrected(with_session(scan, request.session_file), request.corrections)
     inputs = hash_inputs(source=source, session=request.session_file, **request.scan_files)
     write_scan(output, scan, provenance=Provenance("import", settings, inputs), truth=truth, force=request.force)
-    return [*describe_scan(scan), *notes, *(f"lost: {line}" for line in lost), *_arrangement_lines(scan)]
+    doubts = (line for line in _arrangement_lines(scan) if line.rstrip(".") not in notes)
+    return [*describe_scan(scan), *notes, *(f"lost: {line}" for line in lost), *doubts]
 
 
 def _lengths(scan: Scan) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.named_arrays import Grid
-from tactile_bayes.files.reading import CELLS, IMAGE_BYTES, check_limit, decoding, read_bytes
+from tactile_bayes.files.reading import CELLS, IMAGE_BYTES, beginning, check_limit, decoding, read_bytes
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.presets import MM_PER_UNIT
 
@@ -46,7 +46,7 @@ def _decode_graymap(data: bytes) -> Grid:
     """Grid of a PGM (netpbm's ``P2`` or ``P5``): values from 0 to its maximum, unscaled."""
     header = _GREY_HEADER.match(data)
     if header is None:
-        raise BadDataError(f"is not an image of grey values (it starts with {data[:2]!r})", way_out=_WAY_OUT)
+        raise BadDataError(f"is not an image of grey values ({beginning(data[:2])})", way_out=_WAY_OUT)
     width, height, top = (int(header[i]) for i in (2, 3, 4))
     check_limit(width * height, CELLS, what="it has {} pixels")
     body = data[header.end() :]

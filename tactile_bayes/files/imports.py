@@ -23,21 +23,30 @@ from tactile_bayes.files.reading import kind_of
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.scan_text import is_identity, read_frames, read_poses, visible_poses
 from tactile_bayes.files.sequence_mha import is_sequence, read_sequence
-from tactile_bayes.findings import LEADS
-from tactile_bayes.geometry import FloatArray, check_rigid
+from tactile_bayes.findings import LEADS, finding
+from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.select import LEAST_FRAMES, unit_question
 from tactile_bayes.presets import KPA_PER_UNIT, MM_PER_UNIT, PRESSURE_RANGE_KPA, PRESSURE_WINDOW_KPA
-from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import (
+    ElementCalibration,
+    HeadGeometry,
+    Landmarks,
+    PressureFrames,
+    Scan,
+    TrackerPoses,
+    check_lever,
+)
 
 # No value of a scan is larger, seconds since 1970 included; the squares of damaged ones would overflow.
 _LARGEST: Final = 1e12
 _STEP_KPA: Final = 0.001  #: To which pressures are kept: a tenth of what the best arrays resolve.
 _MOST_COUNTS: Final = 65535
 _SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
+_FINER: Final = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+_LONGEST_STEP_S: Final = 0.5  # between frames or poses
 _MOST_NAMES: Final = 12  # of a file's arrays in an error
 _TURN: Final = 2 * np.pi
 _NOT_RIGID: Final = 1e-3  # of matrices that were written with few digits
-_LEVER_MM: Final = (1.0, 1000.0)  #: From the tracker's sensor to the head, where they are two things.
 _OTHER_ORDER: Final = 0.8  #: Roughness in another order over that as stated; right scans have 1.0 or more.
 _LOOKED_AT: Final = 500  # frames
 _TIME_OPTIONS: Final = {"frame_time_s": ("time-unit", "rate-hz"), "pose_time_s": ("pose-time-unit", "pose-rate-hz")}
@@ -197,7 +206,9 @@ def combine_sources(sources: Sequence[Source], options: Stated) -> tuple[Scan, l
     facts = {"frames_unit": str(stated.unit)} if pressure else {}
     if notes:
         facts["imported_as"] = "; ".join(notes)[:2000]
-    return _scan_of_arrays(arrays, facts, checked_on), notes
+    cautions = (note.removeprefix(LEADS["caution"]) for note in notes if note.startswith(LEADS["caution"]))
+    findings = tuple(finding("unlike_an_exam", text) for text in cautions)
+    return replace(_scan_of_arrays(arrays, facts, checked_on), findings=findings), notes
 
 
 def _refuse_missing(arrays: Arrays, unknown: Sequence[str], *, pressure: bool) -> None:
@@ -274,11 +285,15 @@ def _poses_of_matrices(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     matrices = matrices.astype(np.float64)
     rotations = matrices[:, :3, :3]
     departure = np.abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
-    wrong = (departure > _NOT_RIGID) | (np.linalg.det(rotations) < 0)
-    if wrong.any() or (matrices[:, 3:] != [0, 0, 0, 1]).any():
-        first = int(wrong.argmax())
-        what = f"pose_matrix is not rigid at index {first} (R R^T departs from 1 by {departure[first]:.1e})"
-        raise BadDataError(what, way_out="give the 16 numbers row by row, translation last in each row")
+    faults = {
+        "its last row is not 0 0 0 1": (matrices[:, 3:] != [0, 0, 0, 1]).any(axis=(1, 2)),
+        "R R^T is not 1": departure > _NOT_RIGID,
+        "it mirrors": np.linalg.det(rotations) < 0,
+    }
+    for fault, wrong in faults.items():
+        if wrong.any():
+            what = f"pose_matrix is not rigid at index {wrong.argmax()} ({fault})"
+            raise BadDataError(what, way_out="give the 16 numbers row by row, translation last in each row")
     return matrices[:, :3, 3], np.asarray(Rotation.from_matrix(rotations).as_quat(scalar_first=True))
 
 
@@ -370,6 +385,12 @@ def _arrange_times(arrays: Arrays, stated: Stated) -> None:
         ("pose_time_s", "position_mm", stated.pose_time_unit, stated.pose_rate_hz),
     ):
         if time in arrays:
+            steps = np.diff(arrays[time].astype(np.float64).reshape(-1))
+            step = float(np.median(steps)) if steps.size else 0.0
+            if step * _SECONDS[unit or "s"] > _LONGEST_STEP_S:
+                guess = next((name for name in _FINER if step * _SECONDS[name] <= _LONGEST_STEP_S), "ns")
+                way_out = f"looks like {_FINER[guess]}, give s or --{_TIME_OPTIONS[time][0]} {guess}"
+                raise BadDataError(f"{time} steps by {step:.4g}", way_out=way_out)
             arrays[time] = arrays[time] * _SECONDS[unit or "s"]
         elif rate is not None and timed in arrays:
             arrays[time] = np.arange(len(arrays[timed])) / rate
@@ -466,9 +487,7 @@ def _check_largest(arrays: Arrays) -> None:
     for name, array in arrays.items():
         largest = float(np.abs(array, dtype=np.float64).max(initial=0.0))
         if largest > _LARGEST:
-            unit = f"; times in ms are stated, --{_TIME_OPTIONS[name][0]} ms" if name in _TIME_OPTIONS else ""
-            way_out = f"give mm, kPa and s; the file may be damaged{unit}"
-            raise BadDataError(f"{name} holds {largest:.3g}", way_out=way_out)
+            raise BadDataError(f"{name} holds {largest:.3g}", way_out="give mm, kPa and s; the file may be damaged")
 
 
 def _check_units(arrays: Arrays, *, calibrated: bool) -> None:
@@ -482,10 +501,6 @@ def _check_units(arrays: Arrays, *, calibrated: bool) -> None:
     if travel < 1.0 and reach < 5.0 and len(position) > 1:
         what = f"position_mm spans only {travel:.4g}, none beyond {reach:.4g}"
         raise BadDataError(what, way_out=f"{metres} or their unit, --length-unit m or inch")
-    lever = float(np.linalg.norm(arrays["array_from_tracker"][..., :3, 3]))
-    if 1e-3 < lever < _LEVER_MM[0] or lever > _LEVER_MM[1]:
-        what = f"array_from_tracker puts the tracker's sensor {lever:.4g} mm from the head"
-        raise BadDataError(what, way_out=f"looks like {'metres' if lever < 1 else 'micrometres'}, give mm")
     if "landmarks_mm" in arrays:
         apart = float(np.linalg.norm(arrays["landmarks_mm"][0] - arrays["landmarks_mm"][1]))
         if apart < 10.0:
@@ -512,16 +527,13 @@ def _check_units(arrays: Arrays, *, calibrated: bool) -> None:
 
 def _check_clocks(arrays: Arrays) -> None:
     ends = []
-    for name, (unit, rate) in _TIME_OPTIONS.items():
+    for name, (_, rate) in _TIME_OPTIONS.items():
         times = arrays[name]
         if len(times) > 1 and times[0] == times.min() == times.max():
             raise BadDataError(f"{name} is {times[0]:g} throughout", way_out="give its times, not a constant")
         if 2 * (repeats := int((np.diff(times) == 0).sum())) > len(times):
             what = f"{name} repeats the time before {repeats} times of {len(times)}"
             raise BadDataError(what, way_out=f"give fractions of a second, or leave it out and give --{rate}")
-        if len(times) > 1 and (step := float(np.median(np.diff(times)))) > 0.5:
-            what = f"{name} steps by {step:.4g}"
-            raise BadDataError(what, way_out=f"looks like milliseconds, give s or --{unit} ms")
         ends.append((float(times.min()), float(times.max())))
     (a, b), (c, d) = ends
     if b < c or d < a:
@@ -537,7 +549,7 @@ def _scan_of_arrays(arrays: Arrays, facts: Mapping[str, str], checked_on: str) -
     values = {name: np.asarray(array, dtype=np.float64) for name, array in arrays.items() if name != "counts"}
     marks = values.get("landmarks_mm")
     surface, transform = values["head_surface_mm"], values["array_from_tracker"]
-    check_rigid(transform, name="array_from_tracker")
+    check_lever(transform, name="array_from_tracker")
     return Scan(
         frames=PressureFrames(values["frame_time_s"], arrays["counts"].astype(np.uint16)),
         poses=TrackerPoses(values["pose_time_s"], values["position_mm"], values["quaternion_wxyz"]),

@@ -80,7 +80,7 @@ def read_named(path: Path, choose: Choose) -> Arrays:
         elif start.startswith(b"CDF"):
             arrays = _netcdf_3(path)
         else:
-            what = f"is not an .npz, .npy, .mat or HDF5 file (it starts with {start[:6]!r})"
+            what = f"is not an .npz, .npy, .mat or HDF5 file ({reading.beginning(start[:6])})"
             way_out = "save the arrays with numpy.savez_compressed"
             if start.startswith(reading.MCAP_MAGIC):
                 what, way_out = "is a scan", "give it as it is"

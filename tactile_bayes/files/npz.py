@@ -46,7 +46,7 @@ def choose_npz(path: Path, choose: Callable[[Sequence[str]], Iterable[str]]) -> 
     with reading.open_input(path) as stream:
         start = stream.read(6)
         if not zipfile.is_zipfile(stream):
-            fault, way_out = f"is not an .npz file (it starts with {start!r})", "save it with numpy.savez_compressed"
+            fault, way_out = f"is not an .npz file ({reading.beginning(start)})", "save it with numpy.savez_compressed"
             if start.startswith(reading.ZIP_MAGIC[:2]):
                 fault, way_out = "is a zip archive that is cut off (no directory at its end)", "copy it again"
             elif start == np.lib.format.MAGIC_PREFIX:

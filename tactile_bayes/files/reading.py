@@ -61,6 +61,11 @@ def first_bytes(path: Path, number: int) -> bytes:
         return file.read(number)
 
 
+def beginning(start: bytes) -> str:
+    """Words on the first bytes of a file of another kind."""
+    return f"it starts with {start!r}" if start else "it is empty"
+
+
 def is_json(start: bytes) -> bool:
     """True for the first bytes of a JSON object or list."""
     return start.removeprefix(codecs.BOM_UTF8).lstrip().startswith((b"{", b"["))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
 from typing import Final
@@ -170,9 +170,16 @@ def corrected_quaternions(wxyz: FloatArray, corrections: Iterable[str]) -> Float
     return wxyz
 
 
-def import_again(corrections: Iterable[str]) -> str:
-    """Way out: the options of `import` that make the corrections."""
-    return f"import the scan again with {' '.join(f'--correct {name}' for name in corrections)}"
+_LEFT_HANDED: Final = (
+    " (if the tracker's axes are left-handed, as in Unity, mirror its poses instead: else left and right change places)"
+)
+
+
+def import_again(corrections: Collection[str]) -> str:
+    """Way out: the options of `import` that make the corrections, and of a mirrored array the other cause."""
+    mirrored = ("rows-reversed" in corrections) != ("columns-reversed" in corrections)
+    again = f"import the scan again with {' '.join(f'--correct {name}' for name in corrections)}"
+    return again + _LEFT_HANDED * mirrored
 
 
 def convention_agreement(selections: Sequence[SelectedFrames]) -> dict[str, float]:

@@ -312,17 +312,22 @@ def overlap_cautions(frames: Span, poses: Span) -> list[str]:
     return cautions
 
 
+_USUAL_LEVER_MM: Final = (10.0, 300.0)  #: From the face of a head that a hand holds to the tracker's sensor.
+_LEVER: Final = "check that the lever arm is in mm"
+
+
 def scan_findings(scan: Scan) -> tuple[Finding, ...]:
     """Findings of a scan's recorder, and on its times and poses; what the recorder noted too is given once."""
     noted = with_times(scan.findings, Span.of(scan.frames.time_s), Span.of(scan.poses.time_s))
     found = Jumps.of(scan.poses)
-    jumps, remedy = (
-        found.cautions(),
-        "set the tracker's hemisphere to the patient's side, and scan again" * found.crossed,
-    )
+    jumps = found.cautions()
+    remedy = "set the tracker's hemisphere to the patient's side, and scan again" * found.crossed
     noted = tuple(one for one in noted if one.text not in jumps)
     frozen = (finding("times_apart", text, *_LEFT_OUT) for text in _frozen_cautions(scan.poses))
-    return (*noted, *frozen, *(finding("poses_jump", text, remedy, remedy) for text in jumps))
+    lever = float(np.linalg.norm(scan.head.scanhead_from_tracker[:3, 3]))
+    odd = 1e-3 < lever < _USUAL_LEVER_MM[0] or lever > _USUAL_LEVER_MM[1]
+    far = (finding("unusual_scan", f"the tracker's sensor lies {lever:.3g} mm from the head", _LEVER),) if odd else ()
+    return (*noted, *frozen, *(finding("poses_jump", text, remedy, remedy) for text in jumps), *far)
 
 
 def _frozen_cautions(poses: TrackerPoses) -> list[str]:

@@ -54,7 +54,7 @@ def test_copies_maps_of_listed_scans_and_files_of_systems_give_no_exam(site: Pat
         "Studie 1/B/p2.mcap",
     ]
     assert done.stderr.splitlines() == [
-        "left out: Studie 1/B/leer.npz: is not an .npz, .npy, .mat or HDF5 file (it starts with b'')",
+        "left out: Studie 1/B/leer.npz: is not an .npz, .npy, .mat or HDF5 file (it is empty)",
         "left out: Studie 1/Köhler, M./P01 links – 1 - Kopie.mcap: holds the same bytes as "
         "Studie 1/Köhler, M./P01 links – 1.mcap",
         "left out: Studie 1/Köhler, M./P01 links – 1.nc: was made from Studie 1/Köhler, M./P01 links – 1.mcap, "

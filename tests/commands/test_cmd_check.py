@@ -29,7 +29,8 @@ def test_the_first_scan_says_what_is_wrong_and_how_to_mend_it(backwards):
 
     refused = run_here("map", "exam.mcap", "-o", "exam.nc", cwd=backwards)
     assert refused.returncode == 3
-    assert "--correct columns-reversed, or map it with --as-stated" in refused.stderr
+    assert "--correct columns-reversed (if the tracker's axes are left-handed" in refused.stderr
+    assert "else left and right change places), or map it with --as-stated" in refused.stderr
     assert not (backwards / "exam.nc").exists()
 
     checked = run_here("check", "exam.mcap", cwd=backwards)

@@ -30,6 +30,7 @@ from tactile_bayes.files.documents import parse_toml
 from tactile_bayes.files.imports import head_source, import_arrays, pose_source, read_arrays
 from tactile_bayes.files.named_arrays import array_template, read_named
 from tactile_bayes.files.scan_mcap import read_scan
+from tactile_bayes.findings import finding_lines
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.scans import Scan
@@ -310,7 +311,7 @@ def test_matrices_euler_angles_and_scalar_last_are_the_same_poses(pressed: Array
         np.testing.assert_allclose(found.position_mm, place, atol=1e-9)
         apart = turned.inv() * Rotation.from_quat(found.quaternion_wxyz, scalar_first=True)
         assert apart.magnitude().max() < 1e-6
-    with pytest.raises(BadDataError, match="pose_matrix is not rigid at index 0"):
+    with pytest.raises(BadDataError, match=r"pose_matrix is not rigid at index 0 \(its last row is not 0 0 0 1\)"):
         tb.scan(frames, frame_time, (time, matrices.swapaxes(1, 2)), head=head, unit="kPa")
 
 
@@ -345,6 +346,9 @@ FAULTS: list[tuple[str, Callable[[Arrays], Any], dict[str, Any], str]] = [
     ("no head", lambda a: a.pop("head_surface_mm"), {"unit": "kPa"}, "lacks head_surface_mm.*--head-geometry HEAD"),
     ("no times", lambda a: a.pop("frame_time_s"), {"unit": "kPa"}, r"lacks frame_time_s \(n\).*--rate-hz"),
     ("ms", lambda a: a.update(frame_time_s=a["frame_time_s"] * 1000), {"unit": "kPa"}, "milliseconds.*--time-unit ms"),
+    ("us", lambda a: a.update(pose_time_s=a["pose_time_s"] * 1e6), {"unit": "kPa"}, "microsec.*--pose-time-unit us"),
+    ("ns", lambda a: a.update(frame_time_s=1e18 + a["frame_time_s"] * 1e9), {"unit": "kPa"}, "nano.*--time-unit ns"),
+    ("still us", lambda a: a.update(frame_time_s=a["frame_time_s"] * 1e6), {"time_unit": "ms"}, "--time-unit us"),
     ("clocks", lambda a: a.update(pose_time_s=a["pose_time_s"] + 1e6), {"unit": "kPa"}, "overlap.*--pose-offset-s"),
     ("shape", dict.copy, {"unit": "kPa", "frame_shape": (26, 16)}, "16 x 26 taxels, not 26 x 16"),
     ("unknown", dict.copy, {"unit": "kPa", "arrays": {"count": "frames"}}, "'count' is no array.*mean counts"),
@@ -370,8 +374,9 @@ def test_what_is_missing_or_wrong_is_one_line_with_its_way_out(
 
 def test_an_order_that_is_stated_is_taken_with_a_caution(pressed: Arrays, tmp_path: Path) -> None:
     as_npz(tmp_path / "exam.npz", pressed | {"frames": meander(pressed["frames"])})
-    notes = import_arrays(tmp_path / "exam.npz", ArrayMap(unit="kPa", frame_order="rows"))[1]
+    scan, notes = import_arrays(tmp_path / "exam.npz", ArrayMap(unit="kPa", frame_order="rows"))
     assert notes[0].startswith("CAUTION: frames have neighbours that differ by ")
+    assert finding_lines(scan.findings) == [f"{notes[0]}."]  # which maps and sizes tell, too
 
 
 def test_objects_of_every_container_are_refused_and_never_unpickled(tmp_path: Path) -> None:
@@ -581,7 +586,7 @@ def test_many_files_fail_one_by_one(pressed: Arrays, head: Path, tmp_path: Path)
         row[3] /= 1000
     (tmp_path / "metres.json").write_text(json.dumps(in_metres))
     wrong = run_here("import", "c.h5", "-o", "w.mcap", "--unit", "kPa", "--head-geometry", "metres.json", cwd=tmp_path)
-    assert wrong.stderr.startswith("error: metres.json: array_from_tracker puts the tracker's sensor 0.0")
+    assert wrong.stderr.startswith("error: metres.json: scanhead_from_tracker puts the tracker's sensor 0.0")
     (tmp_path / "a.npz").write_bytes(b"")
     clash = run_here("import", "a.mat", "a.npz", "-o", "more", cwd=tmp_path)
     assert clash.returncode == 2

@@ -142,6 +142,14 @@ def test_the_way_to_the_skin_does_not_count():
     assert check_convention(selected(replace(scan, poses=poses))) == check_convention(selected(scan))
 
 
+@pytest.mark.parametrize(
+    ("corrections", "told"), [(["rows-reversed"], True), (["rows-reversed", "columns-reversed"], False), ([], False)]
+)
+def test_an_array_that_seems_mirrored_may_be_a_left_handed_tracker(corrections, told):
+    """A lump on the patient's right was told on the left after the correction that the check named."""
+    assert ("left-handed" in import_again(corrections)) == told
+
+
 def test_rotations_that_the_frames_ask_for_too_are_told_once():
     doubted = {"other_convention": 2.0, "other_agreement": 0.999, "normal_agreement": 0.95}
     (alone,) = convention_findings(doubted)

@@ -16,6 +16,7 @@ from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import CANNOT_SHOW, BadDataError
+from tactile_bayes.geometry import rigid
 from tactile_bayes.mapping.arrangement import check_scan
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.plausibility import exam_findings, map_findings
@@ -180,6 +181,12 @@ UNUSUAL: dict[str, tuple[Callable[[Scan], Scan], str]] = {
     "wrapped below 0": (
         counts(lambda c: np.where(c == c.min(), 65530, c), saturation=65535),
         "stand just below 65,536",
+    ),
+    "lever arm in cm": (
+        lambda one: replace(
+            one, head=HeadGeometry(one.head.surface_mm, one.head.pitch_mm, rigid(np.eye(3), np.array([0, 3.0, 4.0])))
+        ),
+        "the tracker's sensor lies 5 mm from the head",
     ),
     "landmarks of the head": (
         lambda one: replace(one, landmarks=Landmarks(np.array([0.0, 5, 0]), np.array([0.0, -9, 0]))),
