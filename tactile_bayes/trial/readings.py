@@ -346,13 +346,15 @@ def at_excision(
 ) -> tuple[list[Reading], OtherVisits]:
     """Readings of each mass at its last visit on or before excision, and the numbers of those left out.
 
-    Readings, in the order of the table's rows, that name neither visit nor date stay. Without dates the visits are
-    ordered by their numbers, and the last one is taken to lie before excision. Refused are visits whose order is not
-    known, an excision before every visit, and a reading without a visit beside others that have one.
+    Readings, in the order of the table's rows, that name neither visit nor date stay, and so do those not done, such as
+    blank cells of a wide table: they make no visit. Without dates the visits are ordered by their numbers, and the last
+    one is taken to lie before excision. Refused are visits whose order is not known, an excision before every visit,
+    and a reading without a visit beside others that have one.
     """
     by_mass: dict[MassKey, list[Row]] = defaultdict(list)
-    for row in enumerate(readings):
-        by_mass[row[1].key].append(row)
+    for i, reading in enumerate(readings):
+        if reading.status != "not_done":
+            by_mass[reading.key].append((i, reading))
     several = later = 0  # masses of several visits, readings after excision
     dropped: set[int] = set()
     only_there: Counter[str] = Counter()

@@ -50,6 +50,13 @@ def test_dates_give_the_order_of_visits_that_are_names_and_leave_out_those_after
     assert (other.earlier, other.later) == (1, 1)
 
 
+def test_a_visit_at_which_nothing_was_done_is_none() -> None:
+    missed = Reading(MASS, "tactile", 2, "not_done", visit="2")
+    sizes, other = kept(reading("1", 16.0), missed)
+    assert sizes == [16.0, None]
+    assert other.lines() == []
+
+
 def test_a_reading_on_the_day_of_excision_is_before_it() -> None:
     assert kept(reading(None, 16.0, JAN), reading(None, 22.0, MARCH), excised=MARCH)[0] == [22.0]
 
