@@ -129,13 +129,13 @@ def test_validate_says_on_its_second_line_what_it_left_out_and_holds_no_growth(t
         "1 mass was read at several visits: the last one before excision is analysed, readings left out: "
         "2 of earlier visits"
     )
-    assert "tactile: within one mass, mean SD 0.25 mm" in done.stdout
+    assert "tactile: within one mass, by 4 readings of 2 masses: mean SD 0.25 mm" in done.stdout
     blind = "\n".join(
         ",".join(cell for i, cell in enumerate(line.split(",")) if i not in (4, 5)) for line in TRIAL.split()
     )
     control = run_here(*written(tmp_path, blind), "-v", cwd=tmp_path)
     assert "left out: 2 of earlier visits" not in control.stdout
-    assert "tactile: within one mass, mean SD 1.8 mm" in control.stdout
+    assert "by 6 readings of 2 masses: mean SD 1.8 mm" in control.stdout
 
 
 def test_validate_refuses_a_date_that_is_none(tmp_path: Path) -> None:
