@@ -30,7 +30,8 @@ def show_action(file: Path, as_json: bool) -> None:
     """Show what a file holds: schema, shape, units, quality, provenance."""
     shipped = size_calibration_path(file.name) if str(file) in SHIPPED and not file.exists() else None
     facts = describe(shipped or file)
-    click.echo(dump_json(facts) if as_json else "\n".join([*fact_lines(facts), RESEARCH_USE, ""]), nl=False)
+    lines = ["\\n".join(line.splitlines()) for line in fact_lines(facts)]  # a fact must not look like several
+    click.echo(dump_json(facts) if as_json else "\n".join([*lines, RESEARCH_USE, ""]), nl=False)
 
 
 _MOST_NUMBERS = 30  #: Longer lists of numbers are shown by their range.

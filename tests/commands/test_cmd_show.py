@@ -126,6 +126,12 @@ def test_a_foreign_file_is_one_line_and_exit_3(tmp_path: Path, name: str, data: 
     assert done.stderr.startswith(f"error: {name}: ")
 
 
+def test_a_fact_that_holds_lines_is_one_line(tmp_path: Path) -> None:
+    """A subject of "P1, new line, side right" showed a second side."""
+    (tmp_path / "x.json").write_text('{"schema": "tactile-bayes/plan/1", "subject": "P1\\n  side  right"}')
+    assert r"subject  P1\n  side  right" in run_here("show", "x.json", cwd=tmp_path).stdout
+
+
 def test_many_numbers_are_counted_and_many_words_are_shown() -> None:
     lines = list(fact_lines({"a": [[0.5, 1.5]] * 20, "b": ["word"] * 40, "c": (5.0, 14.0)}))
     assert lines[2] == "c  5, 14"
