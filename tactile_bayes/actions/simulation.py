@@ -10,10 +10,10 @@ import click
 import numpy as np
 
 from tactile_bayes.batch import fault_lines, open_executor, open_store_beside, run_batch, store_path
-from tactile_bayes.declarations import as_dict, names_of
+from tactile_bayes.declarations import as_dict, names_of, replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.atomic import write_text
-from tactile_bayes.files.documents import read_toml_record, with_session
+from tactile_bayes.files.documents import read_session, read_toml_record
 from tactile_bayes.files.instrument import read_scene, read_simulated_head
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import write_scan
@@ -39,7 +39,8 @@ def simulate_action(
     force: bool,
 ) -> None:
     """Make a scan with known truth from SCENE, a TOML file."""
-    stated = read_scene(scene)
+    stated, session = read_scene(scene), {} if session_file is None else read_session(session_file)
+    inputs = hash_inputs(scene=scene, session=session_file)
     for lump in stated.solid_lumps if fidelity == "empirical" else ():
         if warning := outside_range(lump.d_mm, lump.depth_ratio):
             click.echo(warning, err=True)
@@ -47,9 +48,9 @@ def simulate_action(
     with progress_bar("frames") as progress:
         simulated = simulate(stated, rng=np.random.default_rng(seed), fidelity=fidelity, head=head, progress=progress)
     scan, truth = simulated.scan, simulated.truth
-    inputs = hash_inputs(scene=scene, session=session_file)
+    scan = replace(scan, session={**scan.session, **session})
     provenance = Provenance("simulate", {"model": truth["model"]}, inputs, seed=seed)
-    write_scan(output, with_session(scan, session_file), provenance=provenance, truth=truth, force=force)
+    write_scan(output, scan, provenance=provenance, truth=truth, force=force)
     shape = f": {truth['shape']}" if truth.get("shape") else ""
     lines = [f"{output}: scan, seed {seed}", *describe_scan(scan), f"model {truth['model']}{shape}"]
     lines += [f"head: {truth['head']}"] if "head" in truth else []

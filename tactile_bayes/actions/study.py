@@ -284,8 +284,7 @@ def compare_model_action(
     **options: Any,
 ) -> None:
     """Compare a scan's frames and map with a forward model of SCENE (section 2.3 of the paper)."""
-    body = read_scene(scene)
-    loaded = read_scan(scan)
+    body, loaded, inputs = read_scene(scene), read_scan(scan), hash_inputs(scan=scan, scene=scene)
     if at is None and not (body.solid_lumps or body.lumps):
         at = (0.0, 0.0)  # no lump to look for: the middle of the strokes
     measured = measured_frames(loaded, place_mm=at, **options)
@@ -301,8 +300,7 @@ def compare_model_action(
             measured, comparisons, figure, title=f"{scan.stem} against {scene.stem}", force=force
         )
     if as_json:
-        document = paper_head.comparison_document(measured, comparisons, inputs=hash_inputs(scan=scan, scene=scene))
-        click.echo(dump_json(document), nl=False)
+        click.echo(dump_json(paper_head.comparison_document(measured, comparisons, inputs=inputs)), nl=False)
         return
     for line in finding_lines(scan_findings(loaded)):
         click.echo(line, err=True)

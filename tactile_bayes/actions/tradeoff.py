@@ -143,6 +143,7 @@ def tradeoff_forward_action(
     """Measure error in amplitude, width and size against CPU time, for the lump of a scene."""
     if size_calibration not in (None, LEARNED):
         protect_inputs(size_calibration_path(size_calibration))
+    inputs = hash_inputs(scene=scene)
     with in_file(scene or ""):
         drawn = Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)) if scene is None else read_scene(scene)
         case = tradeoffs.lump_case(drawn, head=head)
@@ -158,7 +159,7 @@ def tradeoff_forward_action(
     by_model[tradeoffs.PLANE] = replace(plane, notes=(*notes, f"{warning}.") if warning else notes)
     lump = {name: getattr(case, name) for name in ("d_mm", "depth_ratio", "stiffness_ratio", "seat")}
     words = f"lump of {case.d_mm:g} mm, h/d {case.depth_ratio:g}, {case.stiffness_ratio:g} times as stiff as fat"
-    by_title, provenance, inputs = {}, [], hash_inputs(scene=scene)
+    by_title, provenance = {}, []
     for model, tradeoff in by_model.items():
         shoulders, rule = case.settings(model).head.shoulders, rules[model]
         by_title[f"{model}: {words}, {paper.seat_name(case.seat)}; head: {shoulders}"] = tradeoff
@@ -210,6 +211,7 @@ def tradeoff_estimate_action(
         raise UsageError("--centre-mm is a place on one map; give one map")
     if settings.checkpoint is not None:
         raise UsageError("a checkpoint is of one estimate, and this command makes many; leave checkpoint out")
+    inputs = hash_inputs(**{f"map_{number}": path for number, path in enumerate(maps, start=1)})
     with progress_bar("settings") as progress:
         work = StudyRun(time.process_time, tolerance_mm, runs, forecast, progress, settings.seed, settings.interval)
         tactile_map = read_map(maps[0])
@@ -225,7 +227,6 @@ def tradeoff_estimate_action(
     if (cold_s := fresh_cpu_s(words)) is not None:
         shared = {"start of the program and reading the map": max(cold_s - tradeoff.default.seconds, 0.0)}
         tradeoff = replace(tradeoff, shared_cpu_s=shared)
-    inputs = hash_inputs(**{f"map_{number}": path for number, path in enumerate(maps, start=1)})
     options = {"size_calibration": size_calibration, "tolerance_mm": tolerance_mm, "runs": runs}
     provenance = [Provenance("tradeoff estimate", options, inputs, seed=seed)]
     by_title = {f"{maps[0].stem}: what more time for `estimate` buys": tradeoff}
@@ -240,12 +241,13 @@ def tradeoff_map_action(
     begun = time.process_time()
     loaded = read_scan(scan)
     read_s = time.process_time() - begun
+    inputs = hash_inputs(scan=scan)
     settings = Settings(seed=seed)
     with progress_bar("settings") as progress:
         work = StudyRun(time.process_time, tolerance_mm, runs, forecast, progress, seed, settings.interval)
         tradeoff = tradeoffs.measure_map(loaded, inputs=partial(estimate_inputs, settings), work=work)
     tradeoff = replace(tradeoff, shared_cpu_s={"reading the scan": read_s})
     options = {"tolerance_mm": tolerance_mm, "runs": runs}
-    provenance = [Provenance("tradeoff map", options, hash_inputs(scan=scan), seed=seed)]
+    provenance = [Provenance("tradeoff map", options, inputs, seed=seed)]
     by_title = {f"{scan.stem}: what finer cells and more frames buy": tradeoff}
     return _show(by_title, varied="map", figure=figure, as_json=as_json, force=force, provenance=provenance)

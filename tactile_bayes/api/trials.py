@@ -330,6 +330,8 @@ def planned(values: Mapping[str, Any], pilot: Pilot | None, progress: Progress) 
         raise UsageError("--power and --precision find the number of patients; leave out --patients")
     by_default = as_dict(PlanErrors(**stated))
     errors = by_default if pilot is None else pilot.errors(options.against, stated)
+    files = {} if pilot is None else pilot.trial.files
+    inputs = hash_inputs(pilot=files.get("trial"), excision=files.get("excision"))
     unstated: planning.ErrorSource = "default" if pilot is None else "pilot"
     case = partial(planning.PlanCase, **errors, trials=options.trials, seed=options.seed)
     each_maps = (MAPS_OF_AIMS,) if aims and "maps" not in values else sorted(set(options.maps))
@@ -351,8 +353,6 @@ def planned(values: Mapping[str, Any], pilot: Pilot | None, progress: Progress) 
             designs, needed = run([case(patients=patients, maps=number) for patients, number in pairs]), ()
     assumed = {name: float(f"{errors[name]:.9g}") for name in _ERRORS}
     sources: dict[str, planning.ErrorSource] = {name: "option" if name in stated else unstated for name in _ERRORS}
-    files = {} if pilot is None else pilot.trial.files
-    inputs = hash_inputs(pilot=files.get("trial"), excision=files.get("excision"))
     settings: dict[str, Any] = {"trials": options.trials, "errors": assumed, "errors_from": sources}
     settings |= {str(aim): target for aim, target in aims.items()}
     report = planning.PlanReport(

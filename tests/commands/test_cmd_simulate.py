@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 from subprocess import CompletedProcess
+from typing import Any
 
 import pytest
 
+from tactile_bayes.actions import simulation
+from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.scan_mcap import read_scan_report
+from tactile_bayes.forward.simulate import simulate
 
 Run = Callable[..., "CompletedProcess[str]"]
 SCENE = "[scene]\nseed = 4\nduration_s = 0.2\n[[lump]]\namplitude = 0.3\nd_mm = 15\n"
@@ -47,6 +51,30 @@ def test_mistakes_end_in_one_line_and_their_code(run_cli: Run, tmp_path: Path) -
     assert done.returncode == 2
     assert "--force" in done.stderr
     assert (tmp_path / "a.mcap").read_text() == "mine"
+
+
+def test_inputs_are_read_and_told_by_their_digest_before_the_work(
+    run_cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A wrong session was refused after minutes, and a scene edited meanwhile was told by the new digest."""
+    scene, session = tmp_path / "s.toml", tmp_path / "x.toml"
+    scene.write_text(SCENE)
+    session.write_text("side = 3\n")
+    works = []
+
+    def edited(*arguments: Any, **options: Any) -> Any:
+        works.append(scene.write_text("edited"))
+        return simulate(*arguments, **options)
+
+    monkeypatch.setattr(simulation, "simulate", edited)
+    call = ("simulate", "s.toml", "--session", "x.toml", "-o", "a.mcap")
+    assert run_cli(*call, cwd=tmp_path).returncode == 3
+    assert not works
+    session.write_text('side = "left"\n')
+    digest = sha256(scene)
+    assert run_cli(*call, cwd=tmp_path).returncode == 0
+    assert read_scan_report(tmp_path / "a.mcap").provenance["inputs"][0] == {"role": "scene", "sha256": digest}
+    assert works
 
 
 @pytest.mark.parametrize(("depth_ratio", "warns"), [(1.5, True), (0.8, False)])
