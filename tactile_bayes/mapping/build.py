@@ -179,7 +179,7 @@ def stroke_figures(strokes: Sequence[latency.StrokeShift]) -> dict[str, float]:
 # --- Building of a tactile map from scans.
 
 MAX_LANDMARK_SHIFT_MM = 20.0  #: Landmarks of one examination lie nearer to their mean, or patient or tracker moved.
-_SHARED_FACTS = ("subject", "side", "posture")  #: Facts of the session that scans of one examination have in common.
+_SHARED_FACTS = ("subject", "side", "visit", "posture")  #: Facts of the session that scans of one exam have in common.
 
 
 def build_map(
