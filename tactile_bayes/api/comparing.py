@@ -157,14 +157,9 @@ class Comparison(TextResult, eq=False):
 
     def page_text(self, *, title: str, name: str) -> str:
         """The page's HTML."""
-        scans_by_visit = [[scan for one in visit for scan in one.provenance.scans] for visit in self.visits]
-
-        def common_value(fact: str, scans: Sequence[Mapping[str, str]]) -> str:
-            values = {scan[fact] for scan in scans if scan.get(fact)}
-            return values.pop() if len(values) == 1 else ""
-
-        visit_codes = tuple(common_value("visit", visit) for visit in scans_by_visit)
-        patient, side, mass = (common_value(fact, list(chain(*scans_by_visit))) for fact in ("subject", "side", "mass"))
+        visit_codes = tuple(_common_fact("visit", visit) for visit in self.visits)
+        maps = list(chain(*self.visits))
+        patient, side, mass = (_common_fact(fact, maps) for fact in ("subject", "side", "mass"))
         distinct = visit_codes if all(visit_codes) and len(set(visit_codes)) == len(visit_codes) else ()
         course = Course(title, name, patient, side, mass, visits=distinct, dates=self.dates)
         return growth_page(self.compared, self.report, self._drawn(), course)
@@ -237,10 +232,27 @@ def compare_answers(
     return Comparison(compared, report, settings)
 
 
+def _common_fact(fact: str, maps: Sequence[SizeEstimate]) -> str:
+    """What the scans of all maps that name this fact say of it; empty without any, and where they differ."""
+    values = {scan[fact] for one in maps for scan in one.provenance.scans if scan.get(fact)}
+    return values.pop() if len(values) == 1 else ""
+
+
+def _refuse_backwards(visits: Visits, comparing: CompareOptions) -> None:
+    """Raise `UsageError` where visits that are numbered in their scans come in another order, without their days."""
+    codes = [_common_fact("visit", visit) for visit in visits]
+    if comparing.days is None and all(map(str.isdecimal, codes)) and sorted(codes, key=int) != codes:
+        listed = ", ".join(f"visit {number} is coded {code}" for number, code in enumerate(codes, 1))
+        raise UsageError(
+            f"in the scans {listed}; give visits in order of time, or their --dates if codes do not tell it"
+        )
+
+
 def compare_estimates(
     visits: Visits, settings: Settings, comparing: CompareOptions, *, names: Names, files: Files = ()
 ) -> Comparison:
     """Compare visits, maps estimated again where they are of another mass; see `compare_answers`."""
+    _refuse_backwards(visits, comparing)
     estimates = iter(reestimate_at_common_mass([one for visit in visits for one in visit]))
     by_visit = tuple(tuple(next(estimates) for _ in visit) for visit in visits)
     answers = [[one.answer for one in visit] for visit in by_visit]

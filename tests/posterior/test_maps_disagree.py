@@ -92,6 +92,18 @@ def test_maps_of_two_visits_are_refused_with_the_command_that_takes_them(folder:
     assert "`compare` takes several visits" in done.stderr
 
 
+def test_visits_that_scans_number_are_compared_in_that_order_or_by_their_dates(folder: Path) -> None:
+    """Given the other way round a growth would be a shrinkage; the controls have the right order, or dates."""
+    written(folder / "w1.nc", 4.6, visit="2", seed=13)
+    written(folder / "w2.nc", 4.6, visit="10", seed=14)
+    done = run_here("compare", "w2.nc", "--with", "w1.nc", *FAST, cwd=folder)
+    assert done.returncode == 2
+    assert "in the scans visit 1 is coded 10, visit 2 is coded 2; give visits in order of time" in done.stderr
+    dated = ("w2.nc", "--with", "w1.nc", "--dates", "2026-01-01,2026-02-01")
+    for words in (("w1.nc", "--with", "w2.nc"), dated):
+        assert run_here("compare", *words, *FAST, cwd=folder).returncode == 0
+
+
 def test_python_and_the_page_tell_both_sizes(folder: Path, tmp_path: Path) -> None:
     result = tb.pool([folder / "a.nc", folder / "b.nc"], method="laplace")
     assert result.document["status"] == "maps_disagree"
