@@ -197,7 +197,10 @@ def validate(
         Naming the table, the line (1 is the header), the column, the value and the way out.
     """
     own_settings = TrialSettings(**{name: plain(value) for name, value in settings.items()})
-    return analyse(load_trial(table_of(trial, "trial"), table_of(excision, "excision"), path_of(columns)), own_settings)
+    readings, sizes = table_of(trial, "trial"), table_of(excision, "excision")
+    if columns is not None and isinstance(readings, Sheet) and isinstance(sizes, Sheet):
+        raise UsageError("columns is for wide CSV files, not for DataFrames; rename their columns, or give files")
+    return analyse(load_trial(readings, sizes, path_of(columns)), own_settings)
 
 
 MAPS_OF_AIMS = 3  #: Maps of a mass where the number of patients is asked for, by default.

@@ -485,6 +485,7 @@ def repeatability_words(campaign: Campaign) -> str:
     """The learned spread between exams, which sizes use; else why it was not learned, where it might have been."""
     repeatability = campaign.repeatability
     if repeatability is None:
-        return f"spread between exams not learned: {campaign.not_learned}" if campaign.not_learned else ""
+        also = "intervals in the tables are for exams as alike as simulated ones"
+        return f"spread between exams not learned: {campaign.not_learned}; {also}" if campaign.not_learned else ""
     words = repeatability.words()
     return f"{capitalised(words)}; every size is by this spread, learned from the repeats ({layout.REPEATABILITY})."

@@ -144,6 +144,10 @@ CALLS: dict[str, tuple[Callable[..., Any], str]] = {
     "nothing to export": (lambda _: tb.export(None, "x.json", to="fhir"), "files is None; give a list"),
     "an ID of no text": (lambda one: tb.export(one, "x.json", to="fhir", patient_id=3), "patient_id is 3"),  # type: ignore[arg-type]
     "an exam of no date": (lambda one: tb.export(one, "x", to="dicom"), "give study_date YYYY-MM-DD"),
+    "a mapping for DataFrames": (
+        lambda _: tb.validate(TRIAL, EXCISION, columns="map.toml"),
+        "columns is for wide CSV files, not for DataFrames",
+    ),
     "no trial": (lambda _: tb.validate(None, None), "trial is None; give a path"),  # type: ignore[arg-type]
     "resamples as text": (lambda _: tb.validate(TRIAL, EXCISION, resamples="500"), "resamples is '500'"),
     "an interval of no kind": (lambda _: tb.validate(TRIAL, EXCISION, intervals="exact"), "give one of corrected"),

@@ -173,7 +173,7 @@ def test_none_leaves_it_out_and_a_file_or_a_stated_spread_takes_its_place(own: P
 def test_the_spread_is_not_learned_from_fewer_than_five_masses(own: Path) -> None:
     write_table(own / "exams.csv", ROWS[:9])
     done = campaign(own)
-    assert "spread between exams not learned: 4 masses have repeated exams, and it takes 5" in done.stdout
+    assert "spread between exams not learned: 4 masses have repeated exams, and it takes 5; intervals" in done.stdout
     assert not (own / "out" / "repeatability.json").exists()
     assert not list((own / "out").glob("exams/0[1-4]*/sized.json"))
 
