@@ -27,7 +27,6 @@ from tactile_bayes.progress import Progress
 from tactile_bayes.scans import HeadShape
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import BumpDraws, ShapeDraws
-from tactile_bayes.size.eq6 import SizeCalibration
 from tactile_bayes.size.learn import bodies as learning
 from tactile_bayes.size.learn import eq6
 from tactile_bayes.size.learn.site import PhantomMap, correct_calibration
@@ -124,21 +123,12 @@ def _eq6(table: Path | Sheet, options: LearnOptions, progress: Progress | None) 
     made = (recipe.normalise, recipe.background, recipe.radius_mm, recipe.noise)
     settings = {**dict(zip(_MAPS, made, strict=True)), "least_stiffness_ratio": least, "fit": options.fit}
     cautions = table_cautions(rows.columns, least_stiffness_ratio=least)
-    learned = replace(calibration, left_out=left_out, cautions=(*cautions, *_far_off(calibration, lumps)))
-    files = _files(table=table)
-    return LearnedCalibration(
-        learned, settings, files, options.seed, None, lumps, not_left_out, other, table_rows=len(rows)
-    )
-
-
-def _far_off(calibration: SizeCalibration, lumps: eq6.SizeTable) -> list[str]:
-    """Caution on lumps that come out too large or too small by both widths, as one in cm does; empty without any."""
     axes = zip((calibration.x, calibration.y), eq6.axis_rows(lumps), strict=False)
     errors = [np.abs(eq6.log_error(axis.size_mm(one.sigma_mm, one.amplitude), one.d_mm)) for axis, one in axes]
-    off = int(np.sum(np.min(errors, axis=0) > math.log(FAR_OFF)))
-    return (
-        [f"Eq 6 sizes {off} of its lumps more than {FAR_OFF:g} times too large or small: is d_mm in mm?"] if off else []
-    )
+    if off := int(np.sum(np.min(errors, axis=0) > math.log(FAR_OFF))):
+        cautions += (f"Eq 6 sizes {off} of its lumps more than {FAR_OFF:g} times too large or small: is d_mm in mm?",)
+    learned, files = replace(calibration, left_out=left_out, cautions=cautions), _files(table=table)
+    return LearnedCalibration(learned, settings, files, options.seed, None, lumps, not_left_out, other, len(rows))
 
 
 def table_cautions(columns: Mapping[str, Sequence[Any]], *, least_stiffness_ratio: float = 0.0) -> tuple[str, ...]:
