@@ -242,7 +242,7 @@ def simulate(
     Parameters
     ----------
     scene
-        Path of a TOML file, or what stands in it: ``{"scene": {"duration_s": 7}, "lump": [{"d_mm": 15}]}``.
+        Path of a TOML file, or what stands in it: ``{"lump": [{"d_mm": 15, "depth_ratio": 1}]}``.
     seed
         Random seed. Default: the scene's.
     fidelity, head

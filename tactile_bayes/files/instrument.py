@@ -270,6 +270,9 @@ def _lumps(
         if solid and both:
             what = f"lump[{i}] gives {both[0]}, of a bump, and {solid[0]}, of tissue"
             raise BadDataError(what, way_out=f"leave out {', '.join(both)} or {', '.join(solid)}")
+        if not solid and not both and "d_mm" in keys:
+            way_out = "give depth_ratio for a lump of tissue, or amplitude, sigma_x_mm and sigma_y_mm for a bump"
+            raise BadDataError(f"lump[{i}] gives d_mm alone, from which no bump follows", way_out=way_out)
         if not solid:
             bumps.append(scenes.Lump(**values))
             continue

@@ -192,6 +192,10 @@ IMPOSSIBLE = [
     (LUMP + "depth_ratio = 1\nseat = 9", r"lump\[0\].seat puts the gland 82.5 mm deep"),
     (LUMP + "depth_ratio = 1\namplitude = 0.3", r"lump\[0\] gives amplitude, of a bump, and depth_ratio, of tissue"),
     (LUMP + "seat = 1", r"lump\[0\] gives no depth_ratio; a lump of tissue with seat needs it"),
+    (
+        LUMP + "x_mm = 1",
+        r"lump\[0\] gives d_mm alone, from which no bump follows; give depth_ratio for a lump of tissue",
+    ),
     ("[[lump]]\ndepth_ratio = 1", r"lump\[0\] gives no d_mm"),
     (LUMP + "depth_ratio = 1\n[[lump]]\nd_mm = 10\ndepth_ratio = 1", r"lump\[1\] puts the gland 10 mm deep, lump\[0\]"),
     ("[body]\nfat_mm = 20\n" + LUMP + "depth_ratio = 1\nseat = 0", "body.fat_mm puts it 20 mm deep"),
