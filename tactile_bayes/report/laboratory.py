@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from textwrap import wrap
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -96,6 +96,9 @@ def _lines(document: dict[str, Any]) -> Iterator[str]:
     yield "+- is one binomial standard error of a calibrated interval."
 
 
+_FEW: Final = 50  #: Maps below which the conclusion says that they are few.
+
+
 def _conclusion(tests: Sequence[dict[str, Any]], together: float) -> Iterator[str]:
     failed, band = [test["name"] for test in tests if not test["inside_band"]], f"{100 * sbc.BAND:g} % band"
     if failed:
@@ -105,7 +108,9 @@ def _conclusion(tests: Sequence[dict[str, Any]], together: float) -> Iterator[st
         advice = "run again with another --seed" if together > 1 - sbc.BAND else "that is no chance"
         yield f"All {len(tests)} together: p = {together:.2g} ({seldom}); {advice}."
     else:
-        yield f"All ranks stay in their simultaneous {band}s."
+        number = tests[0]["n"]
+        few = "" if number >= _FEW else f" So few maps ({number}) show gross faults alone; give more --maps."
+        yield f"All ranks stay in their simultaneous {band}s.{few}"
 
 
 def table_text(maps: Sequence[sbc.MapRanks]) -> str:

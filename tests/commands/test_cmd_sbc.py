@@ -9,6 +9,7 @@ import pytest
 from in_process import run_here
 
 from tactile_bayes.actions import study as command
+from tactile_bayes.report.laboratory import sbc_document, sbc_text
 from tactile_bayes.studies.sbc import PARAMETERS, MapRanks, Truth
 
 TRUTH = Truth(1.2, 6.0, 4.5, 1.3, -0.8, 6.0, 3.0, 0.02)
@@ -144,3 +145,14 @@ def test_bad_input_gets_one_line(tmp_path: Path, arguments: list[str], words: st
     assert done.returncode == 2
     assert words in done.stderr.strip().splitlines()[-1]
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("number", "words"), [(20, "bands. So few maps (18) show gross faults alone; give more"), (60, "bands.")]
+)
+def test_few_maps_are_said_to_show_little(number: int, words: str) -> None:
+    """After one map it read that all ranks stay in their bands."""
+    maps = [quick(index, method="laplace", seed=1, cosines=18) for index in range(number)]
+    first = sbc_text(sbc_document(maps, method="laplace", seed=1, maps_per_s=None)).splitlines()[0]
+    assert first.startswith(f"All ranks stay in their simultaneous 95 % {words}")
+    assert ("few" in first) == (number == 20)
