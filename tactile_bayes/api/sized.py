@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -99,20 +99,16 @@ class SizeResult(Record, eq=False, dict=True):
         """
         return self._draws(None if self._size is None else self._size.another_exam, "max_size_mm")
 
-    _quantities: ClassVar[tuple[str, ...]] = SIZES  #: Names of all columns of draws.
-
-    def _columns(self) -> dict[str, Draws]:
-        draws_by_name = {name: self._draws(self._size, name) for name in SIZES}
-        return {name: draws for name, draws in draws_by_name.items() if draws is not None}
+    def _columns(self) -> dict[str, Draws | None]:
+        return {name: self._draws(self._size, name) for name in SIZES}
 
     def to_dataframe(self) -> pandas.DataFrame:
         """One row for each draw: chain, draw and the quantities, NaN without a size; no rows without an estimate."""
         columns = self._columns()
-        shape = next(iter(columns.values())).values.shape if columns else (0, 0)
+        shape = next((draws.values.shape for draws in columns.values() if draws is not None), (0, 0))
         chain, draw = (index.ravel() for index in np.indices(shape))
-        values = {name: np.full(chain.shape, np.nan) for name in self._quantities}
-        values |= {name: draws.values.ravel() for name, draws in columns.items()}
-        return dataframe({"chain": chain, "draw": draw, **values})
+        values = {name: np.full(shape, np.nan) if draws is None else draws.values for name, draws in columns.items()}
+        return dataframe({"chain": chain, "draw": draw} | {name: one.ravel() for name, one in values.items()})
 
     @door
     def to_arviz(self) -> Any:
@@ -123,10 +119,10 @@ class SizeResult(Record, eq=False, dict=True):
         UsageError
             Without an estimate: there are no draws.
         """
-        columns = self._columns()
-        if not columns:
+        values = {name: draws.values for name, draws in self._columns().items() if draws is not None}
+        if not values:
             raise UsageError(f"there are no draws: {self.why}")
-        return inference_data({name: draws.values for name, draws in columns.items()}, self._groups())
+        return inference_data(values, self._groups())
 
     def _groups(self) -> dict[str, DrawGroup]:
         """The groups besides ``posterior``."""
@@ -357,11 +353,8 @@ class SizeEstimate(SizedExam, eq=False, dict=True, kw_only=True):
         values = np.array(getattr(estimate.map_posterior, name))
         return Draws(values, unit, self.probability, estimate.draws.labels, estimate.draws.effective_draws)
 
-    _quantities: ClassVar[tuple[str, ...]] = (*SIZES, *OF_A_MAP)
-
-    def _columns(self) -> dict[str, Draws]:
-        shapes = {name: draws for name in OF_A_MAP if (draws := self._of_shape(name)) is not None}
-        return {**super()._columns(), **shapes}
+    def _columns(self) -> dict[str, Draws | None]:
+        return super()._columns() | {name: self._of_shape(name) for name in OF_A_MAP}
 
     def _groups(self) -> dict[str, DrawGroup]:
         rng = np.random.default_rng([self.settings.seed, self.tactile_map.fingerprint, 1])
