@@ -32,6 +32,7 @@ from tactile_bayes.files.instrument import head_geometry, read_scene, scene_of
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
 from tactile_bayes.files.named_arrays import Grid, Source, read_array_map, step_of
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
+from tactile_bayes.files.scan_text import kind_of_column
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.forward.scene import SimulatedScan
 from tactile_bayes.geometry import FloatArray
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
 
 # --- Scans and tactile maps: read, simulate, build, show.
 
+_POSE_COLUMNS = ["time", "x", "y", "z", "qw", "qx", "qy", "qz"]
 _HEAD_SCHEMA = "tactile-bayes/head/1"
 _DEMO = Path(__file__).resolve().parents[1] / "demo" / "scan.mcap"
 
@@ -409,11 +411,12 @@ def scan(
     else:
         named = read_array_map(path_of(columns))
     layout = replace(named, **{name: plain(value) for name, value in stated.items() if value is not None})
-    others = [_poses(poses, layout), _head(head), _calibration(calibration), _landmarks(landmarks)]
+    times = Source({} if time is None else {"frame_time_s": _array(time)})
+    others = [times, _poses(poses, layout), _head(head), _calibration(calibration), _landmarks(landmarks)]
     if isinstance(frames, str | Path):
         imported, notes = imports.import_arrays(path_of(frames), layout, others)
     else:
-        arrays = {"frames": _array(frames)} | ({} if time is None else {"frame_time_s": _array(time)})
+        arrays = {"frames": _array(frames)}
         if not arrays["frames"].ndim:
             raise UsageError(f"frames is {type(frames).__name__}; give (n, rows, columns) numbers, or a path")
         imported, notes = imports.combine_sources([Source(arrays), *others], layout)
@@ -448,6 +451,9 @@ def _poses(poses: Any, stated: ArrayMap) -> Source:
                 f"poses is {type(poses).__name__} of shape {numbers.shape}; give (time, matrices), (time, position, "
                 "quaternion) or (m, 8) numbers"
             )
+        kinds = [kind_of_column(str(name)) for name in getattr(poses, "columns", ())]
+        if all(kinds) and kinds not in ([], _POSE_COLUMNS):
+            raise UsageError(f"poses has the columns {', '.join(kinds)}; give them as {', '.join(_POSE_COLUMNS)}")
         poses = numbers[:, 0], numbers[:, 1:4], numbers[:, 4:]
     names = ("pose_time_s", "pose_matrix") if len(poses) == 2 else ("pose_time_s", "position_mm", "quaternion_wxyz")
     return Source({name: _array(value) for name, value in zip(names, poses, strict=True)})

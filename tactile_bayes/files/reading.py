@@ -187,6 +187,8 @@ _BEGINNINGS = {
     ZIP_MAGIC: _ARCHIVE,
     **dict.fromkeys((b"\x89PNG", b"II*\x00", b"MM\x00*", b"P5"), _IMAGE),
     b"%PDF": "a PDF",
+    b"PAR1": "a Parquet file",
+    **dict.fromkeys((b"#ROSBAG", b"SQLite format 3"), "a ROS bag or another database"),
     b"\x93NUMPY": "an array of numpy (.npy)",
     b"MATLAB 5.0 MAT-file": "a .mat",
     **dict.fromkeys((b"CDF\x01", b"CDF\x02", b"CDF\x05"), _NETCDF_3),

@@ -36,7 +36,20 @@ _NAMES: Final[Mapping[str, str]] = {
     **dict.fromkeys(("el", "elevation", "elev"), "elevation"),
     **dict.fromkeys(("roll", "ro", "rl"), "roll"),
     **dict.fromkeys(
-        ("time", "t", "timestamp", "epoch", "datetime", "times", "timems", "timestampms", "timeus", "secs", "seconds"),
+        (
+            "time",
+            "t",
+            "zeit",
+            "timestamp",
+            "epoch",
+            "datetime",
+            "times",
+            "timems",
+            "timestampms",
+            "timeus",
+            "secs",
+            "seconds",
+        ),
         "time",
     ),
     **dict.fromkeys(("timespecs",), "seconds"),
@@ -73,7 +86,7 @@ def read_poses(path: Path, stated: Stated) -> Source:
 
 def kind_of_column(name: str) -> str:
     """Kind of a column of a tracker's table by its name, such as ``qw``; empty for any other column."""
-    plain = re.sub(r"[^a-z0-9]", "", re.sub(r"[\[(].*?[\])]", "", name.lower()))
+    plain = re.sub(r"[^a-z0-9]", "", re.sub(r"[\[(].*?[\])]", "", _UNIT.sub("", name.strip()).lower()))
     return _NAMES.get(plain) or _NAMES.get(re.sub(r"(mm|cm|inch|in|deg|rad|ms|us|s)$", "", plain), "")
 
 
@@ -154,7 +167,10 @@ def _poses_by_names(lines: Sequence[Line], header: Line, stated: Stated) -> Sour
     names = (*_PLACE, *(matrix_names or _ROTATIONS[layout]))
     if not set(names) <= set(kinds):
         what = f"line {header.number} names no {', '.join(sorted(set(names) - set(kinds)))}"
-        way_out = "name columns Tx, Ty, Tz and Q0, Qx, Qy, Qz or R00 to R22, or x, y, z and azimuth, elevation, roll"
+        way_out = (
+            "name columns Tx, Ty, Tz and Q0, Qx, Qy, Qz or R00 to R22, or x, y, z and azimuth, elevation, roll (yaw, "
+            "pitch and roll: about z, then the new y, then the new x)"
+        )
         raise BadDataError(what, way_out=way_out)
     if stated.pose_layout not in (None, layout):
         raise BadDataError(f"line {header.number} names its rotations ({layout})", way_out="leave --pose-layout out")

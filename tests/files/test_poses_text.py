@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from engineers_arrays import pressures, short_scan
 from scipy.spatial.transform import Rotation
 
 import tactile_bayes as tb
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.scans import Scan
 
 SCAN = short_scan()
@@ -95,6 +96,12 @@ EULER = "time,station,x (cm),y (cm),z (cm),azimuth,elevation,roll"
 QUATERNIONS = [numbers(place, turn) for place, turn in zip(PLACE, POSES.quaternion_wxyz, strict=True)]
 SCALAR_LAST = [numbers(place, turn) for place, turn in zip(PLACE, TURNED.as_quat(), strict=True)]
 IN_METRES = [numbers(place / 1000, turn) for place, turn in zip(PLACE, POSES.quaternion_wxyz, strict=True)]
+
+
+def german(lines: list[str]) -> list[str]:
+    return [one.replace(",", ";").replace(".", ",") for one in with_times(lines)]
+
+
 ROWS_OF_16 = [numbers(one) for one in MATRICES]
 LAYOUTS: dict[str, tuple[list[str], dict[str, Any], list[int] | None]] = {
     "NDI with times": (["Time (s)," + NDI, *with_times(ndi())], {}, KEPT),
@@ -143,6 +150,7 @@ LAYOUTS: dict[str, tuple[list[str], dict[str, Any], list[int] | None]] = {
         {},
         None,
     ),
+    "in metres by German names": (["Zeit;px_m;py_m;pz_m;qw;qx;qy;qz", *german(IN_METRES)], {}, None),
     "names behind #": (
         ["# t x y z qw qx qy qz", *(one.replace(",", " ") for one in with_times(QUATERNIONS))],
         {},
@@ -204,6 +212,22 @@ def test_angles_that_may_be_radians_are_asked_about() -> None:
     poses = TIME, PLACE, angles
     with pytest.warns(UserWarning, match="CAUTION: angles lie within 6.3 and are read as degrees"):
         tb.scan(pressures(SCAN), SCAN.frames.time_s, poses, head=SCAN.head, unit="kPa", pose_layout="euler")
+
+
+def test_columns_of_a_dataframe_are_not_taken_for_others(tmp_path: Path) -> None:
+    """Quaternions with the scalar last were read as scalar first, and times beside a file of frames were dropped."""
+    quaternion = TURNED.as_quat()
+    poses = pd.DataFrame(
+        np.column_stack([TIME, PLACE, quaternion]), columns=["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
+    )
+    stated = {"head": SCAN.head, "unit": "kPa"}
+    with pytest.raises(UsageError, match="qy, qz, qw; give them as time, x, y, z, qw, qx, qy, qz"):
+        tb.scan(pressures(SCAN), SCAN.frames.time_s, poses, **stated)
+    np.savez(tmp_path / "a.npz", frames=pressures(SCAN))
+    ordered = poses[["t", "x", "y", "z", "qw", "qx", "qy", "qz"]]
+    found = tb.scan(tmp_path / "a.npz", SCAN.frames.time_s, ordered, **stated)
+    np.testing.assert_allclose(found.poses.quaternion_wxyz, np.roll(quaternion, 1, axis=1))
+    np.testing.assert_array_equal(found.frames.time_s, SCAN.frames.time_s)
 
 
 def test_a_status_in_numbers_has_to_be_stated(tmp_path: Path) -> None:

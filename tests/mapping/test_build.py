@@ -369,16 +369,18 @@ def test_exchanged_landmarks_are_told_by_the_breast(side):
         assert [text.startswith(told) for text in findings] == [True] * wrong
 
 
+@pytest.mark.parametrize("between", [True, False], ids=["between two scans", "within one"])
 @pytest.mark.parametrize(("moved_mm", "told"), [(0.0, False), (3.0, False), (15.0, True)])
-def test_a_patient_who_moved_between_two_scans_is_told(moved_mm, told):
+def test_a_patient_who_moved_is_told(moved_mm, told, between):
     """One lump was mapped as two, and the map called sound."""
-    scan = stroke_scan()
-    place = TrackerPoses(
-        scan.poses.time_s, scan.poses.position_mm + np.array([moved_mm, 0, 0]), scan.poses.quaternion_wxyz
+    centres = np.tile(scans.strokes(), (1 if between else 2, 1))
+    scan = scans.make_scan(centres, field=scans.gaussian(x=3.0, y=-2.0))
+    moved_mm = np.outer(np.arange(len(scan.poses)) >= (0 if between else 120), [moved_mm, 0, 0])
+    other = replace(
+        scan, poses=TrackerPoses(scan.poses.time_s, scan.poses.position_mm + moved_mm, scan.poses.quaternion_wxyz)
     )
-    findings = [
-        one for one in build_map([scan, replace(scan, poses=place)]).findings if one.kind == "frames_contradict"
-    ]
+    built = build_map([scan, other] if between else other, as_stated=True)
+    findings = [one for one in built.findings if one.kind == "frames_contradict"]
     assert ["the highest rise 15 mm apart" in one.text or "14 mm" in one.text for one in findings] == [True] * told
 
 
