@@ -158,15 +158,6 @@ def _check_times(time_s: FloatArray, *, name: str) -> FloatArray:
 _LEVER_MM: Final = (1.0, 1000.0)  #: From the tracker's sensor to the head, where they are two things.
 
 
-def check_lever(transform: FloatArray, *, name: str) -> None:
-    """Raise `BadDataError` unless `transform` is a rigid motion from a sensor in the hand, in mm."""
-    check_rigid(transform, name=name)
-    lever = float(np.linalg.norm(transform[:3, 3]))
-    if 1e-3 < lever < _LEVER_MM[0] or lever > _LEVER_MM[1]:
-        what = f"{name} puts the tracker's sensor {lever:.4g} mm from the head"
-        raise BadDataError(what, way_out=f"looks like {'metres' if lever < 1 else 'micrometres'}, give mm")
-
-
 class HeadGeometry(Record, eq=False):
     """Positions of the taxels, and how the tracker is mounted."""
 
@@ -183,7 +174,11 @@ class HeadGeometry(Record, eq=False):
         if not 0 < self.pitch_mm < 100:
             raise BadDataError(f"pitch_mm is {self.pitch_mm}", way_out="it must be positive, in mm")
         transform = _check_finite(self.scanhead_from_tracker, name="scanhead_from_tracker", shape=(4, 4))
-        check_lever(transform, name="scanhead_from_tracker")
+        check_rigid(transform, name="scanhead_from_tracker")
+        lever = float(np.linalg.norm(transform[:3, 3]))
+        if 1e-3 < lever < _LEVER_MM[0] or lever > _LEVER_MM[1]:
+            what = f"the lever arm puts the tracker's sensor {lever:.4g} mm from the head"
+            raise BadDataError(what, way_out=f"looks like {'metres' if lever < 1 else 'micrometres'}, give mm")
         set_fields(self, surface_mm=surface, scanhead_from_tracker=transform)
 
     @property

@@ -24,18 +24,10 @@ from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.scan_text import is_identity, read_frames, read_poses, visible_poses
 from tactile_bayes.files.sequence_mha import is_sequence, read_sequence
 from tactile_bayes.findings import LEADS, finding
-from tactile_bayes.geometry import FloatArray
+from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.select import LEAST_FRAMES, unit_question
 from tactile_bayes.presets import KPA_PER_UNIT, MM_PER_UNIT, PRESSURE_RANGE_KPA, PRESSURE_WINDOW_KPA
-from tactile_bayes.scans import (
-    ElementCalibration,
-    HeadGeometry,
-    Landmarks,
-    PressureFrames,
-    Scan,
-    TrackerPoses,
-    check_lever,
-)
+from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
 # No value of a scan is larger, seconds since 1970 included; the squares of damaged ones would overflow.
 _LARGEST: Final = 1e12
@@ -549,7 +541,7 @@ def _scan_of_arrays(arrays: Arrays, facts: Mapping[str, str], checked_on: str) -
     values = {name: np.asarray(array, dtype=np.float64) for name, array in arrays.items() if name != "counts"}
     marks = values.get("landmarks_mm")
     surface, transform = values["head_surface_mm"], values["array_from_tracker"]
-    check_lever(transform, name="array_from_tracker")
+    check_rigid(transform, name="array_from_tracker")
     return Scan(
         frames=PressureFrames(values["frame_time_s"], arrays["counts"].astype(np.uint16)),
         poses=TrackerPoses(values["pose_time_s"], values["position_mm"], values["quaternion_wxyz"]),

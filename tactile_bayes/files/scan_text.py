@@ -129,11 +129,8 @@ def visible_poses(
 def is_identity(numbers: FloatArray, layout: str) -> BoolArray:
     """True for rows of the identity, which a server goes on sending while a tool is out of sight."""
     first_numbers, identity = numbers[:, :12], _IDENTITY[layout]
-    return (
-        (first_numbers == identity).all(axis=1)
-        if first_numbers.shape[1] == len(identity)
-        else np.zeros(len(first_numbers), dtype=bool)
-    )
+    fits = first_numbers.shape[1] == len(identity)
+    return (first_numbers == (identity if fits else np.nan)).all(axis=1)
 
 
 def choose_tool(names: Sequence[str], stated: Stated, *, place: str) -> str:

@@ -586,7 +586,7 @@ def test_many_files_fail_one_by_one(pressed: Arrays, head: Path, tmp_path: Path)
         row[3] /= 1000
     (tmp_path / "metres.json").write_text(json.dumps(in_metres))
     wrong = run_here("import", "c.h5", "-o", "w.mcap", "--unit", "kPa", "--head-geometry", "metres.json", cwd=tmp_path)
-    assert wrong.stderr.startswith("error: metres.json: scanhead_from_tracker puts the tracker's sensor 0.0")
+    assert wrong.stderr.startswith("error: metres.json: the lever arm puts the tracker's sensor 0.0")
     (tmp_path / "a.npz").write_bytes(b"")
     clash = run_here("import", "a.mat", "a.npz", "-o", "more", cwd=tmp_path)
     assert clash.returncode == 2
