@@ -130,7 +130,7 @@ def is_identity(numbers: FloatArray, layout: str) -> BoolArray:
     """True for rows of the identity, which a server goes on sending while a tool is out of sight."""
     first_numbers, identity = numbers[:, :12], _IDENTITY[layout]
     fits = first_numbers.shape[1] == len(identity)
-    return (first_numbers == (identity if fits else np.nan)).all(axis=1)
+    return np.asarray((first_numbers == (identity if fits else np.nan)).all(axis=1))
 
 
 def choose_tool(names: Sequence[str], stated: Stated, *, place: str) -> str:
