@@ -89,7 +89,7 @@ def describe(path: Path) -> dict[str, Any]:
             if group is not None and "schema" in group.attributes():
                 return _posterior(group)
         return _map(path)
-    if is_json(head):
+    if is_json(head) and path.suffix.lower() != ".toml":  # a table of TOML begins as a list does
         return _json(path)
     return _table(path)
 
@@ -144,7 +144,8 @@ def _map(path: Path) -> dict[str, Any]:
 def _json(path: Path) -> dict[str, Any]:
     document: Any = load_json(path, way_out="give one of this program's files")
     if isinstance(document, list) and document and isinstance(document[0], dict):
-        return {"schema": document[0].get("schema"), "kind": "list", "length": len(document)}
+        told = {str(number): facts for number, one in enumerate(document, 1) if (facts := _verdict_facts(one))}
+        return {"schema": document[0].get("schema"), "kind": "list", "length": len(document), "of_each": told}
     schema = document.get("schema") if isinstance(document, dict) else None
     if not isinstance(schema, str) or not schema.startswith("tactile-bayes/"):
         raise _foreign(path)

@@ -65,6 +65,16 @@ def test_every_kind_of_file_is_known(folder: Path, name: str) -> None:
     assert text.stderr == plain.stderr == ""
 
 
+def test_a_list_of_estimates_tells_the_verdict_and_the_findings_of_each(folder: Path) -> None:
+    """As it does of one: a caution on the second map of two was shown as "length 2"."""
+    documents = json.loads((folder / "many.json").read_text())
+    told = json.loads(run_here("show", "many.json", "--json", cwd=folder).stdout)["of_each"]
+    assert [one["verdict"] for one in told.values()] == [one["verdict"] for one in documents]
+    (folder / "alone.json").write_text(json.dumps(documents[1]))
+    alone = json.loads(run_here("show", "alone.json", "--json", cwd=folder).stdout)
+    assert told["2"] == {"verdict": alone["verdict"], "findings": alone["findings"]}
+
+
 def test_a_map_tells_its_shape_and_recipe(folder: Path) -> None:
     found = json.loads(run_here("show", "a.nc", "--json", cwd=folder).stdout)
     assert found["shape"] == {"ny": 51, "nx": 51}
@@ -112,6 +122,7 @@ def test_a_table_is_known_with_a_letter_across_the_end_of_its_first_bytes(tmp_pa
         ("other.json", b'{"a": 1}'),
         ("cut.json", b'{"schema": "tactile-bayes/est'),
         ("list.json", b"[1, 2]"),
+        ("scene.toml", b"[scene]\nseed = 1\n"),
         ("nothing.json", b"[]"),
         ("other.csv", b"a,b\n1,2\n"),
         ("cut.mcap", b"\x89MCAP0\r\n"),
