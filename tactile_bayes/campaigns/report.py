@@ -320,6 +320,7 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
     left_out = set() if masses is None else {(row.exam.patient, row.exam.mass) for row in rows} - masses
     doubts = {
         "no size after excision, left out of trial.csv": [" ".join(mass) for mass in sorted(left_out)],
+        "exams with a caution, see their findings": _names_with_finding(rows, "caution", "name"),
         "masses whose exams disagree, without a pooled size": _names_with_finding(rows, "maps_disagree", "of_mass"),
         "exams with a mass that no row names, see their findings": _names_with_finding(rows, "unnamed_mass", "name"),
         "folders of exams that the table does not list": unlisted,
@@ -346,9 +347,10 @@ def _pooled_words(campaign: Campaign, pooled: Pooled) -> str:
     return f"{what}: {sized} sized, {len(pooled) - sized} without a size"
 
 
-def _names_with_finding(rows: Sequence[ExamRow], kind: str, name: str) -> list[str]:
-    """Names of the exams, or of their masses, with a finding of the kind, each once."""
-    return list(dict.fromkeys(getattr(row.exam, name) for row in rows if any(one.kind == kind for one in row.findings)))
+def _names_with_finding(rows: Sequence[ExamRow], sought: str, name: str) -> list[str]:
+    """Names of the exams, or of their masses, with a finding of the kind or severity, each once."""
+    found = (row.exam for row in rows if any(sought in (one.kind, one.severity) for one in row.findings))
+    return list(dict.fromkeys(getattr(exam, name) for exam in found))
 
 
 def check_inputs(exams: Sequence[Exam], settings: CampaignSettings) -> None:

@@ -371,7 +371,7 @@ def test_what_speaks_against_a_map_reaches_pool_comparison_and_campaign(tmp_path
     assert run("compare", "1.nc", "--with", "2.nc").startswith(sentence.format("visit 2: "))
     assert "CAUTION" not in run("estimate", "1.nc")
     (tmp_path / "exams.csv").write_text("file,patient,visit,mass,replicate\n1.nc,P,1,1,1\n2.nc,P,1,1,2\n")
-    run("campaign", "run", "exams.csv", "-o", "out")
+    assert "exams with a caution, see their findings: P.v1.m1.r2\n" in run("campaign", "run", "exams.csv", "-o", "out")
     with (tmp_path / "out" / "exams_done.csv").open(newline="") as lines:
         told = {row["file"]: (row["verdict"], sentence.format("") in row["findings"]) for row in csv.DictReader(lines)}
     assert told == {"1.nc": ("sound", False), "2.nc": ("doubtful", True)}
