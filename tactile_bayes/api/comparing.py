@@ -158,8 +158,7 @@ class Comparison(TextResult, eq=False):
     def page_text(self, *, title: str, name: str) -> str:
         """The page's HTML."""
         visit_codes = tuple(_common_fact("visit", visit) for visit in self.visits)
-        maps = list(chain(*self.visits))
-        patient, side, mass = (_common_fact(fact, maps) for fact in ("subject", "side", "mass"))
+        patient, side, mass = (_common_fact(fact, [*chain(*self.visits)]) for fact in ("subject", "side", "mass"))
         distinct = visit_codes if all(visit_codes) and len(set(visit_codes)) == len(visit_codes) else ()
         course = Course(title, name, patient, side, mass, visits=distinct, dates=self.dates)
         return growth_page(self.compared, self.report, self._drawn(), course)

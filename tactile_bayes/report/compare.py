@@ -55,9 +55,8 @@ class VisitPlace(Record):
 
     visit: Annotated[int, Meta(ge=2)]
     distance_mm: NonNegative | None
-    sd_mm: (
-        NonNegative | None
-    )  #: SD by which one mass comes out apart between the visits, in the direction of the shift.
+    sd_mm: NonNegative | None
+    """SD by which one mass comes out apart between the visits, in the direction of the shift."""
     shift_mm: tuple[float, float] | None  #: x and y in the patient's frame, from the first visit's place.
     probability: Chance | None
     """That one mass comes out as far apart or farther; below 0.02 the visits are not compared."""

@@ -355,9 +355,9 @@ def _mass_reports(
     for number, mass in enumerate(estimate.masses, start=1):
         alone = mass.estimate
         summaries = quantities if mass.reported else estimate_quantities(alone, tactile_map, probability=probability)
-        place = lump_place(mass.estimate.map_posterior, tactile_map, scans)
+        place = lump_place(alone.map_posterior, tactile_map, scans)
         patient = patient_mm(tactile_map, mass.x_mm, mass.y_mm)
-        why = estimate.reason if mass.reported else mass.estimate.reason
+        why = estimate.reason if mass.reported else alone.reason
         mass_reports.append(
             MassReport(
                 number=number,
@@ -366,10 +366,10 @@ def _mass_reports(
                 centre_patient_mm=None if patient is None else reports.Place(*patient),
                 detected_probability=mass.probability,
                 **{name: summaries.get(name) for name in ("amplitude", *SIZES, "angle_deg")},
-                another_exam=another_exam(mass.estimate.size, probability=probability),
-                reason=why if mass.estimate.size is None else "",
-                reason_code=cast("reports.ReasonCode", mass.estimate.code),
-                advice=mass.estimate.advice,
+                another_exam=another_exam(alone.size, probability=probability),
+                reason=why if alone.size is None else "",
+                reason_code=cast("reports.ReasonCode", alone.code),
+                advice=alone.advice,
                 position=None if place is None else place.as_position(probability),
             )
         )

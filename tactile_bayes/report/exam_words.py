@@ -278,11 +278,8 @@ def short_place(mass: ExamMass) -> str:
 def why_no_clock(exam: ShownExam) -> str:
     """The facts missing for a clock position on a patient's scan; empty if there is one, or no patient."""
     tactile_map = exam.main.tactile_map
-    if (
-        tactile_map is None
-        or tactile_map.patient_from_plane is None
-        or any(mass.place is not None for mass in exam.main.masses)
-    ):
+    by_clock = any(mass.place is not None for mass in exam.main.masses)
+    if by_clock or tactile_map is None or tactile_map.patient_from_plane is None:
         return ""
     lacks = ["nipple"] if tactile_map.nipple_mm is None else []
     lacks += [] if any(scan.get("side") in ("left", "right") for scan in exam.scans) else ["side"]
