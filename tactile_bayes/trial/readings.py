@@ -388,9 +388,11 @@ def _visits_around_excision(
     after = {name for name, day in days.items() if excised is not None and day is not None and day > excised}
     before = {name: day for name, day in days.items() if name not in after}
     if after and not before:
-        row = min(first_row.values())
-        problem = f"of this mass and all its others are after excision on {excised}"
-        raise fault(row, "date", problem, way_out="correct the date here or of excision, or leave the readings out")
+        first = min(after, key=lambda name: first_row[name])
+        problem = f"visit {first} is after excision on {excised}, and so is every other of this mass"
+        raise fault(
+            first_row[first], "date", problem, way_out="correct the date here or of excision, or leave the readings out"
+        )
     if len(first_row) > 1:
         _check_visits_named(rows, fault=fault)
     order = visits_in_order(before)

@@ -130,7 +130,7 @@ def test_visits_without_an_order_and_an_excision_before_all_are_refused_before_a
     (maps / "early.csv").write_text("patient,mass,ex_vivo_mm,date\nP1,1,20,2025-12-01\n")
     early = campaign(maps, rows(), "--excision", "early.csv")
     assert early.returncode == 3
-    assert "table of exams, line 2, column date: of this mass and all its others are after excision" in early.stderr
+    assert "table of exams, line 2, column date: visit 1 is after excision on" in early.stderr
 
 
 def test_one_visit_has_no_growth_landmarks_are_not_needed_and_findings_have_the_tables_codes(tmp_path: Path) -> None:
