@@ -94,9 +94,9 @@ class Exam(Record):
 
     @property
     def as_reading(self) -> Reading:
-        """The exam as a reading without a size, for the order of visits."""
+        """The exam as a reading that was done, for the order of visits; its size is not known yet."""
         key = (self.patient, self.mass)
-        return Reading(key, "tactile", self.replicate, "not_done", visit=self.visit, day=self.day)
+        return Reading(key, "tactile", self.replicate, "not_detected", visit=self.visit, day=self.day)
 
     @property
     def name(self) -> str:
