@@ -412,6 +412,8 @@ def scan(
         named = read_array_map(path_of(columns))
     layout = replace(named, **{name: plain(value) for name, value in stated.items() if value is not None})
     times = Source({} if time is None else {"frame_time_s": _array(time)})
+    if time is not None and layout.time_unit is None:
+        layout = replace(layout, time_unit="s")  # whatever unit a file has
     others = [times, _poses(poses, layout), _head(head), _calibration(calibration), _landmarks(landmarks)]
     if isinstance(frames, str | Path):
         imported, notes = imports.import_arrays(path_of(frames), layout, others)

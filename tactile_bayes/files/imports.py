@@ -477,8 +477,7 @@ def _check_numbers(arrays: Arrays) -> None:
 
 def _check_largest(arrays: Arrays) -> None:
     for name, array in arrays.items():
-        largest = float(np.abs(array, dtype=np.float64).max(initial=0.0))
-        if largest > _LARGEST:
+        if (largest := float(np.abs(array, dtype=np.float64).max(initial=0.0))) > _LARGEST:
             raise BadDataError(f"{name} holds {largest:.3g}", way_out="give mm, kPa and s; the file may be damaged")
 
 

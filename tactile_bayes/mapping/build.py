@@ -103,12 +103,10 @@ def moved(
 
 def _ends(selection: SelectedFrames) -> list[SelectedFrames]:
     """The first and the last third of a scan's used frames."""
-    ends = []
-    for frames in np.array_split(np.flatnonzero(selection.used), 3)[::2]:
-        used = np.zeros_like(selection.used)
-        used[frames[:: max(1, len(frames) // _END_FRAMES)]] = True
-        ends.append(replace(selection, used=used))
-    return ends
+    every = np.arange(len(selection.used))
+    thirds = np.array_split(np.flatnonzero(selection.used), 3)
+    chosen = [frames[:: max(1, len(frames) // _END_FRAMES)] for frames in thirds[::2]]
+    return [replace(selection, used=np.isin(every, frames)) for frames in chosen]
 
 
 def local_plane(

@@ -313,7 +313,6 @@ def overlap_cautions(frames: Span, poses: Span) -> list[str]:
 
 
 _USUAL_LEVER_MM: Final = (10.0, 300.0)  #: From the face of a head that a hand holds to the tracker's sensor.
-_LEVER: Final = "check that the lever arm is in mm"
 
 
 def scan_findings(scan: Scan) -> tuple[Finding, ...]:
@@ -326,8 +325,9 @@ def scan_findings(scan: Scan) -> tuple[Finding, ...]:
     frozen = (finding("times_apart", text, *_LEFT_OUT) for text in _frozen_cautions(scan.poses))
     lever = float(np.linalg.norm(scan.head.scanhead_from_tracker[:3, 3]))
     odd = 1e-3 < lever < _USUAL_LEVER_MM[0] or lever > _USUAL_LEVER_MM[1]
-    far = (finding("unusual_scan", f"the tracker's sensor lies {lever:.3g} mm from the head", _LEVER),) if odd else ()
-    return (*noted, *frozen, *(finding("poses_jump", text, remedy, remedy) for text in jumps), *far)
+    far = [f"the tracker's sensor lies {lever:.3g} mm from the head"] if odd else []
+    unusual = (finding("unusual_scan", text, "check that the lever arm is in mm") for text in far)
+    return (*noted, *frozen, *(finding("poses_jump", text, remedy, remedy) for text in jumps), *unusual)
 
 
 def _frozen_cautions(poses: TrackerPoses) -> list[str]:

@@ -223,9 +223,11 @@ def test_columns_of_a_dataframe_are_not_taken_for_others(tmp_path: Path) -> None
     stated = {"head": SCAN.head, "unit": "kPa"}
     with pytest.raises(UsageError, match="qy, qz, qw; give them as time, x, y, z, qw, qx, qy, qz"):
         tb.scan(pressures(SCAN), SCAN.frames.time_s, poses, **stated)
-    np.savez(tmp_path / "a.npz", frames=pressures(SCAN))
+    rows = np.column_stack([1000 * SCAN.frames.time_s + 7, pressures(SCAN).reshape(len(SCAN.frames), -1)])
+    names = ["time_ms", *(f"S{i}" for i in range(rows.shape[1] - 1))]
+    np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header=",".join(names), comments="")
     ordered = poses[["t", "x", "y", "z", "qw", "qx", "qy", "qz"]]
-    found = tb.scan(tmp_path / "a.npz", SCAN.frames.time_s, ordered, **stated)
+    found = tb.scan(tmp_path / "a.csv", SCAN.frames.time_s, ordered, **stated)
     np.testing.assert_allclose(found.poses.quaternion_wxyz, np.roll(quaternion, 1, axis=1))
     np.testing.assert_array_equal(found.frames.time_s, SCAN.frames.time_s)
 
