@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from datetime import date
 from pathlib import Path
@@ -173,6 +174,11 @@ class LandmarksFile(Record, kw_only=True):
     sternal_notch_mm: Triple  #: Sternal notch, mm.
     xiphoid_mm: Triple  #: Xiphoid, mm.
     nipple_mm: Triple | None = None  #: Nipple, mm; left out where it was not touched.
+
+    def __post_init__(self) -> None:
+        if (apart := math.dist(self.sternal_notch_mm, self.xiphoid_mm)) < 10.0:
+            what = f"sternal_notch_mm and xiphoid_mm are {apart:.4g} mm apart"
+            raise BadDataError(what, way_out="looks like metres or inches, give mm")
 
 
 def write_array_calibration(path: Path, content: ArrayCalibrationFile, *, force: bool = False) -> None:

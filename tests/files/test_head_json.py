@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.instrument import read_head_geometry, read_simulated_head
+from tactile_bayes.files.instrument import read_head_geometry, read_landmarks, read_simulated_head
 from tactile_bayes.forward.scene import FLAT_MM, Head
 
 ARC = {"schema": "tactile-bayes/head/1", "pitch_mm": 1.5, "rows": 10, "columns": 12, "radius_mm": 20.0}
@@ -58,6 +58,12 @@ def test_record_reads_the_same_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.surface_mm, np.array(of_surface(20.0)["surface_mm"]), atol=1e-12)
     with pytest.raises(BadDataError, match="lacks scanhead_from_tracker"):
         read_head_geometry(written(tmp_path, ARC))
+    metres = [[*row[:3], row[3] or 0.055] for row in np.eye(4).tolist()]
+    with pytest.raises(BadDataError, match=r"puts the tracker's sensor 0\.\d+ mm from the head; looks like metres"):
+        read_head_geometry(written(tmp_path, {**ARC, "scanhead_from_tracker": metres}))
+    marks = {"schema": "tactile-bayes/landmarks/1", "sternal_notch_mm": [0.0, 0.19, 0.0], "xiphoid_mm": [0.0, 0.0, 0.0]}
+    with pytest.raises(BadDataError, match=r"are 0\.19 mm apart; looks like metres"):
+        read_landmarks(written(tmp_path, marks))
 
 
 def sphere() -> dict[str, Any]:
