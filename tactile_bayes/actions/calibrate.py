@@ -12,7 +12,7 @@ from tactile_bayes.api.repeatability import exams_of_campaign, learn_from_exams
 from tactile_bayes.api.size_calibration import learn
 from tactile_bayes.commands.options import protect_inputs, typed_options
 from tactile_bayes.declarations import as_dict
-from tactile_bayes.errors import BadDataError, in_file
+from tactile_bayes.errors import BadDataError, UsageError, in_file
 from tactile_bayes.files.instrument import ArrayCalibrationFile, write_array_calibration
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan
@@ -37,6 +37,8 @@ def calibrate_array_action(
 ) -> None:
     """Learn the gain and offset of each taxel from a pressure bladder, and how uneven they stay."""
     measured = day.date() if day else date.today()
+    if len({path for _, path in steps}) < len(steps):
+        raise UsageError("two steps are of one recording; give each pressure its own")
     scans = [read_scan(path) for _, path in steps]
     head = head_id or _one_head(scans)
     saturation = scans[0].element_calibration.saturation_count

@@ -255,6 +255,7 @@ def check_link_rate(hello: readings.HelloReading, *, baud: int, every: int = 1, 
 # A taxel whose counts rise by less than this share of the median taxel's is dead, by more than this many times hot.
 DEAD_SHARE: Final = 0.1
 HOT_RATIO: Final = 2.5
+FALL_SHARE: Final = 0.1  #: Readings of a higher step lie lower by less than this share of their range.
 MIN_FRAMES: Final = 10
 STEPS_FOR_CURVATURE: Final = 4  #: With fewer steps a curvature fits the noise.
 
@@ -310,6 +311,10 @@ def fit_array(steps: Sequence[BladderStep], *, saturation_count: int) -> ArrayFi
     dead, hot = _odd_taxels(pressure, counts, valid)
     good = ~(dead | hot)
     use = valid & good
+    levels = np.median(counts[:, good], axis=1)
+    for i in np.flatnonzero(np.diff(levels) < -FALL_SHARE * np.ptp(levels))[:1].tolist():
+        what = f"the array reads less at {pressure[i + 1]:g} kPa than at {pressure[i]:g}"
+        raise BadDataError(what, way_out="check which step was recorded under which pressure")
     line = _polynomials(pressure, counts, use, degree=1)
     curve = _polynomials(pressure, counts, use, degree=2 if len(steps) >= STEPS_FOR_CURVATURE else 1)
     gain, offset = line[1], line[0]

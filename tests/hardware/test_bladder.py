@@ -109,6 +109,7 @@ def test_the_order_of_the_steps_does_not_matter():
             ),
             "does not answer",
         ),
+        (lambda: fitted(lambda kpa, _: counts_at({0.0: 8.0, 8.0: 0.0}.get(kpa, kpa))), "less at 4 kPa than at 0;"),
     ],
 )
 def test_steps_that_say_nothing_are_refused(make, words):
@@ -181,3 +182,5 @@ def test_steps_of_two_heads_are_refused(run_cli, tmp_path, steps):
     done = run_cli("calibrate", "array", *words, "-o", "array.json", cwd=tmp_path)
     assert done.returncode == 3
     assert "two heads" in done.stderr
+    twice = run_cli("calibrate", "array", *words, "--step", "8", "other.mcap", "-o", "array.json", cwd=tmp_path)
+    assert (twice.returncode, "two steps are of one recording" in twice.stderr) == (2, True)
