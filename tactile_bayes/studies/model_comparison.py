@@ -318,6 +318,7 @@ def measured_frames(
     return MeasuredScan(part, pressure, rotation, origin, selected.level_kpa[used], tactile_map, place_mm, lump)
 
 
+@np.errstate(divide="ignore")  # without a lump the model's map is 1 everywhere, and `map_strict` infinite
 def compare_model(
     measured: MeasuredScan, scene: Scene, *, fidelity: str, head: str | None = None, progress: Progress = no_progress
 ) -> ModelComparison:

@@ -133,6 +133,12 @@ def test_a_scene_with_another_array_is_refused(tmp_path: Path) -> None:
         compare_model(measured, other, fidelity="empirical-gaussian")
 
 
+def test_a_model_without_a_lump_is_compared_without_a_warning_of_numpy(tmp_path: Path) -> None:
+    measured = measured_frames(scan_of(scene_of(tmp_path, BUMPS + QUIET, sigma=5, noise=0)), every=4)
+    empty = compare_model(measured, scene_of(tmp_path, QUIET, noise=0), fidelity="empirical-gaussian")
+    assert empty.figures["map_strict"] == np.inf
+
+
 def test_a_model_with_a_lower_mean_loses_no_frame_at_the_end_of_the_pressure_window(tmp_path: Path) -> None:
     """The first of these frames is pressed with 5.07 kPa; without it the model's map has another grid."""
     measured = measured_frames(tb.demo_scan(), every=40)
