@@ -164,7 +164,7 @@ def _emulated(scan: Path, speed: float, *, poses: bool) -> Iterator[dict[str, st
     """Start a process of emulated devices that play one scan together; yields their URLs by role."""
     words = ["emulate", "both" if poses else "head", str(scan), "--speed", str(speed)]
     process = subprocess.Popen(
-        [sys.executable, "-m", "tactile_bayes", *words],
+        [sys.executable, "-P", "-m", "tactile_bayes", *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,

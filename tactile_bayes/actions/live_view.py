@@ -73,7 +73,7 @@ def live_view(
         "size_calibration": calibration_file and str(calibration_file),
     }
     theirs, ours = os.pipe()
-    command = [sys.executable, "-m", "tactile_bayes.actions.live_view", str(theirs)]
+    command = [sys.executable, "-P", "-m", "tactile_bayes.actions.live_view", str(theirs)]
     process = subprocess.Popen(command, pass_fds=(theirs,), stdin=subprocess.PIPE, text=True)
     os.close(theirs)
     assert process.stdin is not None

@@ -84,7 +84,7 @@ def fresh_cpu_s(words: Sequence[str]) -> float | None:
     for _ in range(TIMES):
         before = os.times()
         subprocess.run(
-            [sys.executable, "-m", "tactile_bayes", *words],
+            [sys.executable, "-P", "-m", "tactile_bayes", *words],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

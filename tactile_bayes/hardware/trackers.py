@@ -457,7 +457,7 @@ class NdiPort(Port):
         if find_spec(MODULE) is None:
             raise DeviceError(f"{self.name}: needs the package ndicapi; pip install 'tactile-bayes[ndi]'")
         ours, theirs = socket.socketpair()
-        command = [sys.executable, "-m", "tactile_bayes.hardware.trackers", str(theirs.fileno()), url, *map(str, roms)]
+        command = [sys.executable, "-P", "-m", __name__, str(theirs.fileno()), url, *map(str, roms)]
         self._process = subprocess.Popen(
             command,
             pass_fds=[theirs.fileno()],

@@ -120,6 +120,17 @@ def test_a_replay_goes_the_way_of_a_recording(run_cli, tmp_path):
 
 
 @pytest.mark.long
+def test_no_module_is_taken_from_the_current_folder(tmp_path, run_python):
+    """Any numpy.py in a folder of scans was run by the emulated devices and the live view."""
+    write_scan(tmp_path / "a.mcap", short_scan(1.0), provenance=Provenance("test", {}))
+    (tmp_path / "numpy.py").write_text("open('taken', 'w')\n")
+    done = run_python("-P", "-m", "tactile_bayes", "replay", "a.mcap", "--live", cwd=tmp_path, env={"TERM": "dumb"})
+    assert done.returncode == 0, done.stderr
+    assert "live view: " in done.stderr
+    assert not (tmp_path / "taken").exists()
+
+
+@pytest.mark.long
 def test_a_signal_to_a_replay_and_its_devices_ends_it_in_order(tmp_path, child_environment):
     """With `timeout` the emulated devices died first: "the device has gone", exit code 4."""
     write_scan(tmp_path / "a.mcap", short_scan(20.0), provenance=Provenance("test", {}))
