@@ -40,7 +40,7 @@ _NOT_TEXT: Final = (
     (ZIP_MAGIC, "is a spreadsheet or another zip archive (xlsx, ods), not CSV", _EXPORT),
     (b"\xd0\xcf\x11\xe0", "is an old Office file (xls), not CSV", _EXPORT),
     (b"\x1f\x8b", "is compressed with gzip", "decompress it first"),
-    (b"{", "is JSON, not CSV", "give the table"),
+    (b"{\n", "is JSON, not CSV", "give the table"),
 )
 """First bytes of files that are no UTF-8 text, what they are, and the way out."""
 

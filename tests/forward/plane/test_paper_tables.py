@@ -104,7 +104,7 @@ FAULTS = {
         ["write 1234 or 1.234"],
     ),
     "semicolons and a cell too many": ((HEADER + ROW).replace(",", ";").strip() + ";7\n", ["line 2", "7 cells"]),
-    "a report": ('{"schema": "tactile-bayes/validate/1"}', ["is JSON, not CSV"]),
+    "a report": ('{\n  "schema": "tactile-bayes/validate/1"}', ["is JSON, not CSV"]),
     "open quote": (HEADER + 'P1,1,"tactile,1,12.5,detected\n', ["line 2", "not CSV", "quotes"]),
     "ragged short": (HEADER + "P1,1,tactile,1,12.5\n", ["line 2", "5 cells under 6 columns"]),
     "bare decimal comma": (HEADER + "P1,1,tactile,1,12,5,detected\n", ["line 2", "7 cells", "12.5, not 12,5"]),
