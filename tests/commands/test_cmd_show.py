@@ -29,6 +29,7 @@ KINDS = {
     "report.json": ("tactile-bayes/validate/1", "validate", "provenance"),
     "trial.csv": (None, "table: trial", "rows"),
     "excision.csv": (None, "table: excision", "rows"),
+    "failures.csv": ("tactile-bayes/failures/1", "table: failures", "step"),
     "phantoms.csv": ("tactile-bayes/size_table/1", "table: size table", "rows"),
 }
 
@@ -40,6 +41,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_calibration(place / "size.json")
     for name in ("scan.mcap", "trial.csv", "excision.csv", "phantoms.csv"):
         shutil.copyfile(DEMO / name, place / name)
+    row = "P1,1,1,1,a.mcap,map,it was cut off; copy it again"
+    (place / "failures.csv").write_text(f"patient,visit,mass,replicate,file,step,reason\n{row}\n")
     fast = ("--method", "laplace", "--size-calibration", "size.json", "--json")
     one = run_here("estimate", "a.nc", *fast, "-o", "post.nc", cwd=place)
     many = run_here("estimate", "a.nc", "b.nc", *fast, cwd=place)
