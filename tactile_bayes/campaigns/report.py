@@ -29,7 +29,7 @@ from tactile_bayes.report.campaign_page import ExamEntry, MassEntry, VisitEntry,
 from tactile_bayes.report.compare import CompareReport, growths
 from tactile_bayes.report.exam_words import reason_on_paper
 from tactile_bayes.report.pages import Growth, growth_line
-from tactile_bayes.trial.readings import at_excision
+from tactile_bayes.trial.readings import at_excision, day_of
 
 # --- Tables: exams done, failures, and the trial table that `validate` takes.
 
@@ -323,6 +323,7 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
         "exams with a caution, see their findings": _names_with_finding(rows, "caution", "name"),
         "masses whose exams disagree, without a pooled size": _names_with_finding(rows, "maps_disagree", "of_mass"),
         "exams with a mass that no row names, see their findings": _names_with_finding(rows, "unnamed_mass", "name"),
+        **_dated_doubts(campaign.exams, excised),
         "folders of exams that the table does not list": unlisted,
     }
     doubtful = [f"{words}: {first_of(names, FEW)}" for words, names in doubts.items() if names]
@@ -333,6 +334,24 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
         (*doubtful, *([f"no trial report: {fault}"] if fault and not report else [])),
         report,
     )
+
+
+def _dated_doubts(exams: Sequence[Exam], excised: Table | None) -> dict[str, list[str]]:
+    """Visits of masses with exams of several days, and those after excision, by what is told of them."""
+    excised_on = {} if excised is None else dict(zip(_masses_of(excised), excised.columns["date"], strict=True))
+    last_day = {exam.of_mass: excised_on.get((exam.patient, exam.mass)) or date.max for exam in exams}
+    days_of = defaultdict[str, set[date]](set)
+    for exam in exams:
+        if day := exam.day or day_of(exam.visit):
+            days_of[exam.of_mass].add(day)
+    return {
+        "exams of one visit on several days, the last of which counts": [
+            name for name, days in days_of.items() if len(days) > 1
+        ],
+        "visits after excision, left out of the report and not of growth.csv": [
+            name for name, days in days_of.items() if max(days) > last_day[name]
+        ],
+    }
 
 
 def _pooled_words(campaign: Campaign, pooled: Pooled) -> str:

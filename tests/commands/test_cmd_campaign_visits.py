@@ -119,6 +119,9 @@ def test_a_second_run_does_nothing_and_another_date_compares_again(done: tuple[P
     later = campaign(maps, rows(dates=("2026-01-10", "2026-04-11")), "--excision", "ex.csv").stdout
     assert "6 steps run" in later  # the pages of the exams at that date too
     assert "compare run: P1.m1, P2.m1" in later
+    assert "several days" not in later
+    mixed = campaign(maps, [rows()[0].replace("-10,", "-12,"), *rows()[1:]]).stdout
+    assert "exams of one visit on several days, the last of which counts: P1.v1.m1" in mixed
 
 
 @pytest.mark.long
@@ -140,8 +143,10 @@ def test_one_visit_has_no_growth_landmarks_are_not_needed_and_findings_have_the_
     one = campaign(tmp_path, lines[:1]).stdout
     assert "growth" not in one
     assert not (tmp_path / "out" / "growth.csv").exists()
-    both = campaign(tmp_path, lines).stdout
+    (tmp_path / "ex.csv").write_text("patient,mass,ex_vivo_mm,date\nP1,1,20,2026-02-01\n")
+    both = campaign(tmp_path, lines, "--excision", "ex.csv").stdout
     assert "1 grown (growth.csv)" in both
+    assert "visits after excision, left out of the report and not of growth.csv: P1.vpost.m1" in both
     (row,) = rows_of(tmp_path / "out" / "growth.csv")
     assert "CAUTION: no landmarks show where the mass of visit 1 (coded pre) lies" in row["findings"]
     campaign(tmp_path, lines[:1])  # files that this run would not make go
