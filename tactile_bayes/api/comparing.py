@@ -216,7 +216,7 @@ def compare_answers(
         if one.kind != "outside_calibration"  # of a size alone: judged anew
     )
     compared = replace(compared, findings=by_severity((*compared.findings, *of_visits)))
-    scans = [scan for visit in visits for scan in _scans(visit)]
+    scans = _scans(answers)
     recorded = {name: value for name, value in settings.recorded().items() if name in _RECORDED}
     provenance = Provenance("compare", recorded | as_dict(comparing), digests, seed=settings.seed, scans=scans)
     report = compare_report(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 import shutil
 import time
 from collections import defaultdict
@@ -97,7 +96,7 @@ def remove_stale_files(
         (MASSES, {exam.of_mass for exam in exams}, ("pool",)),
         (GROWTH, {exam.of_visits for exam in exams}, ("compare",)),
     ):
-        for name in sorted(_names_in(folder / kind)):
+        for name in sorted(path.name for path in (folder / kind).glob("*")):
             if name not in names:
                 left.append(f"{kind}/{name}")
             if name not in names or name in spared:
@@ -108,20 +107,13 @@ def remove_stale_files(
     return left
 
 
-def _names_in(folder: Path) -> list[str]:
-    try:
-        return os.listdir(folder)  # noqa: PTH208 (names only: the directory may be large)
-    except OSError:
-        return []
-
-
 def _clear(place: Path, *, known: Collection[str], made: Collection[str]) -> None:
     """Remove the files of a folder that a step makes and this run did not, and the folder when none is left."""
-    for name in _names_in(place):
-        if name.startswith(WAITING):  # of a step whose command was ended
-            shutil.rmtree(place / name, ignore_errors=True)
-        elif name in known and name not in made:
-            (place / name).unlink(missing_ok=True)
+    for path in place.glob("*"):
+        if path.name.startswith(WAITING):  # of a step whose command was ended
+            shutil.rmtree(path, ignore_errors=True)
+        elif path.name in known and path.name not in made:
+            path.unlink(missing_ok=True)
     if not made:
         _remove_if_empty(place)
 

@@ -8,7 +8,6 @@ import shutil
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from datetime import date
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,7 +18,7 @@ from tactile_bayes.api.comparing import compare_answers
 from tactile_bayes.api.estimating import choose_calibration, estimate_file
 from tactile_bayes.api.pooled import pool_answers
 from tactile_bayes.api.repeatability import ExamFolder, learn_from_exams
-from tactile_bayes.api.settings import Settings
+from tactile_bayes.api.settings import Settings, days_from_first
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.campaigns.exams import ARRAYS, OWN_AXES, Match, estimate_matched, map_of_exam
 from tactile_bayes.declarations import EXACT, Record, field, from_plain, replace, rounded, to_plain
@@ -336,8 +335,7 @@ def make_growth(
     with_draws = [one for maps in answers for one in maps if one.shape is not None]
     placed = all(answer.report.centre_patient_mm is not None for answer in with_draws)
     files = [[folder / name / layout.MAP for name in names] for names in visits]
-    dates = [date.fromisoformat(day) for day in course.dates if day]
-    days = tuple(float((day - dates[0]).days) for day in dates) if len(dates) == len(visits) else None
+    days = days_from_first(None, course.dates if course.dates and all(course.dates) else None)
     comparing = CompareOptions(days=days, same_mass=not placed)
     compared = compare_answers(answers, settings, comparing, names=visits, files=files, numbers=course.numbers)
     report = compared.report.checked()
