@@ -143,10 +143,10 @@ def tradeoff_forward_action(
     """Measure error in amplitude, width and size against CPU time, for the lump of a scene."""
     if size_calibration not in (None, LEARNED):
         protect_inputs(size_calibration_path(size_calibration))
-    inputs = hash_inputs(scene=scene)
     with in_file(scene or ""):
         drawn = Scene(body=SceneBody(), solid_lumps=(SolidLump(seat=0.0),)) if scene is None else read_scene(scene)
         case = tradeoffs.lump_case(drawn, head=head)
+    inputs = hash_inputs(scene=scene)
     # a raster's frames are divided by their means
     default_rules = {tradeoffs.PLANE: "plane-strain", tradeoffs.SOLID: "solid-mean"}
     rules = {model: _rule(case, model, size_calibration or name) for model, name in default_rules.items()}
@@ -211,10 +211,10 @@ def tradeoff_estimate_action(
         raise UsageError("--centre-mm is a place on one map; give one map")
     if settings.checkpoint is not None:
         raise UsageError("a checkpoint is of one estimate, and this command makes many; leave checkpoint out")
-    inputs = hash_inputs(**{f"map_{number}": path for number, path in enumerate(maps, start=1)})
     with progress_bar("settings") as progress:
         work = StudyRun(time.process_time, tolerance_mm, runs, forecast, progress, settings.seed, settings.interval)
         tactile_map = read_map(maps[0])
+        inputs = hash_inputs(**{f"map_{number}": path for number, path in enumerate(maps, start=1)})
         with in_file(maps[0]):
             calibration, sampler = estimate_inputs(settings, tactile_map)
             tradeoff = measure(tactile_map, calibration=calibration, options=sampler, work=work)
