@@ -366,8 +366,9 @@ def _as_map(
 ) -> TactileMap:
     sums, scans = cells.sums.trimmed(), [part.scan for part in selections]
     patient, nipple, spread = _landmarks(scans, plane)
-    sides = [scan.session.get("side", "") for scan in scans]
+    side = next(filter(None, (scan.session.get("side", "") for scan in scans)), "")
     centre = None if patient is None else patient[:2, 3].tolist()  # the plane's origin is the middle of the frames
+    nipple_place = None if patient is None or nipple is None else apply(patient, nipple).tolist()
     parts = [(f"scan {number} " if len(scans) > 1 else "", part) for number, part in enumerate(selections, start=1)]
     quality = {
         **select.frame_figures(selections),
@@ -394,7 +395,7 @@ def _as_map(
         head=_head(scans),
     )
     quality_findings = (
-        *side_findings(next(filter(None, sides), ""), centre, "the scanned place"),
+        *(side_findings(side, centre, "the scanned place") or side_findings(side, nipple_place, "the nipple")),
         *convention_findings(quality, findings),
         *broken_assumptions(quality, strokes_lengthwise=strokes_lengthwise),
         *handling_findings(quality),
