@@ -417,10 +417,8 @@ def rotation_sense(position_mm: FloatArray, quaternion_wxyz: FloatArray) -> Rota
         raise BadDataError(
             f"the sensor was turned by {turn_deg:.0f} degrees only", way_out=f"turn it by {LEAST_TURN_DEG:g} or more"
         )
-    inverse = rotation.transpose(0, 2, 1)
-    return RotationSense(
-        _fixed_point_rms_mm(position_mm, rotation), _fixed_point_rms_mm(position_mm, inverse), turn_deg
-    )
+    as_given, inverted = (_fixed_point_rms_mm(position_mm, one) for one in (rotation, rotation.transpose(0, 2, 1)))
+    return RotationSense(as_given, inverted, turn_deg)
 
 
 def _fixed_point_rms_mm(position_mm: FloatArray, rotation: FloatArray) -> float:

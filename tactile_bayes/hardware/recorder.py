@@ -477,10 +477,8 @@ class Recorder:
         report, clock = self.report, self._clock
         report.head_clock_steps, report.head_clock_wraps = clock.head.steps, clock.head.wraps
         report.tracker_clock_steps, report.tracker_clock_wraps = clock.tracker.steps, clock.tracker.wraps
-        report.missing_why, report.flagged_why = (
-            _counts_in_words(self._why_missing),
-            _counts_in_words(self._why_flagged),
-        )
+        report.missing_why = _counts_in_words(self._why_missing)
+        report.flagged_why = _counts_in_words(self._why_flagged)
         report.other_tools = _counts_in_words(self.follower.other_tools)
         report.tracker_remark = self.tracker.parser.remark if self.tracker else ""
         passed_s = (self._heard_ns - self._begun_ns) / 1e9

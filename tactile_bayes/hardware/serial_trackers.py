@@ -281,9 +281,8 @@ class TrackerDriver(Record):
             answered_at = answered_at or (time.monotonic() if answers[0].came else 0.0)
         answer = answers[0]
         if not answer.came or (answer.tools and set(answer.tools.values()) == {NO_ROTATION}):
-            raise DeviceError(
-                f"{port.name}: {self._fault_words(answer.parsed, unasked, received, rate=port.has_line_rate)}"
-            )
+            words = self._fault_words(answer.parsed, unasked, received, rate=port.has_line_rate)
+            raise DeviceError(f"{port.name}: {words}")
         answer.tool, answer.reference = _choose_tools(answer.tools, tool, reference, port)
         return answer
 
