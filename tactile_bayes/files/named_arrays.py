@@ -125,7 +125,7 @@ def orient_by_axes(arrays: Arrays) -> tuple[tuple[str, ...], tuple[float, ...]]:
 
 
 def step_of(name: str, places: np.ndarray) -> float | None:
-    """Step between the places of cells, which must be even; None for less than two, or numbers from 0 or 1 on."""
+    """Step between the places of cells, which must be even; None for less than two, or whole ones that count up."""
     with np.errstate(all="ignore"):
         steps = np.diff(places.astype(np.float64))
     if not len(steps):
@@ -133,7 +133,7 @@ def step_of(name: str, places: np.ndarray) -> float | None:
     if not np.allclose(steps, steps.mean(), rtol=0.01, atol=0.0):
         what = f"{name} runs in unequal steps ({steps.min():.4g} to {steps.max():.4g})"
         raise BadDataError(what, way_out="a grid has square cells of one side: interpolate it")
-    return None if steps[0] == 1 and places[0] in (0, 1) else abs(float(steps.mean()))
+    return None if steps[0] == 1 and places[0] >= 0 == places[0] % 1 else abs(float(steps.mean()))
 
 
 def _orient(arrays: Arrays, grids: Iterable[str], x: np.ndarray, y: np.ndarray) -> list[str]:

@@ -109,7 +109,8 @@ def test_values_that_say_that_they_are_mirrored_or_turned_are_refused() -> None:
         with pytest.raises(BadDataError, match=words):
             tb.map_of(given, spacing_mm=2, normalise="gain")
     assert tb.map_of(mm.assign_coords(x=mm.x / 10, y=mm.y / 10), spacing_mm=1, normalise="gain").x_mm.size == 45
-    assert tb.map_of(pd.DataFrame(held), spacing_mm=2, normalise="gain").tactile_map.recipe.cell_mm == 2
+    for counted in (pd.DataFrame(held), pd.DataFrame(held).iloc[2:]):
+        assert tb.map_of(counted, spacing_mm=2, normalise="gain").tactile_map.recipe.cell_mm == 2
 
 
 def test_the_path_of_a_grid_says_what_it_lacks(tmp_path: Path) -> None:
