@@ -232,7 +232,7 @@ def compare_answers(
 
 
 def _common_fact(fact: str, maps: Sequence[SizeEstimate]) -> str:
-    """What the scans of all maps that name this fact say of it; empty without any, and where they differ."""
+    """This fact as the scans of all maps that name it have it; empty without any, and where they differ."""
     values = {scan[fact] for one in maps for scan in one.provenance.scans if scan.get(fact)}
     return values.pop() if len(values) == 1 else ""
 
