@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, check_number
 from tactile_bayes.findings import Finding, by_severity, finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, Plane, apply, inverse, patient_from_plane
@@ -40,14 +40,22 @@ _END_FRAMES = 100  #: Of a third of a scan that are looked at, up to twice as ma
 _WIDENING = 1.5  #: Factor by which a radius grows whose frames span no plane.
 
 
-_SCANS = (
-    *("two scans", 0.1, 1 / 2),
-    *("build one map per scan, and pool them: estimate --pool", "have each scan mapped by itself"),
+class _Parts(Record):
+    """Parts of the frames that may have moved against each other, and when they are told to have."""
+
+    words: str
+    least_rise: float  #: Least of their highest rises, over the median of the smoothed map.
+    none_below: float  #: Share of the other part's highest rise below which a part has no rise there.
+    remedy: str
+    on_paper: str
+
+
+_SCANS = _Parts(
+    "two scans", 0.1, 1 / 2, "build one map per scan, and pool them: estimate --pool", "have each scan mapped by itself"
 )
-_ENDS = ("the scan's first and last third", 0.15, 1 / 3, *2 * ("scan again, patient and tracker at rest",))
-"""Parts that may have moved against each other, the least of their highest rises over the median of the smoothed map,
-the share of it below which a part has no rise, and the remedies. None of 79 right scans is told by its thirds, and 24
-of 29 whose tracker moved by 20 mm along the head."""
+_AT_REST = "scan again, patient and tracker at rest"
+_ENDS = _Parts("the scan's first and last third", 0.15, 1 / 3, _AT_REST, _AT_REST)
+"""None of 79 right scans is told by its thirds, and 24 of 29 whose tracker moved by 20 mm along the head."""
 
 
 def _rises(selections: Sequence[SelectedFrames], plane: Plane) -> tuple[CellSums, FloatArray]:
@@ -78,26 +86,23 @@ def highest_point_mm(selections: Sequence[SelectedFrames], plane: Plane) -> Floa
     return np.asarray(_highest(*_rises(selections, plane))[::-1] * _CELL_MM)
 
 
-def moved(
-    parts: Sequence[SelectedFrames], plane: Plane, limits: tuple[str, float, float, str, str]
-) -> tuple[Finding, ...]:
-    """Caution where two scans or parts of one have their highest rises each where the other has none.
+def _moved(parts: Sequence[SelectedFrames], plane: Plane, told: _Parts) -> tuple[Finding, ...]:
+    """Caution where two parts have their highest rises each where the other has none: one lump would be mapped twice.
 
-    One lump would be mapped twice. Lower rises say nothing: beside lumps a scan's pattern goes with its strokes.
+    Lower rises say nothing: beside lumps a scan's pattern goes with its strokes.
     """
-    of_parts, least_rise, share, *remedies = limits
     maps = [_rises([part], plane) for part in parts if part.used.sum() >= select.LEAST_FRAMES]
     for one, other in combinations(maps, 2):
         cell, other_cell = _highest(*one), _highest(*other)
         rise, other_rise = _rise_at(*one, cell), _rise_at(*other, other_cell)
-        alone = _rise_at(*other, cell) < share * other_rise and _rise_at(*one, other_cell) < share * rise
-        if alone and min(rise, other_rise) > least_rise:
+        missed = _rise_at(*other, cell) < told.none_below * other_rise
+        if missed and _rise_at(*one, other_cell) < told.none_below * rise and min(rise, other_rise) > told.least_rise:
             apart = _CELL_MM * float(np.linalg.norm(cell - other_cell))
             text = (
-                f"{of_parts} feel the highest rise {apart:.0f} mm apart, each where the other feels none: patient "
+                f"{told.words} feel the highest rise {apart:.0f} mm apart, each where the other feels none: patient "
                 "or tracker moved between them, and one lump may be taken for two"
             )
-            return (finding("frames_contradict", text, *remedies),)
+            return (finding("frames_contradict", text, told.remedy, told.on_paper),)
     return ()
 
 
@@ -263,8 +268,8 @@ def _build(
         plane, radius_figures = local_plane(selections, plane, radius_mm=radius)
         figures |= radius_figures
     if not any(one.kind == "frames_contradict" for one in findings):
-        findings += _numbered([moved(_ends(part), plane, _ENDS) for part in selections])
-    findings += moved(selections, plane, _SCANS) if len(selections) > 1 else ()
+        findings += _numbered([_moved(_ends(part), plane, _ENDS) for part in selections])
+    findings += _moved(selections, plane, _SCANS) if len(selections) > 1 else ()
     sources = accumulate.frame_sources(selections, plane_from_base=plane.plane_from_base, cell_mm=settings.cell_mm)
     if settings.register_strokes:
         sources, strokes = latency.register_strokes(sources)

@@ -179,7 +179,7 @@ def import_again(corrections: Collection[str]) -> str:
     """Way out: the options of `import` that make the corrections, and of a mirrored array the other cause."""
     mirrored = ("rows-reversed" in corrections) != ("columns-reversed" in corrections)
     again = f"import the scan again with {' '.join(f'--correct {name}' for name in corrections)}"
-    return again + _LEFT_HANDED * mirrored
+    return again + _LEFT_HANDED if mirrored else again
 
 
 def convention_agreement(selections: Sequence[SelectedFrames]) -> dict[str, float]:

@@ -318,16 +318,16 @@ _USUAL_LEVER_MM: Final = (10.0, 300.0)  #: From the face of a head that a hand h
 def scan_findings(scan: Scan) -> tuple[Finding, ...]:
     """Findings of a scan's recorder, and on its times and poses; what the recorder noted too is given once."""
     noted = with_times(scan.findings, Span.of(scan.frames.time_s), Span.of(scan.poses.time_s))
-    found = Jumps.of(scan.poses)
-    jumps = found.cautions()
-    remedy = "set the tracker's hemisphere to the patient's side, and scan again" * found.crossed
-    noted = tuple(one for one in noted if one.text not in jumps)
+    jumps = Jumps.of(scan.poses)
+    remedy = "set the tracker's hemisphere to the patient's side, and scan again" if jumps.crossed else ""
+    jumped = [finding("poses_jump", text, remedy, remedy) for text in jumps.cautions()]
+    noted = tuple(one for one in noted if one.text not in jumps.cautions())
     frozen = (finding("times_apart", text, *_LEFT_OUT) for text in _frozen_cautions(scan.poses))
     lever = float(np.linalg.norm(scan.head.scanhead_from_tracker[:3, 3]))
-    odd = 1e-3 < lever < _USUAL_LEVER_MM[0] or lever > _USUAL_LEVER_MM[1]
-    far = [f"the tracker's sensor lies {lever:.3g} mm from the head"] if odd else []
-    unusual = (finding("unusual_scan", text, "check that the lever arm is in mm") for text in far)
-    return (*noted, *frozen, *(finding("poses_jump", text, remedy, remedy) for text in jumps), *unusual)
+    if lever <= 1e-3 or _USUAL_LEVER_MM[0] <= lever <= _USUAL_LEVER_MM[1]:
+        return (*noted, *frozen, *jumped)
+    text = f"the tracker's sensor lies {lever:.3g} mm from the head"
+    return (*noted, *frozen, *jumped, finding("unusual_scan", text, "check that the lever arm is in mm"))
 
 
 def _frozen_cautions(poses: TrackerPoses) -> list[str]:
