@@ -107,7 +107,7 @@ def _import_each(sources: tuple[Path, ...], folder: Path, request: ImportRequest
             lines += _import(source, target, request)
         except TactileBayesError as error:
             line = one_line(error)
-            click.echo(line if str(source) in line else f"{source}: {line}", err=True)
+            click.echo(f"error: {line}" if str(source) in line else f"error: {source}: {line}", err=True)
             exit_code = exit_code or error.exit_code
     if is_new and not lines:
         folder.rmdir()

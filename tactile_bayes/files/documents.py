@@ -243,7 +243,8 @@ def read_session(path: Path) -> dict[str, str]:
         if key in document:
             raise BadDataError(f"{key} is set by the recording itself", way_out=f"leave {key} out", path=str(path))
     for key in document:
-        near = difflib.get_close_matches(key, {*names_of(Session)}.difference(SET_BY_RECORDING), n=1, cutoff=0.8)
+        known = {*names_of(Session)}.difference(SET_BY_RECORDING)
+        near = ["side"] if key in ("breast", "laterality") else difflib.get_close_matches(key, known, n=1, cutoff=0.8)
         if near and near[0] not in document:
             raise BadDataError(f"{key} is not known", way_out=f"did you mean {near[0]}?", path=str(path))
     check_session(document, path=path)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-import tempfile
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache, partial
+from tempfile import TemporaryDirectory
 from typing import Any, Protocol
 
 import numpy as np
@@ -27,13 +28,29 @@ def _arviz() -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # its notice of the next major version, which is pinned away
         try:
-            import arviz
-        except (OSError, RuntimeError):  # no home, or one that cannot be written, to note in that it gave the notice
-            from unittest.mock import patch
+            return _import_arviz()
+        except (OSError, RuntimeError):  # no home that can be written, where it keeps the day of that notice
+            with TemporaryDirectory() as folder, _cache_home(folder):
+                return _import_arviz()
 
-            with tempfile.TemporaryDirectory() as home, patch.dict(os.environ, HOME=home, XDG_CACHE_HOME=home):
-                import arviz
+
+def _import_arviz() -> Any:
+    import arviz
+
     return arviz
+
+
+@contextmanager
+def _cache_home(folder: str) -> Iterator[None]:
+    """Let libraries keep their caches in a folder."""
+    before = os.environ.get("XDG_CACHE_HOME")
+    os.environ["XDG_CACHE_HOME"] = folder
+    try:
+        yield
+    finally:
+        del os.environ["XDG_CACHE_HOME"]
+        if before is not None:
+            os.environ["XDG_CACHE_HOME"] = before
 
 
 def _agreement(draws: FloatArray) -> dict[str, float]:

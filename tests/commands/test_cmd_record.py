@@ -423,6 +423,7 @@ SESSIONS = {
     'Side = "left"': "'Side' is not known; did you mean side?",
     'reference = "7"': "reference is set by the recording itself",
     'subjct = "P031"': "subjct is not known; did you mean subject?",
+    'laterality = "left"': "laterality is not known; did you mean side?",
     "date = 2026-11-27": "date is 2026-11-27; give a text in quotes",
     'side = "Left"': "side is 'Left'; did you mean left? Give one of left, right, phantom",
     "side = left": "is not TOML",
