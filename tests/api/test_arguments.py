@@ -227,6 +227,7 @@ def test_a_day_may_be_a_date(found: tb.SizeEstimate, tmp_path: Path) -> None:
     assert (tmp_path / "day.html").read_bytes() == (tmp_path / "text.html").read_bytes()
 
 
+@pytest.mark.long
 def test_numbers_of_numpy_are_taken_as_numbers(made: tb.Map) -> None:
     of_numpy = tb.estimate(made, seed=np.int64(3), interval=np.float64(0.9), known={"seat": np.float32(1.0)}, **FAST)
     plain = tb.estimate(made, seed=3, interval=0.9, known={"seat": 1.0}, **FAST)

@@ -131,6 +131,7 @@ def test_exams_of_a_mass_that_lie_apart_are_reported(folder: Path) -> None:
     assert not any("CAUTION" in row["findings"] for row in rows_of(folder / "c" / "out" / "exams_done.csv"))
 
 
+@pytest.mark.long
 def test_two_masses_near_one_place_are_refused_by_name(folder: Path) -> None:
     told = campaign(folder, "a.nc,P1,1,2,1,left,16,2", "b.nc,P1,1,2,2,left,,", more=("--match-mm", "50"))
     assert "P1.v1.m2.r2: estimate: shows masses at (" in told

@@ -136,6 +136,7 @@ def test_visits_without_an_order_and_an_excision_before_all_are_refused_before_a
     assert "table of exams, line 2, column date: visit 1 is after excision on" in early.stderr
 
 
+@pytest.mark.long
 def test_one_visit_has_no_growth_landmarks_are_not_needed_and_findings_have_the_tables_codes(tmp_path: Path) -> None:
     for visit, sigma in enumerate(WIDTHS["P1"]):
         written(tmp_path / f"P1-{visit}-1.nc", sigma=sigma, seed=visit, landmarks=False)

@@ -221,7 +221,10 @@ def test_methods_agree_on_a_strong_lump(errors: str) -> None:
         assert np.abs(other_sd / sd - 1).max() < stretch, method
 
 
-@pytest.mark.parametrize("method", METHODS)
+MARKS = {"ensemble": pytest.mark.long}  # chains of seconds
+
+
+@pytest.mark.parametrize("method", [pytest.param(name, marks=MARKS.get(name, ())) for name in METHODS])
 class TestContract:
     def test_draws_are_finite_and_shaped_alike(self, method: str) -> None:
         found = answer(method)

@@ -345,6 +345,7 @@ def test_a_notebook_has_both_intervals_and_the_probability() -> None:
     assert re.search(r"probability of a lump +0\.9\d", table)
 
 
+@pytest.mark.long
 def test_what_speaks_against_a_map_reaches_pool_comparison_and_campaign(tmp_path: Path) -> None:
     """Written to a file, estimated by commands; only what is of one size alone is judged anew from all maps."""
     for number in (1, 2, 3):

@@ -265,6 +265,7 @@ def test_the_document_is_the_one_of_all_trade_offs() -> None:
         assert document["reference"]["words"].startswith(f"{model}, fineness")
 
 
+@pytest.mark.long
 def test_the_figure_is_the_same_bytes_each_time(tmp_path: Path) -> None:
     for name in ("one.png", "two.png"):
         draw_tradeoffs(by_model(), tmp_path / name)
