@@ -20,6 +20,7 @@ from tactile_bayes.files.atomic import Format, check_suffix, refuse_existing, re
 from tactile_bayes.options import RecordOptions
 from tactile_bayes.presets import HEADS
 from tactile_bayes.report import figure_file
+from tactile_bayes.shell import raise_if_interrupted
 
 # --- Paths on the command line: an output may be neither an input nor another output of the same command.
 
@@ -113,7 +114,9 @@ def command(
             refuse_existing(*(values[name] for name in guarded), force=values.get("force", False))
             token = BY_OPTIONS.set(True)
             try:
-                code = getattr(import_module(f"tactile_bayes.actions.{module}"), function)(**values)
+                act = getattr(import_module(f"tactile_bayes.actions.{module}"), function)
+                raise_if_interrupted()  # while it was imported
+                code = act(**values)
             finally:
                 BY_OPTIONS.reset(token)
             if code:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -54,6 +56,21 @@ def test_a_signal_to_end_ends_as_ctrl_c_does(number: signal.Signals, tmp_path: P
     assert done.returncode == errors.EXIT_INTERRUPTED
     assert done.stderr.split() == ["interrupted"]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interruption_that_an_import_swallows_ends_the_command(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Compiled modules do, while they are imported: the command went on to its end."""
+
+    def swallow(name: str) -> object:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+        return import_module(name)
+
+    monkeypatch.setattr("tactile_bayes.commands.options.import_module", swallow)
+    done = run_here("devices", cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr.split()) == (errors.EXIT_INTERRUPTED, "", ["interrupted"])
 
 
 def test_ctrl_c_once_the_command_has_ended_leaves_its_exit_code() -> None:
