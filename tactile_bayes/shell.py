@@ -211,7 +211,13 @@ def raw_stream(stream: Any) -> TextIO:
     return raw
 
 
-# --- Signals that end a command in order, as Ctrl-C does.
+# --- Other processes of the program, and signals that end a command in order, as Ctrl-C does.
+
+
+def own_process(module: str, *words: str) -> list[str]:
+    """Command line of a module of the program; -P: else Python files of the current folder would be run."""
+    return [sys.executable, "-P", "-m", module, *words]
+
 
 _interrupted = False
 

@@ -116,8 +116,12 @@ def calibrate_size_action(
         return
     if figure is not None and learned.lumps is not None:
         eq6_figure(calibration, learned.lumps, figure, title=table.name, force=force)
-    not_left_out, rows = learned.not_left_out, learned.table_rows
-    text = calibration_text(calibration, not_left_out=not_left_out, other_fit=learned.other_fit, table_rows=rows)
+    text = calibration_text(
+        calibration,
+        not_left_out=learned.not_left_out,
+        other_fit=learned.other_fit,
+        table_rows=learned.table_rows,
+    )
     click.echo(text, nl=False)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -40,6 +39,7 @@ from tactile_bayes.hardware.serial_trackers import TRACKERS, open_tracker, probe
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.scan import describe_scan
 from tactile_bayes.scans import Scan
+from tactile_bayes.shell import own_process
 
 
 def emulate_action(
@@ -164,7 +164,7 @@ def _emulated(scan: Path, speed: float, *, poses: bool) -> Iterator[dict[str, st
     """Start a process of emulated devices that play one scan together; yields their URLs by role."""
     words = ["emulate", "both" if poses else "head", str(scan), "--speed", str(speed)]
     process = subprocess.Popen(
-        [sys.executable, "-P", "-m", "tactile_bayes", *words],
+        own_process("tactile_bayes", *words),
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         text=True,

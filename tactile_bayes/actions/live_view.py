@@ -47,7 +47,7 @@ from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.presets import FIELD_COSINES, INTERVAL, PRESSURE_WINDOW_KPA, RECORDING_KEYS, RESEARCH_USE, VIRIDIS
 from tactile_bayes.scans import ElementCalibration, HeadGeometry
-from tactile_bayes.shell import can_redraw, has_styles
+from tactile_bayes.shell import can_redraw, has_styles, own_process
 
 DRAWINGS_PER_S = 10.0
 BATCH_S = 1 / DRAWINGS_PER_S / 2  #: Frames are added to the map in batches, two for each drawing.
@@ -73,7 +73,7 @@ def live_view(
         "size_calibration": calibration_file and str(calibration_file),
     }
     theirs, ours = os.pipe()
-    command = [sys.executable, "-P", "-m", "tactile_bayes.actions.live_view", str(theirs)]
+    command = own_process("tactile_bayes.actions.live_view", str(theirs))
     process = subprocess.Popen(command, pass_fds=(theirs,), stdin=subprocess.PIPE, text=True)
     os.close(theirs)
     assert process.stdin is not None

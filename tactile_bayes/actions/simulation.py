@@ -39,7 +39,8 @@ def simulate_action(
     force: bool,
 ) -> None:
     """Make a scan with known truth from SCENE, a TOML file."""
-    stated, session = read_scene(scene), {} if session_file is None else read_session(session_file)
+    stated = read_scene(scene)
+    session = {} if session_file is None else read_session(session_file)
     inputs = hash_inputs(scene=scene, session=session_file)
     for lump in stated.solid_lumps if fidelity == "empirical" else ():
         if warning := outside_range(lump.d_mm, lump.depth_ratio):
@@ -47,8 +48,8 @@ def simulate_action(
     seed = stated.seed if seed is None else seed
     with progress_bar("frames") as progress:
         simulated = simulate(stated, rng=np.random.default_rng(seed), fidelity=fidelity, head=head, progress=progress)
-    scan, truth = simulated.scan, simulated.truth
-    scan = replace(scan, session={**scan.session, **session})
+    truth = simulated.truth
+    scan = replace(simulated.scan, session={**simulated.scan.session, **session})
     provenance = Provenance("simulate", {"model": truth["model"]}, inputs, seed=seed)
     write_scan(output, scan, provenance=provenance, truth=truth, force=force)
     shape = f": {truth['shape']}" if truth.get("shape") else ""

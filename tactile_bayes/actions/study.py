@@ -284,7 +284,9 @@ def compare_model_action(
     **options: Any,
 ) -> None:
     """Compare a scan's frames and map with a forward model of SCENE (section 2.3 of the paper)."""
-    body, loaded, inputs = read_scene(scene), read_scan(scan), hash_inputs(scan=scan, scene=scene)
+    body = read_scene(scene)
+    loaded = read_scan(scan)
+    inputs = hash_inputs(scan=scan, scene=scene)
     if at is None and not (body.solid_lumps or body.lumps):
         at = (0.0, 0.0)  # no lump to look for: the middle of the strokes
     measured = measured_frames(loaded, place_mm=at, **options)

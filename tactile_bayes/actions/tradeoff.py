@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -31,7 +30,7 @@ from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.tissue import SceneBody, SolidLump
 from tactile_bayes.report.paper_head import finite
 from tactile_bayes.report.tradeoff import DIGITS, Varied, draw_tradeoffs, tradeoff_file, tradeoff_text
-from tactile_bayes.shell import progress_bar
+from tactile_bayes.shell import own_process, progress_bar
 from tactile_bayes.size.pooling import PooledEstimate
 from tactile_bayes.studies import paper, tradeoffs
 from tactile_bayes.studies.estimate_tradeoff import (
@@ -84,7 +83,7 @@ def fresh_cpu_s(words: Sequence[str]) -> float | None:
     for _ in range(TIMES):
         before = os.times()
         subprocess.run(
-            [sys.executable, "-P", "-m", "tactile_bayes", *words],
+            own_process("tactile_bayes", *words),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

@@ -127,7 +127,8 @@ def _eq6(table: Path | Sheet, options: LearnOptions, progress: Progress | None) 
     errors = [np.abs(eq6.log_error(axis.size_mm(one.sigma_mm, one.amplitude), one.d_mm)) for axis, one in axes]
     if off := int(np.sum(np.min(errors, axis=0) > math.log(FAR_OFF))):
         cautions += (f"Eq 6 sizes {off} of its lumps more than {FAR_OFF:g} times too large or small: is d_mm in mm?",)
-    learned, files = replace(calibration, left_out=left_out, cautions=cautions), _files(table=table)
+    learned = replace(calibration, left_out=left_out, cautions=cautions)
+    files = _files(table=table)
     return LearnedCalibration(learned, settings, files, options.seed, None, lumps, not_left_out, other, len(rows))
 
 

@@ -368,8 +368,8 @@ def _pooled_words(campaign: Campaign, pooled: Pooled) -> str:
 
 def _names_with_finding(rows: Sequence[ExamRow], sought: str, name: str) -> list[str]:
     """Names of the exams, or of their masses, with a finding of the kind or severity, each once."""
-    found = (row.exam for row in rows if any(sought in (one.kind, one.severity) for one in row.findings))
-    return list(dict.fromkeys(getattr(exam, name) for exam in found))
+    exams = (row.exam for row in rows if any(sought in (one.kind, one.severity) for one in row.findings))
+    return list(dict.fromkeys(getattr(exam, name) for exam in exams))
 
 
 def check_inputs(exams: Sequence[Exam], settings: CampaignSettings) -> None:

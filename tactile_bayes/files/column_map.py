@@ -141,8 +141,9 @@ class _Row(NamedTuple):
     def size(self, column: str, factor: float, ask: str) -> float:
         """A size in mm, which is above 0; `ask` is the way out of 0 and of a word."""
         text = self.cells[column]
-        value: float = self.value(column, "number") if any(map(str.isdigit, text)) else 0.0
-        if value == 0:
+        is_word = not any(map(str.isdigit, text))
+        value: float = 0.0 if is_word else self.value(column, "number")
+        if is_word or value == 0:
             raise self.table.error(self.line, column, f"is {text}", way_out=ask)
         if value < 0:
             raise self.table.error(self.line, column, f"is {value:g}", way_out="a size is above 0")

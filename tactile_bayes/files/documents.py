@@ -15,7 +15,15 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 from tactile_bayes.declarations import Meta, Record, field, from_plain, names_of, replace, schema_name, short_repr
 from tactile_bayes.errors import BadDataError, in_file, suggestion
-from tactile_bayes.files.reading import JSON_BYTES, TOML_BYTES, WAYS, decoding, kind_of, read_text, schema_kind
+from tactile_bayes.files.reading import (
+    JSON_BYTES,
+    TOML_BYTES,
+    decoding,
+    kind_of,
+    of_another_kind,
+    read_text,
+    schema_kind,
+)
 from tactile_bayes.options import TrialSettings
 from tactile_bayes.scans import Scan
 
@@ -68,8 +76,7 @@ def parse_record(document: object, kind: type[T], *, path: Path) -> T:
     kind_expected = schema_kind(schema)
     kind_read = schema_kind(document.get("schema")) if isinstance(document, dict) else ""
     if kind_expected and kind_read and kind_read != kind_expected:
-        way_out = WAYS.get((kind_read, kind_expected), f"give {kind_expected}")
-        raise BadDataError(f"is {kind_read}, not {kind_expected}", way_out=way_out, path=str(path))
+        raise of_another_kind(path, kind_read, kind_expected, way_out=f"give {kind_expected}")
     if schema and isinstance(document, dict) and document.get("schema", schema) != schema:
         raise BadDataError(f"schema is {short_repr(document['schema'])}", way_out=f"give {schema!r}", path=str(path))
     with in_file(path):
@@ -242,8 +249,8 @@ def read_session(path: Path) -> dict[str, str]:
     for key in SET_BY_RECORDING:
         if key in document:
             raise BadDataError(f"{key} is set by the recording itself", way_out=f"leave {key} out", path=str(path))
+    known = set(names_of(Session)).difference(SET_BY_RECORDING)
     for key in document:
-        known = {*names_of(Session)}.difference(SET_BY_RECORDING)
         near = ["side"] if key in ("breast", "laterality") else difflib.get_close_matches(key, known, n=1, cutoff=0.8)
         if near and near[0] not in document:
             raise BadDataError(f"{key} is not known", way_out=f"did you mean {near[0]}?", path=str(path))

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import BadDataError, in_file, suggestion
 from tactile_bayes.files.arrays_layout import KNOWN, LAYOUT, OPTIONAL, ArrayMap, Stated, in_words
-from tactile_bayes.files.instrument import read_array_calibration, read_head_geometry, read_landmarks
+from tactile_bayes.files.instrument import LEAST_STERNUM_MM, read_array_calibration, read_head_geometry, read_landmarks
 from tactile_bayes.files.named_arrays import Source, is_text, plain_names, read_named
 from tactile_bayes.files.npz import Arrays
 from tactile_bayes.files.reading import kind_of
@@ -494,7 +494,7 @@ def _check_units(arrays: Arrays, *, calibrated: bool) -> None:
         raise BadDataError(what, way_out=f"{metres} or their unit, --length-unit m or inch")
     if "landmarks_mm" in arrays:
         apart = float(np.linalg.norm(arrays["landmarks_mm"][0] - arrays["landmarks_mm"][1]))
-        if apart < 10.0:
+        if apart < LEAST_STERNUM_MM:
             raise BadDataError(f"the points of landmarks_mm are {apart:.4g} apart", way_out=metres)
     if "nipple_mm" in arrays:
         if "landmarks_mm" not in arrays:

@@ -167,6 +167,9 @@ class ArrayCalibrationFile(Record, eq=False, kw_only=True):
         return ElementCalibration(self.gain_kpa_per_count, self.offset_kpa, self.saturation_count)
 
 
+LEAST_STERNUM_MM: Final = 10.0  #: From sternal notch to xiphoid: nobody has less.
+
+
 class LandmarksFile(Record, kw_only=True):
     """Landmarks touched before a scan, in `base`."""
 
@@ -176,7 +179,7 @@ class LandmarksFile(Record, kw_only=True):
     nipple_mm: Triple | None = None  #: Nipple, mm; left out where it was not touched.
 
     def __post_init__(self) -> None:
-        if (apart := math.dist(self.sternal_notch_mm, self.xiphoid_mm)) < 10.0:
+        if (apart := math.dist(self.sternal_notch_mm, self.xiphoid_mm)) < LEAST_STERNUM_MM:
             what = f"sternal_notch_mm and xiphoid_mm are {apart:.4g} mm apart"
             raise BadDataError(what, way_out="looks like metres or inches, give mm")
 

@@ -156,7 +156,7 @@ def decoding(what: str, *, way_out: str) -> Iterator[None]:
         raise BadDataError(f"{what} ({why})", way_out=way_out) from None
 
 
-WAYS_OUT: Final = {
+_WAYS_OUT: Final = {
     **dict.fromkeys((errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP), "check the path"),
     **dict.fromkeys((errno.EACCES, errno.EPERM), "ask for the right to read it"),
     **dict.fromkeys((errno.EMFILE, errno.ENFILE), "close other programs: too many files are open"),
@@ -169,7 +169,7 @@ def readable(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        way_out = WAYS_OUT.get(error.errno or 0, "copy it to another disk and read it there")
+        way_out = _WAYS_OUT.get(error.errno or 0, "copy it to another disk and read it there")
         raise BadDataError(f"cannot be read ({error.strerror or error})", way_out=way_out, path=str(path)) from None
 
 
@@ -203,7 +203,7 @@ _DOCUMENTS = {
     "validate": "a trial report (JSON)",
     "plan": "a trial plan (JSON)",
 }
-WAYS = {
+_WAYS = {
     (_SCAN, _MAP): "build its map first: `tactile-bayes map {path} -o MAP.nc`",
     (_ARCHIVE, _SCAN): "bring it in first: `tactile-bayes import {path} -o SCAN.mcap`",
     (_ARCHIVE, _MAP): "bring it in first: `tactile-bayes import --help` says how",
@@ -245,7 +245,12 @@ def wrong_kind(path: Path, expected: str, *, what: str, way_out: str) -> BadData
     kind = kind_of(path)
     if not kind or kind == expected:
         return BadDataError(what, way_out=way_out, path=str(path))
-    remedy = WAYS.get((kind, expected), way_out).format(path=path)
+    return of_another_kind(path, kind, expected, way_out=way_out)
+
+
+def of_another_kind(path: Path, kind: str, expected: str, *, way_out: str) -> BadDataError:
+    """Error for a file of a `kind` other than `expected`, with the way from one to the other where there is one."""
+    remedy = _WAYS.get((kind, expected), way_out).format(path=path)
     return BadDataError(f"is {kind}, not {expected}", way_out=remedy, path=str(path))
 
 

@@ -37,18 +37,8 @@ _NAMES: Final[Mapping[str, str]] = {
     **dict.fromkeys(("roll", "ro", "rl"), "roll"),
     **dict.fromkeys(
         (
-            "time",
-            "t",
-            "zeit",
-            "timestamp",
-            "epoch",
-            "datetime",
-            "times",
-            "timems",
-            "timestampms",
-            "timeus",
-            "secs",
-            "seconds",
+            *("time", "t", "zeit", "timestamp", "epoch", "datetime"),
+            *("times", "timems", "timestampms", "timeus", "secs", "seconds"),
         ),
         "time",
     ),
@@ -129,8 +119,9 @@ def visible_poses(
 def is_identity(numbers: FloatArray, layout: str) -> BoolArray:
     """True for rows of the identity, which a server goes on sending while a tool is out of sight."""
     first_numbers, identity = numbers[:, :12], _IDENTITY[layout]
-    fits = first_numbers.shape[1] == len(identity)
-    return np.asarray((first_numbers == (identity if fits else np.nan)).all(axis=1))
+    if first_numbers.shape[1] != len(identity):
+        return np.zeros(len(first_numbers), dtype=bool)
+    return np.asarray((first_numbers == identity).all(axis=1))
 
 
 def choose_tool(names: Sequence[str], stated: Stated, *, place: str) -> str:

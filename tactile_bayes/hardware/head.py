@@ -312,8 +312,10 @@ def fit_array(steps: Sequence[BladderStep], *, saturation_count: int) -> ArrayFi
     good = ~(dead | hot)
     use = valid & good
     levels = np.median(counts[:, good], axis=1)
-    for i in np.flatnonzero(np.diff(levels) < -FALL_SHARE * np.ptp(levels))[:1].tolist():
-        what = f"the array reads less at {pressure[i + 1]:g} kPa than at {pressure[i]:g}"
+    falls = np.diff(levels) < -FALL_SHARE * np.ptp(levels)
+    if falls.any():
+        first = int(falls.argmax())
+        what = f"the array reads less at {pressure[first + 1]:g} kPa than at {pressure[first]:g}"
         raise BadDataError(what, way_out="check which step was recorded under which pressure")
     line = _polynomials(pressure, counts, use, degree=1)
     curve = _polynomials(pressure, counts, use, degree=2 if len(steps) >= STEPS_FOR_CURVATURE else 1)

@@ -426,16 +426,16 @@ class Recorder:
         if touch is None or not touch.add(reading):
             return
         self.touch, words, device_ns = None, str(touch), max(0, self._pose_ns)
-        for other in self._touched.values():
-            if other.name != touch.name and math.dist(other.position_mm, touch.position_mm) <= LEAST_APART_MM:
-                words += f"; not stored: this is the place of the {other.words}, touch both again"
-                break
+        others = [other for other in self._touched.values() if other.name != touch.name]
+        at_place = [one for one in others if math.dist(one.position_mm, touch.position_mm) <= LEAST_APART_MM]
+        if at_place:
+            words += f"; not stored: this is the place of the {at_place[0].words}, touch both again"
         else:
             self._touched[touch.name] = touch
             self.sink.add_landmark(touch.name, touch.position_mm, device_ns=device_ns, host_ns=max(0, host_ns))
             self.observer.landmark(touch.name, touch.position_mm)
         self.report.landmarks.append(words)
-        self._note(words, "tracker", device_ns, host_ns, serious=words != str(touch) or not touch.steady)
+        self._note(words, "tracker", device_ns, host_ns, serious=bool(at_place) or not touch.steady)
 
     def _note(self, text: str, device: str, device_ns: int, host_ns: int, *, serious: bool = True) -> None:
         self.sink.add_note(text, device=device, device_ns=device_ns, host_ns=max(0, host_ns), serious=serious)

@@ -34,6 +34,7 @@ from tactile_bayes.hardware.readings import (
     plausible,
     printable,
 )
+from tactile_bayes.shell import own_process
 
 # --- CRC-64 as OpenIGTLink uses it: polynomial of ECMA-182, initial value 0, nothing inverted or reflected.
 
@@ -457,7 +458,7 @@ class NdiPort(Port):
         if find_spec(MODULE) is None:
             raise DeviceError(f"{self.name}: needs the package ndicapi; pip install 'tactile-bayes[ndi]'")
         ours, theirs = socket.socketpair()
-        command = [sys.executable, "-P", "-m", __name__, str(theirs.fileno()), url, *map(str, roms)]
+        command = own_process(__name__, str(theirs.fileno()), url, *map(str, roms))
         self._process = subprocess.Popen(
             command,
             pass_fds=[theirs.fileno()],

@@ -176,8 +176,8 @@ _IF_EXAMS_REPEAT: Final = (
 def growths(patient: str, mass: str, visits: Sequence[str], report: CompareReport, link: str) -> list[Growth]:
     """Rows of one mass from its comparison; `visits` are codes in order of time."""
     if report.status != "compared":
-        told: dict[str, Any] = {"findings": report.findings, "link": link}
-        return [Growth(patient, mass, visits[0], visits[-1], report.status, report.reason, **told)]
+        ends = visits[0], visits[-1]
+        return [Growth(patient, mass, *ends, report.status, report.reason, findings=report.findings, link=link)]
     sizes = [visit.max_size_mm for visit in report.visits if visit.max_size_mm is not None]
     return [
         Growth(

@@ -124,9 +124,11 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
     site: SiteShift | None = None  #: Correction by a site's own phantoms.
 
     def __repr__(self) -> str:
-        site, of = self.site, self.source
-        of, cautions = (of, ()) if site is None else (f"{of}, corrected by {site.phantoms} phantoms", site.cautions)
-        return terms.calibration_words(type(self), f"{of}, lumps", self.recipe, self.domain, cautions)
+        corrected = "" if self.site is None else f", corrected by {self.site.phantoms} phantoms"
+        cautions = () if self.site is None else self.site.cautions
+        return terms.calibration_words(
+            type(self), f"{self.source}{corrected}, lumps", self.recipe, self.domain, cautions
+        )
 
     def at_fat(self, profiles: Sequence[tuple[float, ...] | None]) -> BodyCalibration:
         """The calibration for a mass whose maps have these `presets.HEAD_PROFILE`, None for a map without one.

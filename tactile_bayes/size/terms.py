@@ -17,6 +17,7 @@ from scipy.special import ndtri
 
 from tactile_bayes.declarations import Meta, Record, described, field
 from tactile_bayes.errors import Abstention, BadDataError
+from tactile_bayes.findings import LEADS
 from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
 from tactile_bayes.presets import HEAD_PROFILE, INTERVAL, Background, Noise
 from tactile_bayes.scans import HeadShape
@@ -125,7 +126,7 @@ class Recipe(Record):
 def calibration_words(kind: type, of: str, recipe: Recipe, domain: Domain, cautions: Sequence[str]) -> str:
     """A calibration in a line for notebooks: cautions, what it was learned from, range of sizes and recipe."""
     low, high = domain["d_mm"]
-    texts = [*(f"CAUTION: {text}." for text in cautions), f"{of} of {low:.3g} to {high:.3g} mm; {recipe}"]
+    texts = [*(f"{LEADS['caution']}{text}." for text in cautions), f"{of} of {low:.3g} to {high:.3g} mm; {recipe}"]
     return f"<{kind.__name__} {' '.join(texts)}>"
 
 
