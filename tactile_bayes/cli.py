@@ -13,17 +13,8 @@ from collections.abc import Iterable
 
 import click
 
-from tactile_bayes import __version__
+from tactile_bayes import __version__, shell
 from tactile_bayes.errors import EXIT_FAULT, EXIT_INTERRUPTED, EXIT_READER_GONE, EXIT_USAGE, TactileBayesError
-from tactile_bayes.shell import (
-    LEAST_COLUMNS,
-    ReaderGoneError,
-    interrupt_on_signals,
-    protect_streams,
-    raw_stream,
-    release_streams,
-    terminal_columns,
-)
 
 _HYPHEN = "\ue000"  # Replaces a hyphen while lines are wrapped: "--array-calibration" is a word to copy.
 
@@ -33,8 +24,8 @@ class UnbrokenHelp(click.HelpFormatter):
 
     def __init__(self, indent_increment: int = 2, width: int | None = None, max_width: int | None = None) -> None:
         super().__init__(indent_increment, width, max_width)  # never below 50 columns
-        if columns := terminal_columns(raw_stream(sys.stdout)):
-            self.width = min(self.width, max(columns, LEAST_COLUMNS) - 2)
+        if columns := shell.terminal_columns(shell.raw_stream(sys.stdout)):
+            self.width = min(self.width, max(columns, shell.LEAST_COLUMNS) - 2)
 
     def write(self, string: str) -> None:
         super().write(string.replace(_HYPHEN, "-"))
@@ -155,13 +146,13 @@ def main() -> None:
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C would change the exit code
     # The matrices here are small: more threads cost CPU and gain nothing, and workers would fight over the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    protect_streams()
+    shell.protect_streams()
     try:
-        with interrupt_on_signals():
+        with shell.interrupt_on_signals():
             status = _run()
     except KeyboardInterrupt:  # a second one, while the first was handled
         status = EXIT_INTERRUPTED
-    release_streams()
+    shell.release_streams()
     sys.exit(status)
 
 
@@ -181,7 +172,7 @@ def _run() -> int:
     except TactileBayesError as error:
         click.echo(f"error: {error}", err=True)
         return error.exit_code
-    except ReaderGoneError:
+    except shell.ReaderGoneError:
         return EXIT_READER_GONE
     except (OSError, MemoryError) as error:
         if _folder_gone():

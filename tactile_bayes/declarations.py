@@ -130,8 +130,7 @@ def meaning_of(kind: Any) -> str:
 
 def extra_of(kind: Any) -> Mapping[str, Any]:
     """The dictionary of a kind's ``Meta(extra=...)``; empty without one."""
-    extra: Mapping[str, Any] = _rules(kind).get("extra", {})
-    return extra
+    return dict(_rules(kind).get("extra", {}))
 
 
 def subrecord(record: Any, names: Sequence[str], meaning: str) -> Any:
@@ -150,17 +149,16 @@ def set_fields(record: Any, **values: Any) -> None:
 
 def names_of(kind: Any) -> tuple[str, ...]:
     """Names of the fields of a record, or of a data class."""
-    names: tuple[str, ...] = getattr(kind, "__struct_fields__", None) or tuple(kind.__dataclass_fields__)
-    return names
+    return tuple(getattr(kind, "__struct_fields__", None) or kind.__dataclass_fields__)
 
 
 def as_dict(record: Any) -> dict[str, Any]:
     """A record's values by name, nested records and data classes as dictionaries too; for JSON see `to_plain`."""
-    return {name: _map_values(getattr(record, name), _value_as_dict) for name in names_of(record)}
 
+    def plain(value: Any) -> Any:
+        return as_dict(value) if isinstance(value, msgspec.Struct) or dataclasses.is_dataclass(value) else value
 
-def _value_as_dict(value: Any) -> Any:
-    return as_dict(value) if isinstance(value, msgspec.Struct) or dataclasses.is_dataclass(value) else value
+    return {name: _map_values(getattr(record, name), plain) for name in names_of(record)}
 
 
 def _map_values(value: Any, function: Callable[[Any], Any], *, lists: bool = False) -> Any:

@@ -6,30 +6,21 @@ from typing import get_args
 
 import click
 
-from tactile_bayes.commands.options import (
-    FORCE,
-    SPEED,
-    FilePath,
-    FiniteRange,
-    WholeRange,
-    command,
-    number_option,
-    output_option,
-    record_options,
-)
+from tactile_bayes.commands import options
 from tactile_bayes.declarations import names_of
 from tactile_bayes.options import FaultOptions, RecordOptions
 from tactile_bayes.presets import TrackerProtocol
 
+_FILE = options.FilePath()
 _RECORDING = names_of(RecordOptions)[2:-1]  #: Between the output with the head's port and `FORCE`.
 PROTOCOLS = get_args(TrackerProtocol)
 
 
-@command("record", "record.record_action")
-@output_option("SCAN.mcap", "MCAP", "Scan file to write.", required=True)
+@options.command("record", "record.record_action")
+@options.output_option("SCAN.mcap", "MCAP", "Scan file to write.", required=True)
 @click.option("--head", "head_url", required=True, metavar="URL", help="Port of the scan head.")
-@record_options(RecordOptions, *_RECORDING)
-@FORCE
+@options.record_options(RecordOptions, *_RECORDING)
+@options.FORCE
 def record_command() -> None:
     """Record a scan head and a tracker.
 
@@ -41,9 +32,9 @@ def record_command() -> None:
     """
 
 
-@command("emulate", "devices.emulate_action")
+@options.command("emulate", "devices.emulate_action")
 @click.argument("kind", metavar="head|tracker|both", type=click.Choice(["head", "tracker", "both"]))
-@click.argument("scan", metavar="SCAN.mcap", type=FilePath())
+@click.argument("scan", metavar="SCAN.mcap", type=_FILE)
 @click.option(
     "--protocol", type=click.Choice(PROTOCOLS), default="open", show_default=True, help="Protocol of the tracker."
 )
@@ -56,11 +47,11 @@ def record_command() -> None:
 @click.option(
     "--once", is_flag=True, help="End when the scan has been sent and read. Default: wait for the next start."
 )
-@SPEED
-@record_options(FaultOptions, "drop", "corrupt", "stall", "disconnect_s", show_default=False)
-@record_options(FaultOptions, "hold")
-@record_options(FaultOptions, "hide", "breathe_mm", show_default=False)
-@click.option("--seed", type=WholeRange(min=0), default=1, show_default=True, help="Random seed of the faults.")
+@options.SPEED
+@options.record_options(FaultOptions, "drop", "corrupt", "stall", "disconnect_s", show_default=False)
+@options.record_options(FaultOptions, "hold")
+@options.record_options(FaultOptions, "hide", "breathe_mm", show_default=False)
+@click.option("--seed", type=options.WholeRange(min=0), default=1, show_default=True, help="Random seed of the faults.")
 def emulate_command() -> None:
     """Serve a scan as a scan head or a tracker would send it, or as both, at its own rate, with faults on request.
 
@@ -75,7 +66,7 @@ def emulate_command() -> None:
     """
 
 
-@command("devices", "devices.devices_action")
+@options.command("devices", "devices.devices_action")
 @click.option(
     "--probe",
     "url",
@@ -85,14 +76,14 @@ def emulate_command() -> None:
 @click.option(
     "--pivot", "pivot_url", metavar="URL", help="Check for inverse rotations: turn this tracker about a fixed point."
 )
-@record_options(
+@options.record_options(
     RecordOptions,
     "tracker_protocol",
     metavar="PROTOCOL",
     help=f"Protocol of the tracker to rotate: {', '.join(PROTOCOLS)}.",
 )
-@record_options(RecordOptions, "tool")
-@number_option("--duration", FiniteRange(min=0.2), 10.0, "Time to rotate it, s.", metavar="S")
+@options.record_options(RecordOptions, "tool")
+@options.number_option("--duration", options.FiniteRange(min=0.2), 10.0, "Time to rotate it, s.", metavar="S")
 def devices_command() -> None:
     """List the serial ports and the devices that are probably on them.
 
@@ -103,12 +94,12 @@ def devices_command() -> None:
     """
 
 
-@command("replay", "devices.replay_action")
-@click.argument("scan", metavar="SCAN.mcap", type=FilePath())
-@output_option("OUT.mcap", "MCAP", "Save what is recorded.")
-@record_options(RecordOptions, "live", "serve", "size_calibration")
-@SPEED
-@FORCE
+@options.command("replay", "devices.replay_action")
+@click.argument("scan", metavar="SCAN.mcap", type=_FILE)
+@options.output_option("OUT.mcap", "MCAP", "Save what is recorded.")
+@options.record_options(RecordOptions, "live", "serve", "size_calibration")
+@options.SPEED
+@options.FORCE
 def replay_command() -> None:
     """Replay a scan through emulated devices, recorder and live view, as if it were being recorded.
 
@@ -116,10 +107,10 @@ def replay_command() -> None:
     """
 
 
-@command("repair", "devices.repair_action")
-@click.argument("scan", metavar="SCAN.mcap", type=FilePath())
-@output_option("OUT.mcap", "MCAP", "Write to this file instead of replacing SCAN.mcap.")
-@FORCE
+@options.command("repair", "devices.repair_action")
+@click.argument("scan", metavar="SCAN.mcap", type=_FILE)
+@options.output_option("OUT.mcap", "MCAP", "Write to this file instead of replacing SCAN.mcap.")
+@options.FORCE
 def repair_command() -> None:
     """Repair a scan that was cut off or damaged: keep what is intact, report what is lost.
 

@@ -9,25 +9,17 @@ from typing import Final
 import click
 
 from tactile_bayes.api.settings import Settings
-from tactile_bayes.commands.options import (
-    FORCE,
-    JSON,
-    SESSION,
-    FilePath,
-    command,
-    figure_option,
-    output_option,
-    path_option,
-    record_options,
-)
+from tactile_bayes.commands import options
 from tactile_bayes.files.arrays_layout import GridOptions, Stated, layout_lines
 from tactile_bayes.options import IdentityOptions, MapOptions, RecordOptions
 from tactile_bayes.presets import CORRECTIONS, METHODS
 
+_FILE = options.FilePath()
 
-@command("demo", "exam.demo_action")
-@output_option("DIR", None, "Folder for the files.", default=Path("tactile-bayes-demo"), show_default=True)
-@record_options(
+
+@options.command("demo", "exam.demo_action")
+@options.output_option("DIR", None, "Folder for the files.", default=Path("tactile-bayes-demo"), show_default=True)
+@options.record_options(
     Settings, "method", type=click.Choice(METHODS[:3]), help="Method of the first estimate; see `estimate --help`."
 )
 @click.option("--force", is_flag=True, help="Overwrite the files of an earlier demo.")
@@ -41,16 +33,16 @@ def demo_command() -> None:
     """
 
 
-@command("import", "bring_in.import_action")
-@click.argument("sources", metavar="SRC...", nargs=-1, type=FilePath())
-@click.option("-o", "--output", type=FilePath(), help="File to write: .mcap or .nc; of several SRC, the folder.")
+@options.command("import", "bring_in.import_action")
+@click.argument("sources", metavar="SRC...", nargs=-1, type=_FILE)
+@click.option("-o", "--output", type=_FILE, help="File to write: .mcap or .nc; of several SRC, the folder.")
 @click.option(
     "--as",
     "kind",
     type=click.Choice(["scan", "map"]),
     help="Kind of SRC. Default: as the output's suffix says; a table or image without a scan's options is a map.",
 )
-@record_options(GridOptions)
+@options.record_options(GridOptions)
 @click.option(
     "--correct",
     "corrections",
@@ -65,12 +57,12 @@ def demo_command() -> None:
     is_flag=True,
     help="Print a MAP.toml for --columns, with the arrays of SRC and guesses by their shapes.",
 )
-@path_option("--columns", "MAP.toml", "Scan: names of the arrays in SRC.")
-@path_option("--poses", "FILE", "Scan: the tracker's poses, in a table of their own.")
-@record_options(RecordOptions, "head_geometry", "array_calibration", "landmarks")
-@record_options(Stated)
-@SESSION
-@FORCE
+@options.path_option("--columns", "MAP.toml", "Scan: names of the arrays in SRC.")
+@options.path_option("--poses", "FILE", "Scan: the tracker's poses, in a table of their own.")
+@options.record_options(RecordOptions, "head_geometry", "array_calibration", "landmarks")
+@options.record_options(Stated)
+@options.SESSION
+@options.FORCE
 def import_command() -> None:
     """Import scans, grids and images from other programs.
 
@@ -97,15 +89,15 @@ _ARRAYS = "\n".join([_ARRAYS_HEADING, "", "\b", *layout_lines(), "", _OTHER_ARRA
 import_command.help = f"{cleandoc(import_command.help or '')}\n\n{_ARRAYS}"
 
 
-@command("check", "exam.check_action")
-@click.argument("scans", nargs=-1, required=True, metavar="SCAN...", type=FilePath())
-@record_options(MapOptions, "pressure_window_kpa")
-@output_option(
+@options.command("check", "exam.check_action")
+@click.argument("scans", nargs=-1, required=True, metavar="SCAN...", type=_FILE)
+@options.record_options(MapOptions, "pressure_window_kpa")
+@options.output_option(
     "HEAD.json",
     None,
     "Write the scan's head with the day of this check, where the scan shows that it is right; for --head-geometry.",
 )
-@FORCE
+@options.FORCE
 def check_command() -> None:
     """Check that array, lever arm and quaternions of scans are as they are stated.
 
@@ -117,9 +109,9 @@ def check_command() -> None:
     """
 
 
-@command("show", "show.show_action")
-@click.argument("file", type=FilePath())
-@JSON
+@options.command("show", "show.show_action")
+@click.argument("file", type=_FILE)
+@options.JSON
 def show_command() -> None:
     """Show what a file holds: schema, shape, units, quality, provenance.
 
@@ -133,19 +125,19 @@ def show_command() -> None:
 _FORMATS: Final = ("dicom", "fhir", "nrrd", "csv")
 
 
-@command("export", "pages.export_action")
-@click.argument("files", metavar="FILE...", nargs=-1, type=FilePath())
+@options.command("export", "pages.export_action")
+@click.argument("files", metavar="FILE...", nargs=-1, type=_FILE)
 @click.option("--to", required=True, type=click.Choice(_FORMATS), help="Format to write.")
-@output_option("OUT", None, "File to write; for dicom the folder of the files.")
-@path_option(
+@options.output_option("OUT", None, "File to write; for dicom the folder of the files.")
+@options.path_option(
     "--worklist",
     "ITEM",
     "Patient and study from a modality worklist item (.dcm or DICOM JSON), or from JSON of plain keys.",
 )
 @click.option("--patient-id-from-scan", is_flag=True, help="Use the scan's subject code as the patient ID.")
-@record_options(IdentityOptions)
-@path_option("--dictionary", "DICT.csv", "With csv: write the data dictionary of the REDCap form.")
-@FORCE
+@options.record_options(IdentityOptions)
+@options.path_option("--dictionary", "DICT.csv", "With csv: write the data dictionary of the REDCap form.")
+@options.FORCE
 def export_command() -> None:
     """Export maps and estimates as DICOM, FHIR, NRRD (3D Slicer) or CSV (REDCap).
 
@@ -157,13 +149,13 @@ def export_command() -> None:
     """
 
 
-@command("diagnose", "exam.diagnose_action")
-@click.argument("posterior", metavar="POST.nc", type=FilePath())
-@figure_option("Draw densities and traces.", "--trace")
-@figure_option("Draw the ranks of each chain's draws among all.", "--rank")
-@figure_option("Draw the pairs of sizes, amplitude and widths.", "--corner")
-@JSON
-@FORCE
+@options.command("diagnose", "exam.diagnose_action")
+@click.argument("posterior", metavar="POST.nc", type=_FILE)
+@options.figure_option("Draw densities and traces.", "--trace")
+@options.figure_option("Draw the ranks of each chain's draws among all.", "--rank")
+@options.figure_option("Draw the pairs of sizes, amplitude and widths.", "--corner")
+@options.JSON
+@options.FORCE
 def diagnose_command() -> None:
     """Check the draws of a posterior: R-hat, effective draws and Monte-Carlo errors of every size and width.
 

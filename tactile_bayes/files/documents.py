@@ -15,15 +15,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 from tactile_bayes.declarations import Meta, Record, field, from_plain, names_of, replace, schema_name, short_repr
 from tactile_bayes.errors import BadDataError, in_file, suggestion
-from tactile_bayes.files.reading import (
-    JSON_BYTES,
-    TOML_BYTES,
-    decoding,
-    kind_of,
-    of_another_kind,
-    read_text,
-    schema_kind,
-)
+from tactile_bayes.files import reading
 from tactile_bayes.options import TrialSettings
 from tactile_bayes.scans import Scan
 
@@ -73,10 +65,10 @@ def read_toml_record(path: Path, kind: type[T], *, way_out: str) -> T:
 def parse_record(document: object, kind: type[T], *, path: Path) -> T:
     """Make a record of plain data; for the errors see `read_record`."""
     schema = schema_name(kind)
-    kind_expected = schema_kind(schema)
-    kind_read = schema_kind(document.get("schema")) if isinstance(document, dict) else ""
+    kind_expected = reading.schema_kind(schema)
+    kind_read = reading.schema_kind(document.get("schema")) if isinstance(document, dict) else ""
     if kind_expected and kind_read and kind_read != kind_expected:
-        raise of_another_kind(path, kind_read, kind_expected, way_out=f"give {kind_expected}")
+        raise reading.of_another_kind(path, kind_read, kind_expected, way_out=f"give {kind_expected}")
     if schema and isinstance(document, dict) and document.get("schema", schema) != schema:
         raise BadDataError(f"schema is {short_repr(document['schema'])}", way_out=f"give {schema!r}", path=str(path))
     with in_file(path):
@@ -86,9 +78,9 @@ def parse_record(document: object, kind: type[T], *, path: Path) -> T:
 def load_json(path: Path, *, way_out: str = "give a file this program wrote") -> object:
     """Read a JSON file of any content. Too large, too deep or a number that no double holds is an error."""
     try:
-        return parse_json(read_text(path, most=JSON_BYTES, way_out=way_out), way_out=way_out)
+        return parse_json(reading.read_text(path, most=reading.JSON_BYTES, way_out=way_out), way_out=way_out)
     except BadDataError as error:
-        kind = kind_of(path)
+        kind = reading.kind_of(path)
         if kind and not kind.endswith("(JSON)"):
             raise BadDataError(f"is {kind}, not a JSON file", way_out=way_out, path=str(path)) from None
         raise error.with_path(path) from None
@@ -96,7 +88,7 @@ def load_json(path: Path, *, way_out: str = "give a file this program wrote") ->
 
 def parse_json(text: str, *, name: str = "", way_out: str = "copy the file again") -> object:
     """Parse a JSON text as `load_json` does; `name` is the part of a file that the text is, empty for a whole file."""
-    with decoding(f"{name} is not JSON".lstrip(), way_out=way_out):
+    with reading.decoding(f"{name} is not JSON".lstrip(), way_out=way_out):
         document: object = json.loads(text, object_pairs_hook=partial(_object, way_out=way_out))
     check_plain(document, way_out=way_out, name=name)
     return document
@@ -114,7 +106,7 @@ def _object(pairs: list[tuple[str, Any]], *, way_out: str) -> dict[str, Any]:
 def load_toml(path: Path, *, way_out: str) -> dict[str, Any]:
     """Read a TOML file. Too large, too deep or a number that no double holds is an error."""
     with in_file(path):
-        return parse_toml(read_text(path, most=TOML_BYTES, way_out=way_out), way_out=way_out)
+        return parse_toml(reading.read_text(path, most=reading.TOML_BYTES, way_out=way_out), way_out=way_out)
 
 
 def parse_toml(text: str, *, way_out: str) -> dict[str, Any]:
@@ -123,7 +115,7 @@ def parse_toml(text: str, *, way_out: str) -> dict[str, Any]:
     if long:
         line = text.count("\n", 0, long.start()) + 1
         raise BadDataError(f"line {line}: a key of more than {MOST_KEY_PARTS} parts", way_out=way_out)
-    with decoding("is not TOML", way_out=way_out):
+    with reading.decoding("is not TOML", way_out=way_out):
         document = tomllib.loads(text)
     check_plain(document, way_out=way_out)
     return document

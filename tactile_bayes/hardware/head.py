@@ -15,7 +15,7 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, DeviceError
 from tactile_bayes.geometry import FloatArray, rotation_from_quaternion
 from tactile_bayes.hardware import readings
-from tactile_bayes.scans import ElementCalibration
+from tactile_bayes.scans import CountArray, ElementCalibration
 
 # --- The open framing of scan heads: COBS between zero bytes, version, type, sequence, device time, checksum.
 #
@@ -89,16 +89,10 @@ def encode_packet(kind: int, payload: bytes, *, sequence: int = 0, device_us: in
 class PacketParser(readings.Parser):
     """Parser of packets; skips and counts garbage: failed checksums, invalid codes, noise."""
 
-    def __init__(self) -> None:
-        self._rest = b""
-
     def packets(self, data: bytes) -> list[Packet]:
         """Parse `data`; return the packets completed by it."""
-        *parts, self._rest = (self._rest + data).split(b"\0")
-        if len(self._rest) > _LONGEST:
-            self.garbage_bytes += len(self._rest)
-            self._rest = b""
-        return [packet for part in parts if part and (packet := self._decode(part)) is not None]
+        parts = filter(None, self._parts(data, b"\0", _LONGEST))
+        return [packet for part in parts if (packet := self._decode(part)) is not None]
 
     def _decode(self, part: bytes) -> Packet | None:
         body = cobs_decode(part) if len(part) <= _LONGEST else None
@@ -142,7 +136,7 @@ def encode_hello(hello: readings.HelloReading) -> bytes:
     return encode_packet(HELLO, numbers + name)
 
 
-def encode_frame(counts: readings.CountArray, *, sequence: int, device_us: int) -> bytes:
+def encode_frame(counts: CountArray, *, sequence: int, device_us: int) -> bytes:
     """Encode one (rows, columns) frame row by row."""
     return encode_packet(FRAME, counts.astype("<u2").tobytes(), sequence=sequence, device_us=device_us)
 
@@ -176,7 +170,6 @@ class HeadParser(PacketParser):
     """Parser of a device in the open framing, head or tracker."""
 
     def __init__(self, hello: readings.HelloReading | None = None, *, every: int = 1) -> None:
-        super().__init__()
         self.hello = hello
         self._every = every
         self._expected: int | None = None
@@ -268,7 +261,7 @@ class BladderStep(Record, eq=False):
     saturated: NDArray[np.bool_]  #: (rows, columns) bool array: Taxels that reached full scale in any frame.
 
     @classmethod
-    def from_frames(cls, pressure_kpa: float, frames: readings.CountArray, *, saturation_count: int) -> BladderStep:
+    def from_frames(cls, pressure_kpa: float, frames: CountArray, *, saturation_count: int) -> BladderStep:
         """Average the frames of a step."""
         if not np.isfinite(pressure_kpa) or pressure_kpa < 0:
             raise BadDataError(f"a step of {pressure_kpa} kPa", way_out="give the bladder's pressure, 0 or more")

@@ -28,13 +28,13 @@ from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import BoolArray, FloatArray, Plane, apply, patient_from_plane
 from tactile_bayes.hardware.ports import PIPE_BYTES
-from tactile_bayes.hardware.readings import CountArray, PoseReading
+from tactile_bayes.hardware.readings import PoseReading
 from tactile_bayes.hardware.recorder import Observer, RecordingReport
 from tactile_bayes.mapping.accumulate import MapAccumulator
 from tactile_bayes.mapping.cells import FramePoses, HeadMoments, distinct_poses, head_moments, poses_at
 from tactile_bayes.mapping.map import TactileMap, orientation_of
 from tactile_bayes.presets import PRESSURE_WINDOW_KPA
-from tactile_bayes.scans import ElementCalibration, HeadGeometry, TrackerPoses
+from tactile_bayes.scans import CountArray, ElementCalibration, HeadGeometry, TrackerPoses
 
 # --- Feed of a recording to its live view, through a pipe on which the recorder never waits.
 #

@@ -7,14 +7,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
+from tactile_bayes.scans import CountArray
 
 # --- Device readings, independent of the protocol: frames, poses, identity and end of transmission.
 
-CountArray = NDArray[np.uint16]
 Quaternion = tuple[float, float, float, float]
-MM_PER_INCH: Final = 25.4
 NO_ROTATION: Final = "no rotation"  #: Reason for a missing pose whose numbers are no position with a rotation.
 
 
@@ -72,10 +69,19 @@ class Parser:
     fault = ""  #: Fault of the last record that could not be read; empty where nothing looked like a record.
     remark = ""  #: Remark on the records that were read; empty where they are as they should be.
     garbage_bytes = 0  #: Number of bytes so far that belong to no valid record.
+    _rest = b""  #: Bytes that do not make a whole record yet.
 
     def feed(self, data: bytes) -> list[Reading]:
         """Parse `data`; return the completed readings."""
         raise NotImplementedError
+
+    def _parts(self, data: bytes, end: bytes, longest: int) -> list[bytes]:
+        """The parts of a line that `data` completes, each without its `end`; a longer one is noise, and dropped."""
+        *parts, self._rest = (self._rest + data).split(end)
+        if len(self._rest) > longest:
+            self.garbage_bytes += len(self._rest)
+            self._rest = b""
+        return parts
 
 
 class RecordParser(Parser):
@@ -85,7 +91,7 @@ class RecordParser(Parser):
     """
 
     def __init__(self, record_bytes: int, read: Callable[[bytes], PoseReading | None]) -> None:
-        self.record_bytes, self._read, self._rest = record_bytes, read, b""
+        self.record_bytes, self._read = record_bytes, read
 
     def feed(self, data: bytes) -> list[Reading]:
         buffer, index, size = self._rest + data, 0, self.record_bytes

@@ -14,21 +14,10 @@ from typing import Final
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import DeviceError, UsageError
-from tactile_bayes.hardware import head
+from tactile_bayes.hardware import head, readings
 from tactile_bayes.hardware.ports import ANSWER_S, SILENT_S, Port, preview
-from tactile_bayes.hardware.readings import (
-    MM_PER_INCH,
-    NO_ROTATION,
-    HelloReading,
-    MissingReading,
-    Parser,
-    PoseReading,
-    Reading,
-    RecordParser,
-    ToolReading,
-    plausible,
-)
 from tactile_bayes.hardware.trackers import ASK_FOR_TDATA, NAME_BYTES, IgtlinkParser, NdiPort, encode_transform
+from tactile_bayes.presets import MM_PER_UNIT
 
 # --- Records of Ascension Flock of Birds and miniBIRD trackers, position and quaternion, by the standard transmitter.
 #
@@ -39,7 +28,7 @@ _SCALE_INCH: Final = 36.0
 _BIRD_BYTES: Final = 14
 
 
-def _bird_pose(record: bytes) -> PoseReading | None:
+def _bird_pose(record: bytes) -> readings.PoseReading | None:
     if not record[0] & 0x80 or any(byte & 0x80 for byte in record[1:]):
         return None
     words = ((record[i] & 0x7F) << 2 | record[i + 1] << 9 for i in range(0, _BIRD_BYTES, 2))  # two bits are not sent
@@ -84,7 +73,7 @@ _LIBERTY_TEXT: Final = re.compile(rb"([ 0]\d|1[0-6])([A-Za-z ])")  # station, er
 _NUMBER: Final = re.compile(rb"[+-]?\d+(\.\d*)?([eE][+-]?\d+)?")
 
 
-def _fastrak_pose(record: bytes) -> PoseReading | None:
+def _fastrak_pose(record: bytes) -> readings.PoseReading | None:
     station, error = record[1] - 48, record[2:3]
     if record[:1] != b"0" or not 1 <= station <= 4 or not (error.isalpha() or error == b" "):
         return None
@@ -104,7 +93,7 @@ def _columns(text: bytes) -> tuple[float, ...] | None:
     return tuple(float(cell.replace(b" ", b"")) for cell in cells)
 
 
-def _liberty_pose(record: bytes) -> PoseReading | None:
+def _liberty_pose(record: bytes) -> readings.PoseReading | None:
     tag, station, command, error, _, size, *values, time_ms, distortion = LIBERTY.unpack_from(record)
     fits = abs(size - LIBERTY.size + LIBERTY_HEADER_BYTES) <= 2
     if tag not in _TAGS or not 1 <= station <= 16 or command not in b"CP" or not fits or record[-1:] != b" ":
@@ -112,19 +101,12 @@ def _liberty_pose(record: bytes) -> PoseReading | None:
     return _pose(values, str(station), bytes([error]), time_ms, distortion)
 
 
-class LibertyAsciiParser(Parser):
+class LibertyAsciiParser(readings.Parser):
     """Parser of LIBERTY and PATRIOT text records: station, error, then numbers between spaces."""
 
-    def __init__(self) -> None:
-        self._rest = b""
-
-    def feed(self, data: bytes) -> list[Reading]:
-        *lines, self._rest = (self._rest + data).split(b"\n")
-        if len(self._rest) > _LONGEST_LINE:
-            self.garbage_bytes += len(self._rest)
-            self._rest = b""
-        poses: list[Reading] = []
-        for line in lines:
+    def feed(self, data: bytes) -> list[readings.Reading]:
+        poses: list[readings.Reading] = []
+        for line in self._parts(data, b"\n", _LONGEST_LINE):
             pose = self._line(line.rstrip(b"\r"))
             if pose is None:
                 self.garbage_bytes += len(line) + 1
@@ -132,7 +114,7 @@ class LibertyAsciiParser(Parser):
                 poses.append(pose)
         return poses
 
-    def _line(self, line: bytes) -> PoseReading | None:
+    def _line(self, line: bytes) -> readings.PoseReading | None:
         prefix, words = _LIBERTY_TEXT.match(line), line[3:].split()
         if prefix is None or len(words) != _WORDS_LIBERTY or not all(map(_NUMBER.fullmatch, words)):
             return None
@@ -144,16 +126,16 @@ class LibertyAsciiParser(Parser):
 
 def _pose(
     values: Sequence[float], tool: str, error: bytes = b" ", time_ms: int | None = None, distortion: int = 0
-) -> PoseReading | None:
+) -> readings.PoseReading | None:
     """Pose from a position in inches and a quaternion; None for numbers that cannot be one. A space means no error."""
-    x, y, z = (number * MM_PER_INCH for number in values[:3])
+    x, y, z = (number * MM_PER_UNIT["in"] for number in values[:3])
     w, i, j, k = values[3:]
-    if not plausible((x, y, z), (w, i, j, k)):
+    if not readings.plausible((x, y, z), (w, i, j, k)):
         return None
     flags: tuple[str, ...] = ("" if error == b" " else f"error {error.decode() if error.isalpha() else error[0]}",)
     flags += (f"distortion {distortion}" if distortion else "",)
     device_ns = None if time_ms is None else time_ms * 1_000_000
-    return PoseReading((x, y, z), (w, i, j, k), device_ns, tuple(filter(None, flags)), tool)
+    return readings.PoseReading((x, y, z), (w, i, j, k), device_ns, tuple(filter(None, flags)), tool)
 
 
 # --- Records as the devices of these drivers send them.
@@ -161,16 +143,16 @@ def _pose(
 PROTOCOLS: Final = ("fastrak", "fastrak-ascii", "liberty", "liberty-ascii", "bird", "open", "igtlink")
 
 
-def encode_record(protocol: str, pose: ToolReading, number: int) -> bytes:
+def encode_record(protocol: str, pose: readings.ToolReading, number: int) -> bytes:
     """Encode a reading in one of `PROTOCOLS`; empty for a missing pose where the protocol cannot say so."""
     if protocol == "open":
         return head.encode_pose(pose, sequence=number)
     if protocol == "igtlink":
         return encode_transform(pose)
-    if not isinstance(pose, PoseReading):
+    if not isinstance(pose, readings.PoseReading):
         return b""
     station = int(pose.tool or 1)
-    numbers = (*(value / MM_PER_INCH for value in pose.position_mm), *pose.quaternion_wxyz)
+    numbers = (*(value / MM_PER_UNIT["in"] for value in pose.position_mm), *pose.quaternion_wxyz)
     time_ms = (pose.device_ns or 0) // 1_000_000 % 2**32
     match protocol:
         case "fastrak":
@@ -202,9 +184,9 @@ _BOOT_S: Final = 12.0
 class TrackerAnswer:
     """Answer of a tracker before a recording, read as records of one form; `parser` makes a parser of that form."""
 
-    def __init__(self, parser: Callable[[], Parser]) -> None:
+    def __init__(self, parser: Callable[[], readings.Parser]) -> None:
         self.parser, self.parsed = parser, parser()
-        self.hello: HelloReading | None = None
+        self.hello: readings.HelloReading | None = None
         self.tools: dict[str, str] = {}  #: By tool: why it has no pose now; empty where it has one.
         self.tool = ""
         self.reference: str | None = None
@@ -224,10 +206,10 @@ class TrackerAnswer:
     def feed(self, data: bytes) -> None:
         """Parse `data`."""
         for reading in self.parsed.feed(data):
-            if isinstance(reading, HelloReading):
+            if isinstance(reading, readings.HelloReading):
                 self.hello = reading
-            elif isinstance(reading, PoseReading | MissingReading) and len(self.tools) < _MOST_TOOLS:
-                why = reading.why if isinstance(reading, MissingReading) else ""
+            elif isinstance(reading, readings.PoseReading | readings.MissingReading) and len(self.tools) < _MOST_TOOLS:
+                why = reading.why if isinstance(reading, readings.MissingReading) else ""
                 self.tools[reading.tool] = self.tools.get(reading.tool, why) and why
 
 
@@ -236,14 +218,14 @@ class TrackerDriver(Record):
 
     title: str  #: Name of the device, for messages.
     baud: int  #: Default line rate.
-    parser: Callable[[], Parser]  #: Makes a parser of its records.
+    parser: Callable[[], readings.Parser]  #: Makes a parser of its records.
     configure: tuple[bytes, ...] = ()  #: Commands that set the form of records and the units, sent one by one.
     single: bytes = b""
     start: bytes = b""
     stop: bytes = b""  #: `single`, `start`, `stop`: Commands for one record, for a stream of them, and for its end.
     late: bytes = b""  #: Command to send where nothing comes without it.
     several: tuple[bytes, ...] = ()  #: Commands that add the tool to each record, sent where a tool is named.
-    other_parser: Callable[[], Parser] | None = None  #: Parser of the other form that the device may be set to.
+    other_parser: Callable[[], readings.Parser] | None = None  #: Of the other form that the device may be set to.
     silent_s: float = SILENT_S  #: Silence after which the device has gone; a server may send nothing of a hidden tool.
     hint: str = "check its power, cable and line rate"  #: Advice when nothing comes.
 
@@ -280,13 +262,13 @@ class TrackerDriver(Record):
             answers.sort(key=lambda answer: (not answer.came, answer.parsed.garbage_bytes))
             answered_at = answered_at or (time.monotonic() if answers[0].came else 0.0)
         answer = answers[0]
-        if not answer.came or (answer.tools and set(answer.tools.values()) == {NO_ROTATION}):
+        if not answer.came or (answer.tools and set(answer.tools.values()) == {readings.NO_ROTATION}):
             words = self._fault_words(answer.parsed, unasked, received, rate=port.has_line_rate)
             raise DeviceError(f"{port.name}: {words}")
         answer.tool, answer.reference = _choose_tools(answer.tools, tool, reference, port)
         return answer
 
-    def _fault_words(self, parser: Parser, unasked: bytes, received: bytes, *, rate: bool) -> str:
+    def _fault_words(self, parser: readings.Parser, unasked: bytes, received: bytes, *, rate: bool) -> str:
         """Words on the bytes that came instead of a record."""
         expected = f"a record of {self.title} was expected"
         if parser.fault:
@@ -343,13 +325,13 @@ def _open_framing(title: str, baud: int) -> TrackerDriver:
     return TrackerDriver(title, baud, head.HeadParser, (), ask, start, stop)
 
 
-def _fastrak(words: str, form: bytes, closing: bytes, parser: Callable[[], Parser]) -> TrackerDriver:
+def _fastrak(words: str, form: bytes, closing: bytes, parser: Callable[[], readings.Parser]) -> TrackerDriver:
     """Driver of a FASTRAK in one form of records; no command sets the items for all stations, so each is set."""
     items = [b"O%d,2,11,%b\r" % (station, closing) for station in range(1, 5)]
     return TrackerDriver(f"a Polhemus FASTRAK ({words})", 115_200, parser, (b"U", *items, form), b"P", b"C", b"c")
 
 
-def _liberty(words: str, form: bytes, closing: bytes, parser: Callable[[], Parser]) -> TrackerDriver:
+def _liberty(words: str, form: bytes, closing: bytes, parser: Callable[[], readings.Parser]) -> TrackerDriver:
     """Driver of a LIBERTY or PATRIOT in one form of records."""
     title = f"a Polhemus LIBERTY or PATRIOT ({words})"
     commands = (b"U0\r", form, b"O*,2,7,8,11,%b\r" % closing, b"Q0\r")
@@ -357,20 +339,20 @@ def _liberty(words: str, form: bytes, closing: bytes, parser: Callable[[], Parse
 
 
 TRACKERS: Final[dict[str, TrackerDriver]] = {
-    "fastrak": _fastrak("binary", b"f", b"0", partial(RecordParser, _FASTRAK_BYTES, _fastrak_pose)),
-    "fastrak-ascii": _fastrak("ASCII", b"F", b"1", partial(RecordParser, _FASTRAK_TEXT_BYTES, _fastrak_pose)),
-    "liberty": _liberty("binary", b"F1\r", b"0", partial(RecordParser, LIBERTY.size + 1, _liberty_pose)),
+    "fastrak": _fastrak("binary", b"f", b"0", partial(readings.RecordParser, _FASTRAK_BYTES, _fastrak_pose)),
+    "fastrak-ascii": _fastrak("ASCII", b"F", b"1", partial(readings.RecordParser, _FASTRAK_TEXT_BYTES, _fastrak_pose)),
+    "liberty": _liberty("binary", b"F1\r", b"0", partial(readings.RecordParser, LIBERTY.size + 1, _liberty_pose)),
     "liberty-ascii": _liberty("ASCII", b"F0\r", b"1", LibertyAsciiParser),
     "bird": TrackerDriver(
         "an Ascension Flock of Birds",
         115_200,
-        partial(RecordParser, _BIRD_BYTES, _bird_pose),
+        partial(readings.RecordParser, _BIRD_BYTES, _bird_pose),
         (b"]",),
         b"BB",  # two: only the second shows whether an address ended the first
         b"@",
         b"B",
         several=(b"P\x23\x01",),  # group mode
-        other_parser=partial(RecordParser, _BIRD_BYTES + 1, _bird_pose),
+        other_parser=partial(readings.RecordParser, _BIRD_BYTES + 1, _bird_pose),
     ),
     "open": _open_framing("a tracker in the open framing", head.DEFAULT_BAUD),
     "igtlink": TrackerDriver(
@@ -392,7 +374,7 @@ def open_tracker(protocol: str, url: str, *, baud: int | None = None, roms: Sequ
     return Port(url, baud=baud or TRACKERS[protocol].baud or 9600, role="tracker")
 
 
-def check_head(port: Port, *, every: int = 1) -> HelloReading:
+def check_head(port: Port, *, every: int = 1) -> readings.HelloReading:
     """Ask a head for its identity, and refuse a line too slow for its frames."""
     port.write(head.encode_command(head.STOP))
     received, parser, begun = port.drain(), head.HeadParser(), time.monotonic()
@@ -419,7 +401,7 @@ def _no_hello(parser: head.HeadParser, received: bytes, port: Port) -> str:
         line = "cable" if port.has_line_rate else "its server"
         return f"nothing came; check its power and {line}, and that this is the head's port"
     for driver in TRACKERS.values():
-        if any(isinstance(reading, PoseReading) for reading in driver.parser().feed(received)):
+        if any(isinstance(reading, readings.PoseReading) for reading in driver.parser().feed(received)):
             return f"records of {driver.title} came; give the port of the head"
     return f"{preview(received)} came ({len(received)} bytes); give its line rate with --head-baud, or the head's port"
 

@@ -21,19 +21,8 @@ import numpy as np
 
 from tactile_bayes.errors import DeviceError
 from tactile_bayes.geometry import quaternion_from_rotation, rotation_from_quaternion
-from tactile_bayes.hardware import head
+from tactile_bayes.hardware import head, readings
 from tactile_bayes.hardware.ports import Port
-from tactile_bayes.hardware.readings import (
-    NO_ROTATION,
-    HelloReading,
-    MissingReading,
-    Parser,
-    PoseReading,
-    Reading,
-    ToolReading,
-    plausible,
-    printable,
-)
 from tactile_bayes.shell import own_process
 
 # --- CRC-64 as OpenIGTLink uses it: polynomial of ECMA-182, initial value 0, nothing inverted or reflected.
@@ -105,7 +94,7 @@ ASK_FOR_TDATA: Final = _HEADER.pack(1, b"STT_TDATA", b"", 0, 0, len(_NO_WISHES),
 """After it a server sends TDATA: as fast as it can, in its own frame."""
 
 
-class IgtlinkParser(Parser):
+class IgtlinkParser(readings.Parser):
     """Parser of messages with poses; it skips others, whatever their size.
 
     The header has no checksum, so a spoilt size may cover messages that follow. Where a message is skipped or not yet
@@ -114,21 +103,20 @@ class IgtlinkParser(Parser):
     """
 
     def __init__(self) -> None:
-        self._rest = b""
         self._checks = 0
         self._over = 0  # bytes still to come of a message without poses
         self._others: set[str] = set()
 
-    def feed(self, data: bytes) -> list[Reading]:
+    def feed(self, data: bytes) -> list[readings.Reading]:
         buffer, index = self._rest + data, 0
-        all_readings: list[Reading] = []
+        all_readings: list[readings.Reading] = []
         self._checks = _FEWEST_CHECKED + _CHECKED_SHARE * len(data)
         while len(buffer) - index >= _HEADER.size:
             if self._checks < 0:  # headers after headers: an attack on this program's time
                 self.garbage_bytes, self._over, index = self.garbage_bytes + len(buffer) - index, 0, len(buffer)
                 break
-            readings: list[Reading] = []
-            size = self._message(buffer, index, readings) if _POSE_HEADER.match(buffer, index) else -1
+            found: list[readings.Reading] = []
+            size = self._message(buffer, index, found) if _POSE_HEADER.match(buffer, index) else -1
             if size < 0:
                 size = self._pass_over(buffer, index)
             elif size:
@@ -139,12 +127,12 @@ class IgtlinkParser(Parser):
                 if not size:
                     break
             index += size
-            all_readings += readings
+            all_readings += found
         self._rest = buffer[index:]
         return all_readings
 
-    def _message(self, buffer: bytes, index: int, readings: list[Reading]) -> int:
-        """Size of a message with poses, which are added to `readings`; 0 while incomplete, -1 for no message."""
+    def _message(self, buffer: bytes, index: int, found: list[readings.Reading]) -> int:
+        """Size of a message with poses, which are added to `found`; 0 while incomplete, -1 for no message."""
         size: int
         version, kind, device, seconds, fraction, size, crc = _HEADER.unpack_from(buffer, index)
         kind, tool, end = kind.rstrip(b"\0"), _name(device), index + _HEADER.size + size
@@ -171,21 +159,21 @@ class IgtlinkParser(Parser):
         for start in range(0, len(content), prefix + numbers.size):
             name = _name(content[start : start + NAME_BYTES]) if prefix else tool
             values = numbers.unpack_from(content, start + prefix)
-            readings.append(self._reading(values, tool=name, unseen=_unseen(facts), device_ns=device_ns))
+            found.append(self._reading(values, tool=name, unseen=_unseen(facts), device_ns=device_ns))
         return end - index
 
-    def _reading(self, values: tuple[float, ...], *, tool: str, unseen: str, device_ns: int | None) -> Reading:
+    def _reading(self, values: tuple[float, ...], *, tool: str, unseen: str, device_ns: int | None) -> readings.Reading:
         x, y, z = values[-3:] if len(values) == _COLUMNS else values[:3]
         quaternion = _quaternion_of_matrix(values[:-3]) if len(values) == _COLUMNS else (values[6], *values[3:6])
         if unseen:
-            return MissingReading(unseen, tool)
-        if quaternion is None or not plausible((x, y, z), quaternion):
+            return readings.MissingReading(unseen, tool)
+        if quaternion is None or not readings.plausible((x, y, z), quaternion):
             self.fault = f"what {tool!r} sends is no rotation and place in mm: {' '.join(f'{v:g}' for v in values)}"
-            return MissingReading(NO_ROTATION, tool)
+            return readings.MissingReading(readings.NO_ROTATION, tool)
         if (x, y, z, *map(abs, quaternion)) == (0, 0, 0, 1, 0, 0, 0):
-            return MissingReading("identity sent", tool)
+            return readings.MissingReading("identity sent", tool)
         w, i, j, k = quaternion
-        return PoseReading((x, y, z), (w, i, j, k), device_ns, tool=tool)
+        return readings.PoseReading((x, y, z), (w, i, j, k), device_ns, tool=tool)
 
     def _next_message(self, buffer: bytes, index: int) -> int:
         """Index of the first complete message with poses after `index`; `index` itself without one."""
@@ -241,7 +229,7 @@ def _find_header(buffer: bytes, start: int) -> int:
 
 def _name(data: bytes) -> str:
     """Text of a padded name."""
-    return printable(data.partition(b"\0")[0])
+    return readings.printable(data.partition(b"\0")[0])
 
 
 def _fits(kind: bytes, size: int) -> bool:
@@ -287,9 +275,9 @@ def _quaternion_of_matrix(columns: tuple[float, ...]) -> tuple[float, ...] | Non
     return tuple(map(float, quaternion_from_rotation(rotation))) if np.linalg.det(rotation) > 0 else None
 
 
-def encode_transform(pose: ToolReading) -> bytes:
+def encode_transform(pose: readings.ToolReading) -> bytes:
     """Encode a pose as a TRANSFORM message of header version 1; a missing pose is an identity."""
-    if isinstance(pose, PoseReading):
+    if isinstance(pose, readings.PoseReading):
         rotation = rotation_from_quaternion(np.array(pose.quaternion_wxyz))
         body, device_ns = _MATRIX.pack(*rotation.T.ravel(), *pose.position_mm), pose.device_ns or 0
     else:
@@ -393,7 +381,7 @@ class NdiTracker:
             part = re.sub(r"[^A-Za-z0-9.]", "", self._command(f"PHINF:{handle:02X}{_PART_NUMBER:04X}"))
         return f"{handle:02X}-{part}" if part else f"{handle:02X}"
 
-    def readings(self) -> list[ToolReading]:
+    def measure(self) -> list[readings.ToolReading]:
         """Next reading of each tool; none without a new frame. Several failures in a row are a `DeviceError`."""
         try:
             self._command(f"BX:{_TRANSFORMS:04X}")
@@ -409,23 +397,26 @@ class NdiTracker:
         self._frame = frame
         return [self._reading(handle) for handle in self.tools]
 
-    def _reading(self, handle: int) -> ToolReading:
+    def _reading(self, handle: int) -> readings.ToolReading:
         port, tool = bytes([handle]), self.tools[handle]
         transform = self._api.ndiGetBXTransform(self._device, port)
         status = self._api.ndiGetBXPortStatus(self._device, port)
         if isinstance(transform, str):
             out = transform == "MISSING" and status & _OUT_OF_VOLUME
-            return MissingReading("out of volume" if out else transform.lower(), tool)
+            return readings.MissingReading("out of volume" if out else transform.lower(), tool)
         w, i, j, k, x, y, z = (float(value) for value in transform[:7])
-        if not plausible((x, y, z), (w, i, j, k)):
-            return MissingReading(NO_ROTATION, tool)
-        return PoseReading((x, y, z), (w, i, j, k), None, ("partly out of volume",) * bool(status & _PARTLY_OUT), tool)
+        if not readings.plausible((x, y, z), (w, i, j, k)):
+            return readings.MissingReading(readings.NO_ROTATION, tool)
+        flags = ("partly out of volume",) if status & _PARTLY_OUT else ()
+        return readings.PoseReading((x, y, z), (w, i, j, k), None, flags, tool)
 
 
 def serve(tracker: NdiTracker, line: socket.socket) -> None:
     """Serve the tracker in the open framing until the other end closes."""
     commands, sending, number = head.PacketParser(), False, 0
-    latest: dict[str, ToolReading] = {tool: MissingReading("not measured yet", tool) for tool in tracker.tools.values()}
+    latest: dict[str, readings.ToolReading] = {
+        tool: readings.MissingReading("not measured yet", tool) for tool in tracker.tools.values()
+    }
     line.setblocking(False)
     while True:
         wire = b""
@@ -435,14 +426,14 @@ def serve(tracker: NdiTracker, line: socket.socket) -> None:
                 return
             for packet in commands.packets(data):
                 if packet.kind == head.ASK:
-                    wire = head.encode_hello(HelloReading(tracker.name, 0, 0, 0, 0.0))
+                    wire = head.encode_hello(readings.HelloReading(tracker.name, 0, 0, 0, 0.0))
                     wire += b"".join(head.encode_pose(one, sequence=0) for one in latest.values())
                 elif packet.kind in (head.START, head.STOP):
                     sending = packet.kind == head.START
-        readings, now_ns = tracker.readings(), time.monotonic_ns()
-        latest |= {reading.tool: reading for reading in readings}
-        for reading in readings if sending else ():
-            timed = reading._replace(device_ns=now_ns) if isinstance(reading, PoseReading) else reading
+        measured, now_ns = tracker.measure(), time.monotonic_ns()
+        latest |= {reading.tool: reading for reading in measured}
+        for reading in measured if sending else ():
+            timed = reading._replace(device_ns=now_ns) if isinstance(reading, readings.PoseReading) else reading
             wire += head.encode_pose(timed, sequence=number)
             number += 1
         if wire:

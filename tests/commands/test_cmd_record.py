@@ -28,8 +28,8 @@ from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, write_scan
 from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker, Faults, PtyLink
 from tactile_bayes.hardware.ports import Port
-from tactile_bayes.hardware.readings import MM_PER_INCH
 from tactile_bayes.mapping.build import build_map
+from tactile_bayes.presets import MM_PER_UNIT
 from tactile_bayes.scans import Scan
 
 
@@ -179,8 +179,8 @@ def test_a_shared_clock_and_single_precision_give_the_map_of_the_scan_as_the_wir
         done = record(*words)
     assert done.returncode == 0, done.stderr
     got = read_scan(tmp_path / "a.mcap").poses
-    inches = (scan.poses.position_mm / MM_PER_INCH).astype(np.float32).astype(np.float64)
-    np.testing.assert_array_equal(got.position_mm, inches * MM_PER_INCH)
+    inches = (scan.poses.position_mm / MM_PER_UNIT["in"]).astype(np.float32).astype(np.float64)
+    np.testing.assert_array_equal(got.position_mm, inches * MM_PER_UNIT["in"])
     np.testing.assert_array_equal(got.quaternion_wxyz, scan.poses.quaternion_wxyz.astype(np.float32))
     np.testing.assert_array_equal(np.rint(got.time_s * 1000), np.floor(scan.poses.time_s * 1000 + 1e-6))
 

@@ -138,7 +138,7 @@ def test_new_frames_with_a_tool_in_sight_are_poses():
     spoilt = OSError("POLARIS 0x04: Invalid CRC")
     frames = [(1, seen), (1, seen), (2, "MISSING"), (3, seen), 4, spoilt, (4, (9.0,) * 8), (5, seen)]
     tracker = NdiTracker(FakeLibrary(frames), "/dev/ttyUSB0")
-    found = [tracker.readings() for _ in frames]
+    found = [tracker.measure() for _ in frames]
     pose, unseen = [PoseReading((254.0, -127.0, 25.4), TURN, tool=TOOL)], [MissingReading("missing", TOOL)]
     none = [MissingReading("no rotation", TOOL)]
     assert found == [pose, [], unseen, pose, [], [], none, pose]  # again, unseen, twice spoilt, impossible
@@ -154,14 +154,14 @@ def test_new_frames_with_a_tool_in_sight_are_poses():
     ],
 )
 def test_a_ports_status_says_why_there_is_no_pose(status, seen, found):
-    assert NdiTracker(FakeLibrary([(1, seen)], status=status), "/dev/ttyUSB0").readings() == [found]
+    assert NdiTracker(FakeLibrary([(1, seen)], status=status), "/dev/ttyUSB0").measure() == [found]
 
 
 def test_each_enabled_tool_is_read_and_named_by_handle_and_part():
     seen = (*TURN, 1.0, 2.0, 3.0, 0.2)
     library = FakeLibrary([(1, {10: seen, 11: "MISSING"})], enabled=(10, 11))
     tracker = NdiTracker(library, "/dev/ttyUSB0")
-    assert tracker.readings() == [
+    assert tracker.measure() == [
         PoseReading((1, 2, 3), TURN, tool="0A-870030A"),
         MissingReading("missing", "0B-870030B"),
     ]
@@ -170,9 +170,9 @@ def test_each_enabled_tool_is_read_and_named_by_handle_and_part():
 def test_a_tracker_that_stops_answering_is_reported():
     tracker = NdiTracker(FakeLibrary([7] * 10), "/dev/ttyUSB0")
     for _ in range(4):
-        assert tracker.readings() == []
+        assert tracker.measure() == []
     with pytest.raises(DeviceError, match=r"BX failed \(error 7\)"):
-        tracker.readings()
+        tracker.measure()
 
 
 @pytest.mark.parametrize(
