@@ -323,10 +323,7 @@ class InlineExecutor(Executor):
 
 
 def open_executor(*, workers: int = 1, cluster: str | None = None) -> AbstractContextManager[Executor]:
-    """Open an executor over a dask cluster if its address is given, else over `workers` processes of this machine.
-
-    Killed processes are replaced; 0 or 1 `workers` run in this process, with the same results.
-    """
+    """Executor over a dask cluster, else over `workers` processes; 0 or 1 are this one, with the same results."""
     if cluster:
         return cluster_executor(cluster)
     if workers < 0:
@@ -336,10 +333,7 @@ def open_executor(*, workers: int = 1, cluster: str | None = None) -> AbstractCo
 
 @contextlib.contextmanager
 def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Executor]:
-    """Executor over the workers of a running dask scheduler, for example ``tcp://10.0.0.5:8786``.
-
-    The workers must have this version of the program installed: another one could give other results.
-    """
+    """Executor over the workers of a running dask scheduler (``tcp://10.0.0.5:8786``), which must have this version."""
     try:
         from distributed import Client
     except ImportError:

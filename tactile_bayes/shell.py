@@ -189,10 +189,7 @@ def protect_streams() -> None:
 
 
 def _buffered(stream: io.TextIOWrapper) -> io.TextIOWrapper:
-    """The stream with a buffer and with escapes in place of encoding errors.
-
-    Without a buffer (``PYTHONUNBUFFERED=1``, as in many containers) Python drops text that a full disk does not take.
-    """
+    """The stream with escapes and a buffer: without one Python drops text that a full disk does not take."""
     if isinstance(stream.buffer, io.RawIOBase):
         raw = io.FileIO(stream.fileno(), "w", closefd=False)
         stream = io.TextIOWrapper(io.BufferedWriter(raw), encoding=stream.encoding, line_buffering=True)
@@ -224,10 +221,7 @@ _interrupted = False
 
 @contextlib.contextmanager
 def interrupt_on_signals() -> Iterator[None]:
-    """Let SIGTERM (`kill`, `timeout`, a batch system) and SIGHUP (a closed terminal) interrupt as Ctrl-C does.
-
-    A signal that is ignored stays ignored: `nohup` ignores SIGHUP.
-    """
+    """Let SIGTERM (`kill`) and SIGHUP (a closed terminal) interrupt as Ctrl-C, unless ignored, as by `nohup`."""
     global _interrupted
     _interrupted = False
     before: dict[int, Any] = {}

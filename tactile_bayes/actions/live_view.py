@@ -292,10 +292,7 @@ _STEPS: Final = 256
 
 
 def live_text(state: LiveState, *, columns: int, lines: int, colour: bool, keys: bool = False) -> str:
-    """One screen of lines, none longer than `columns`.
-
-    `keys` is true if the recording's keys can be pressed on this terminal.
-    """
+    """One screen of lines, none longer than `columns`; `keys`: the recording's keys can be pressed on this terminal."""
     above = [_pressure(state, columns, colour=colour), _figures(state)[:columns], state.size_words[:columns]]
     below = [*textwrap.wrap(state.landmark_words, columns), RESEARCH_USE[:columns]]
     if keys:

@@ -82,10 +82,7 @@ class Request(RecordOptions, kw_only=True):
 
 
 def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration | None, Landmarks | None]:
-    """Geometry, calibration and landmarks, read from the files of the options; `UsageError` where one is missing.
-
-    Without a calibration is --uncalibrated: the head's own full scale is needed for one.
-    """
+    """Geometry, calibration (None with --uncalibrated) and landmarks of the files that the options name."""
     like = read_scan(request.like) if request.like else None
     if request.head_geometry:
         head = read_head_geometry(request.head_geometry)
@@ -105,10 +102,7 @@ def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration | 
 
 
 def calibration_age(request: Request, *, head_id: str, today: date) -> dict[str, str]:
-    """Session fact on the age of the array calibration, in days; empty without a calibration file.
-
-    A calibration that is stale or of another head is a `UsageError`, unless it is accepted.
-    """
+    """Session fact on the age of the array calibration, in days; one that is stale or of another head is refused."""
     if not request.array_calibration or request.uncalibrated:
         return {}
     calibration = read_array_calibration(request.array_calibration)
@@ -156,10 +150,7 @@ def noted_signals() -> Iterator[list[str]]:
 
 @dataclass
 class Keys:
-    """Keys of a terminal for landmarks, start and stop; without a terminal there are none.
-
-    Nothing is printed where a live view is `drawn`: it shows the same facts and would overwrite the lines.
-    """
+    """Keys of a terminal for landmarks, start and stop; where a live view is `drawn`, nothing is printed."""
 
     recorder: Recorder
     scanhead_from_tracker: FloatArray

@@ -84,10 +84,7 @@ class NamePattern:
         return "[^/]*" if part == "*" else re.escape(part)
 
     def facts(self, name: str) -> dict[str, str]:
-        """Facts in a file's name, by the columns of the table.
-
-        A name that does not follow the pattern, or a word in it that is no side, date or number, is a `BadDataError`.
-        """
+        """Facts in a file's name, by the columns of the table; a name that does not follow the pattern is refused."""
         folders = name.replace(os.sep, "/").split("/")
         tail = "/".join(folders[-self._parts :])
         match = self._names.fullmatch(tail if self._with_ending else tail.rpartition(".")[0])
@@ -112,10 +109,7 @@ class NamePattern:
 
 
 def _read_facts(path: Path, name: str, pattern: NamePattern | None) -> FileFacts:
-    """Facts on which all scans of a scan or map agree, and those in its name; arrays of a scan hold none.
-
-    A `BadDataError` where file and name contradict each other.
-    """
+    """Facts on which all scans of a scan or map agree, and those in its name, which may not contradict each other."""
     sessions: Sequence[Mapping[str, Any]] = ()
     made: Any = ()
     if name.lower().endswith(MAP):

@@ -32,10 +32,7 @@ _OTHERS: Final = ("pool", "compare", _BESIDE)  #: Steps that are of no single ex
 
 @contextlib.contextmanager
 def open_campaign(folder: Path, *, dry: bool = False) -> Iterator[BatchStore | None]:
-    """Open the journal of a folder, which is made if need be; for a dry run read it only, None where there is none.
-
-    A folder of something else, one that another run is using, or one that cannot be made or read is a `UsageError`.
-    """
+    """Open the journal of a folder, made if need be and of no other use; for a dry run read it, or None without one."""
     journal = folder / JOURNAL
     try:
         has_journal, has_files = journal.exists(), folder.is_dir() and any(folder.iterdir())
@@ -189,20 +186,14 @@ def read_sources(
 
 
 class DuplicateExams:
-    """Finds exams with the same content, which only masses of one scan may have, block by block.
-
-    `shared` is the content's name for messages: ``"bytes"`` or ``"recording"``.
-    """
+    """Finds exams of the same `shared` (bytes or recording), which only masses of one scan may have, block by block."""
 
     def __init__(self, breasts: Breasts, shared: str) -> None:
         self._breasts, self._shared = breasts, shared
         self._sharing: dict[str, list[Exam]] = defaultdict(list)
 
     def faults(self, marks: Mapping[Exam, Iterable[str]]) -> dict[str, str]:
-        """Faults of these exams and of earlier ones, by name; `marks`: digests of each exam's content.
-
-        Masses of one scan, each with its place, have none.
-        """
+        """Faults of these exams and of earlier ones, by name; `marks`: digests of each exam's content."""
         new = {mark: None for of_exam in marks.values() for mark in of_exam}
         for exam, of_exam in marks.items():
             for mark in dict.fromkeys(of_exam):

@@ -290,10 +290,7 @@ class Written(Record):
 
 
 def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Written:
-    """Write tables, the index and, where excision sizes are given, the trial's report.
-
-    `unlisted` are folders of exams that the table does not list.
-    """
+    """Write tables, index and, with excision sizes, the trial's report; `unlisted`: folders of exams of no row."""
     folder, growth, pooled = campaign.folder, growth_rows(campaign), pooled_reports(campaign)
     rows, excised = exam_rows(campaign, pooled), _excised(campaign.settings)
     masses = None if excised is None else set(_masses_of(excised))

@@ -112,11 +112,7 @@ class Campaign:
         return made
 
     def run(self) -> None:
-        """Run what is missing: maps, estimates and figures by blocks, repeatability, sizes by it, pages, pools, growth.
-
-        Where the disk does not take a result (`UsageError`), the cluster is lost (`TactileBayesError`) or on Ctrl-C
-        (`BatchInterrupted`), all that is done is kept.
-        """
+        """Run what is missing; what is done is kept where the disk is full, the cluster is lost, or on Ctrl-C."""
         self._read_sources()
         sound = [exam for exam in self.exams if exam.name not in self.faults]
         self.not_pooled = self.not_compared = self._unpoolable()

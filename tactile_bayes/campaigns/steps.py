@@ -149,10 +149,7 @@ class Task(Record):
 
 
 def _write_staged(task: Task, writes: Writes) -> Result:
-    """Write a step's files beside their place; returns their digests and where they are.
-
-    Equal files have equal folders. Those of earlier runs are removed when the others are put in place.
-    """
+    """Write a step's files beside their place, equal ones in equal folders; returns digests and that folder."""
     staged = task.folder / f"{WAITING}{task.step}-{task.digest[:_DIGITS]}"
     try:
         if writes:
@@ -232,10 +229,7 @@ def _copy_map(source: Path, expected: Mapping[str, str]) -> Made:
 
 
 def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
-    """Refuse a file whose facts contradict the table's; a fact that either lacks is not compared, nor are capitals.
-
-    The table has no two codes that differ by capitals alone.
-    """
+    """Refuse a file whose facts contradict the table's; one that either lacks is not compared, nor are capitals."""
     both = {
         ours: facts[theirs] for ours, theirs in layout.SAME_IN_SCANS.items() if facts.get(theirs) and expected.get(ours)
     }
@@ -262,10 +256,7 @@ def make_estimate(folder: Path, settings: Settings, match: Match | None, side: s
 
 
 def _estimate_exam(folder: Path, settings: Settings, match: Match | None, side: str) -> SizeEstimate:
-    """The exam's estimate; with a match, of the mass that lies where other exams place it.
-
-    `side`: of the breast by the table, where no scan says it; the landmarks are held against it.
-    """
+    """The exam's estimate, with a match of the mass that lies there; `side`: by the table, where no scan says it."""
     path, findings = folder / layout.MAP, list[Finding]()
     if match is None:
         sized = estimate_file(path, settings)
@@ -296,10 +287,7 @@ def make_figures(folder: Path, settings: Settings, match: Match | None, side: st
 
 
 def make_page(folder: Path, expected: Mapping[str, str], *, report: str) -> Made:
-    """The exam's page and thumbnail from the files of earlier steps, its size from the file `report`.
-
-    Facts that the scans lack are the table's.
-    """
+    """The exam's page and thumbnail, the size from the file `report`; what no scan says is the table's."""
     tactile_map, scans = read_map_and_scans(folder / layout.MAP)
     from_table = {layout.SAME_IN_SCANS[name]: text for name, text in expected.items() if name in layout.SAME_IN_SCANS}
     facts = [from_table | scan for scan in scans or [{}]]
@@ -405,10 +393,7 @@ def learn_repeatability(repeats: Sequence[ExamFolder]) -> Made:
 
 
 def make_size(folder: Path, settings: Settings, *, figures: bool) -> Made:
-    """Size an exam by the site's repeatability: its estimate with other sizes. Nothing where it had no size.
-
-    The size is from the draws of the exam, in the axes of its map as `estimate` has it.
-    """
+    """Size an exam by the site's repeatability from its draws: its estimate with other sizes, if it has any."""
     report = read_record(folder / layout.ESTIMATE, EstimateReport)
     if report.max_size_mm is None:
         return {}, {}

@@ -141,10 +141,7 @@ def read_map_and_header(path: Path) -> tuple[TactileMap, MapHeader]:
 
 
 def _attributes(tactile_map: TactileMap, provenance: Provenance) -> dict[str, str]:
-    """Global attributes; structured values are JSON with keys in a fixed order.
-
-    CF wants a unit that UDUNITS reads for every quantity that has one: a map without such a unit does not claim CF.
-    """
+    """Global attributes; a map without a unit that UDUNITS reads does not claim CF, which wants one."""
     header = MapHeader(
         schema=SCHEMA,
         **{name: getattr(tactile_map, name) for name in _SHARED},

@@ -101,10 +101,7 @@ SHAPES = {"chain": 4, "log_density": 2, "accepted": 1, "twister": 2, "cursor": 2
 
 
 class CheckpointFile:
-    """A checkpoint file, made when it does not exist and rewritten after each block of steps.
-
-    `context` is a text that the chain depends on, such as the calibration's hash; with another it is refused.
-    """
+    """A checkpoint file, rewritten after each block of steps; refused with another `context` of the chain."""
 
     def __init__(self, path: Path, *, context: str = "") -> None:
         self.path, self.context = path, context

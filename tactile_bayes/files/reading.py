@@ -237,11 +237,7 @@ def schema_kind(schema: object) -> str:
 
 
 def wrong_kind(path: Path, expected: str, *, what: str, way_out: str) -> BadDataError:
-    """Error for a file of another kind than `expected` (in the words of `kind_of`); names the kind where it is known.
-
-    `what` and `way_out` are the fault and the remedy where it is not, or where the file is of the expected kind and
-    damaged.
-    """
+    """Error for a file that is not of the `expected` kind: names its own, or `what` where that is damaged."""
     kind = kind_of(path)
     if not kind or kind == expected:
         return BadDataError(what, way_out=way_out, path=str(path))
@@ -338,11 +334,7 @@ def _store(address: str) -> Any:
 
 @contextlib.contextmanager
 def _reading_store(address: str) -> Iterator[Any]:
-    """The store of an address.
-
-    In the block a missing or closed file is a `BadDataError`, which fails its exam alone; a fault of the store is a
-    `UsageError`.
-    """
+    """The store of an address; a missing or closed file fails its exam, a fault of the store is a `UsageError`."""
     try:
         yield _store(address)
     except UsageError:

@@ -50,11 +50,7 @@ T = TypeVar("T")
 
 
 class ScanWriter:
-    """Writer of one scan to a binary stream, which stays open: its description, then messages as they arrive.
-
-    `truth` is the scene of a simulated scan, which `read_scan_report` returns beside the scan. `findings` are those of
-    the file that the scan is a copy of.
-    """
+    """Writer of one scan to a binary stream, which stays open: its description, then messages as they arrive."""
 
     def __init__(
         self,
@@ -179,10 +175,7 @@ def _pose_message(position_mm: FloatArray, quaternion_wxyz: FloatArray) -> Any:
 
 
 def ns_from_s(time_s: FloatArray) -> NDArray[np.int64]:
-    """Convert times in s to whole ns.
-
-    Seconds and their fraction are converted apart: a time since 1970 times 1e9 does not fit a double's 53 bits.
-    """
+    """Whole ns of times in s, seconds and fraction apart: a time since 1970 times 1e9 fits no double's 53 bits."""
     seconds = np.floor(time_s)
     nanos = np.rint((time_s - seconds) * _NS)
     return seconds.astype(np.int64) * _NS + nanos.astype(np.int64)
@@ -191,10 +184,7 @@ def ns_from_s(time_s: FloatArray) -> NDArray[np.int64]:
 def write_scan(
     path: Path, scan: scans.Scan, *, provenance: Provenance, truth: Mapping[str, Any] | None = None, force: bool = False
 ) -> None:
-    """Write a scan; equal scans give equal bytes under one version of zstd and protobuf.
-
-    A `Scan` knows no host times: ``log_time`` is then the device time. Landmarks, which have no time, carry the first.
-    """
+    """Write a scan; equal scans give equal bytes. ``log_time`` is the device time, that of landmarks the first one."""
     check_session(scan.session, path=path)
     with atomic_path(path, force=force) as partial, partial.open("wb") as stream:
         writer = ScanWriter(
@@ -223,11 +213,7 @@ def write_scan(
 
 
 def read_scan(path: Path) -> scans.Scan:
-    """Read a scan; from an unfinished file, everything up to the last complete chunk.
-
-    Damaged chunks are an error: a scan with a hole must not pass for a whole one. `read_scan_report` reads around the
-    damage.
-    """
+    """Read a scan, of an unfinished file up to the last complete chunk; damage is for `read_scan_report` alone."""
     file = read_scan_report(path)
     if file.damaged:
         way_out = "copy it again, or keep what is intact with `tactile-bayes import`"
@@ -384,10 +370,7 @@ SYNC_S: Final = 0.5  #: Interval at which written bytes are synced to the disk: 
 
 
 def create_exclusive(path: Path, *, force: bool) -> IO[bytes]:
-    """Create a new file for its owner only; under its final name, because it must survive a kill.
-
-    It is locked until it is closed: another recording, or `repair`, leaves it alone.
-    """
+    """Create a file for its owner only, locked until it is closed, under its final name: it must survive a kill."""
     refuse_existing(path, force=force)
     flags = os.O_WRONLY | os.O_CREAT | (0 if force else os.O_EXCL)
     try:

@@ -40,10 +40,7 @@ def default_for(normalise: str) -> str:
 
 
 def size_calibration_path(name: str) -> Path | None:
-    """Path of a calibration given by name or path; None for ``none``; a name that is neither is an error.
-
-    A file of the same name in the working directory needs a ``./`` before it.
-    """
+    """Path of a calibration by its name, or by its path (``./solid`` for a file called so); None for ``none``."""
     if name == NONE:
         return None
     if name in SHIPPED:
@@ -122,10 +119,7 @@ def write_size_calibration(
     base: dict[str, Any] | None = None,
     force: bool = False,
 ) -> None:
-    """Write a size calibration of any form atomically.
-
-    With a site's correction the whole calibration that it corrects, `base`, is kept in the file.
-    """
+    """Write a size calibration of any form atomically; a site's correction keeps the whole `base` that it corrects."""
     if isinstance(calibration, SizeCalibration):
         schema, form, body = "size-calibration/1", "eq6", _eq6_document(calibration)
     elif calibration.site is None:

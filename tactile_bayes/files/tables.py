@@ -151,12 +151,7 @@ class Table(Record):
 
 
 def read_table(source: Path | Sheet, schema_name: str) -> Table:
-    """Read a CSV file under the Table Schema ``data_schema/SCHEMA_NAME`` (``trial.table.json``...).
-
-    The file is UTF-8, with or without a byte order mark. Between the cells are commas, semicolons or tabs, and with the
-    last two a number may have a decimal comma. Blank lines are skipped, and so are rows without a filled cell and
-    columns without a name or a filled cell, which spreadsheets write.
-    """
+    """Read a CSV file under the Table Schema ``data_schema/SCHEMA_NAME``, without blank rows and nameless columns."""
     schema = load_schema(schema_name)
     fields = {field["name"]: field for field in schema["fields"]}
     path, text = (source.name, source.text) if isinstance(source, Sheet) else (source, read_text(source))
@@ -499,10 +494,7 @@ def read_lines(path: Path) -> list[str]:
 
 
 def read_text_table(path: Path, decimal: str | None = None) -> tuple[list[Line], str]:
-    """Lines of a text that are not blank, split so that most fields are numbers, and their separator in words.
-
-    Where no `decimal` (``"point"`` or ``"comma"``) is stated, commas that may separate thousands are refused.
-    """
+    """Lines of a text that are not blank, split so that most fields are numbers, and their separator in words."""
     texts = read_lines(path)
     separator = detect_separator(texts)
     if not separator:
@@ -526,10 +518,7 @@ def read_text_table(path: Path, decimal: str | None = None) -> tuple[list[Line],
 
 
 def detect_separator(texts: Sequence[str], marks: Sequence[str] = ()) -> str:
-    """Separator that gives the most numbers and the fewest other fields; empty where no line has two numbers.
-
-    `marks` are further words for no value.
-    """
+    """Separator with the most numbers (or `marks`) and the fewest other fields; empty where no line has two numbers."""
     filled = [text for text in texts if text.strip()]
     sample = filled[:: max(1, len(filled) // _SAMPLED)]
     scores = {}  # by separator: numbers in rows of numbers, and minus the other fields there

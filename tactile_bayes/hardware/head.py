@@ -55,10 +55,7 @@ def cobs_encode(data: bytes) -> bytes:
 
 
 def cobs_decode(data: bytes) -> bytes | None:
-    """Undo `cobs_encode`; None for an invalid code.
-
-    A code byte stands where a zero was, so most of the work is to put the zeros back in place.
-    """
+    """Undo `cobs_encode`; None for an invalid code. Most of it is to put back the zeros that codes stand for."""
     out = bytearray(data)
     index, end = 0, len(data)
     full = []  # codes of 255: no zero was there, the byte goes
@@ -291,10 +288,7 @@ class ArrayFit(Record, eq=False):
 
 
 def fit_array(steps: Sequence[BladderStep], *, saturation_count: int) -> ArrayFit:
-    """Fit a line (and a parabola) of pressure on counts for each taxel by least squares.
-
-    Steps at which a taxel is saturated are left out for it.
-    """
+    """Fit a line (and a parabola) of pressure on counts for each taxel by least squares, without saturated steps."""
     ordered = sorted(steps, key=lambda step: step.pressure_kpa)
     pressure = np.array([step.pressure_kpa for step in ordered])
     if len(np.unique(pressure)) < 2:

@@ -92,10 +92,7 @@ class Feed(Observer):
 
 
 def read_feed(pipe: int, every_s: float) -> Iterator[list[FeedMessage]]:
-    """Yield the messages that a `Feed` has sent since the last time, every `every_s` until the recorder has gone.
-
-    They come in lists: frames that are mapped one by one cost eight times as much.
-    """
+    """Messages of a `Feed` since the last time, in lists: frames mapped one by one cost eight times as much."""
     os.set_blocking(pipe, False)
     ended = False
     while not ended:

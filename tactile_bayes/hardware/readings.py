@@ -85,10 +85,7 @@ class Parser:
 
 
 class RecordParser(Parser):
-    """Parser of records of a fixed length; after garbage it tries again at each next byte.
-
-    `read` returns the pose in `record_bytes` bytes, or None where they are no record.
-    """
+    """Parser of records of a fixed length, of which `read` makes poses; after garbage it tries at the next byte."""
 
     def __init__(self, record_bytes: int, read: Callable[[bytes], PoseReading | None]) -> None:
         self.record_bytes, self._read = record_bytes, read

@@ -216,10 +216,7 @@ class DeviceLine:
 
 @dataclass
 class Recorder:
-    """Runs one recording of devices that were checked and do not stream yet; without a tracker it has no poses.
-
-    The sink gets everything in order of arrival.
-    """
+    """Runs one recording of devices that were checked and do not stream yet; the sink gets all in order of arrival."""
 
     head: DeviceLine
     tracker: DeviceLine | None
@@ -276,10 +273,7 @@ class Recorder:
             self._stopped_ns = self.clock_ns()
 
     def run(self, each_tick: Callable[[], None] = lambda: None) -> RecordingReport:
-        """Record until the end; `each_tick`, called many times a second, may call `stop` and `start` and set `touch`.
-
-        However the recording ends, the devices get their stop commands and the report is complete.
-        """
+        """Record to the end, whatever that is, and stop the devices; `each_tick` may call `stop` and `start`."""
         flushed_ns = self.clock_ns()
         try:
             while not self._done():

@@ -213,10 +213,7 @@ class IgtlinkParser(readings.Parser):
 
 
 def _find_header(buffer: bytes, start: int) -> int:
-    """Index of the first header of a message with poses from `start` on; -1 without one.
-
-    Messages of images are large: `bytes.find` searches them faster than the pattern does.
-    """
+    """Index of the first header of a message with poses, -1 without; in images `bytes.find` is the quickest."""
     first = -1
     for kind in _KINDS:
         at = buffer.find(kind, start + 2, None if first < 0 else first + _HEADER.size)
