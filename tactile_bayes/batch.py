@@ -402,7 +402,6 @@ class Outcome(Record, Generic[Result]):
 
     @property
     def ok(self) -> bool:
-        """True if there is a result."""
         return not self.error
 
 

@@ -92,7 +92,6 @@ class HeadShape(Record):
         return across, along
 
     def __str__(self) -> str:
-        """The head in a few words."""
         parts = [f"{self.rows} x {self.columns} taxels", f"{self.pitch_mm:g} mm apart"]
         across, along = self._curvatures()
         parts.append(_arc(across) if across else "flat")

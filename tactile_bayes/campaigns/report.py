@@ -66,8 +66,7 @@ class ExamRow(Record, eq=False):
     scans: tuple[Mapping[str, str], ...] = ()
     synthetic: bool | None = None
     """`scans`, `synthetic`: Of the file: digests and facts, whether it is simulated (None: unknown)."""
-    findings: tuple[Finding, ...] = ()
-    """Findings on its estimate, on the pooled size of its mass, and on the table."""
+    findings: tuple[Finding, ...] = ()  #: Findings on its estimate, on the pooled size of its mass, and on the table.
 
     @classmethod
     def of(cls, exam: Exam, report: EstimateReport, **facts: Any) -> ExamRow:

@@ -221,7 +221,6 @@ class Campaign:
         self._copy(EXAMS, [exam.name for exam in exams], made_by=("map", "estimate", "figures"))
 
     def _with_estimate(self, exams: Sequence[Exam]) -> list[Exam]:
-        """The exams that have an estimate."""
         return [exam for exam in exams if exam.name in self.keys["estimate"]]
 
     def _recorded_once(self, exams: Sequence[Exam]) -> list[Exam]:
@@ -444,7 +443,6 @@ class Campaign:
         return self.files(step, name).get(file)
 
     def _normalise(self, exam: Exam) -> str:
-        """How the exam's map was normalised."""
         return str(self.result("map", exam.name)["normalise"])
 
 

@@ -65,7 +65,6 @@ class ColumnMap(Record):
     excision: ExcisionColumns | None = None
 
     def key_columns(self) -> list[str]:
-        """Columns of the patient and of the mass."""
         return [self.patient] if self.mass is None else [self.patient, self.mass]
 
 
@@ -122,7 +121,6 @@ class _Row(NamedTuple):
     cells: Mapping[str, str]
 
     def key(self, mapping: ColumnMap) -> dict[str, Any]:
-        """Patient and mass."""
         for name in mapping.key_columns():
             if not self.cells[name]:
                 raise self.table.error(self.line, name, "is blank", way_out="every row needs its patient and mass")

@@ -181,8 +181,7 @@ IMAGE_SUFFIXES: Final = (".tif", ".tiff", ".pgm", ".png")
 _ARRAY_SUFFIXES: Final = (*ARRAY_SUFFIXES, ".nc", ".cdf")
 _BESIDE: Final = ("mean", "count", "variance", "spacing_mm")
 TABLE_SUFFIXES: Final = (".csv", ".txt", ".tsv", ".asf", ".asc", ".dat")
-GRID_SUFFIXES: Final = (*TABLE_SUFFIXES, *IMAGE_SUFFIXES, *ARRAY_SUFFIXES)
-"""Suffixes of files that `open_grid` reads."""
+GRID_SUFFIXES: Final = (*TABLE_SUFFIXES, *IMAGE_SUFFIXES, *ARRAY_SUFFIXES)  #: Suffixes of files that `open_grid` reads.
 
 
 def open_grid(path: Path, *, no_value: Sequence[str] = (), array: str = "") -> Grid:
@@ -391,8 +390,7 @@ def grid_map(grid: Grid, options: GridOptions) -> tuple[TactileMap, list[str]]:
 
 # --- Cells much finer than any lump, as pixels are: they are averaged before anything is fitted to them.
 
-_FINEST_MM: Final = 0.5
-"""In finer cells with correlated errors the fit took noise for lumps, and minutes."""
+_FINEST_MM: Final = 0.5  #: In finer cells with correlated errors the fit took noise for lumps, and minutes.
 
 
 def _average_cells(tactile_map: TactileMap, times: int) -> TactileMap:

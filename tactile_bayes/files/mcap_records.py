@@ -84,7 +84,6 @@ class Messages:
         return len(self._times)
 
     def add(self, time_ns: int, logged_ns: int, body: memoryview) -> None:
-        """Add one message with its publish and log times."""
         self._times.append(time_ns)
         self.logged.append(logged_ns)
         if self.keep:
@@ -162,7 +161,6 @@ class McapRecords:
         check_limit(self.unpacked_bytes, self.most_bytes, what="it unpacks to {} bytes or more")
 
     def add_loss(self, what: str, *, damaged: bool = True) -> None:
-        """Note a loss."""
         self.lost.append(what)
         self.damaged |= damaged
 

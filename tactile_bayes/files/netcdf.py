@@ -65,8 +65,7 @@ class Variable(Record):
     values: Any  #: Numbers; their type is the variable's.
     dimensions: tuple[str, ...]  #: The name of each axis.
     attributes: Mapping[str, str]  #: Text by name: units, a long name.
-    fill: float | None = None
-    """The ``_FillValue`` of a variable whose cells may have no value; not for coordinates."""
+    fill: float | None = None  #: The ``_FillValue`` of a variable whose cells may have no value; not for coordinates.
 
 
 class Contents(Record):

@@ -126,7 +126,6 @@ class CheckpointFile:
         return ChainState(**{name: arrays[name] for name in SHAPES})
 
     def save(self, key: str, state: ChainState) -> None:
-        """Write the state atomically."""
         arrays: dict[str, Any] = {"schema": np.array(SCHEMA), "key": np.array(f"{key}:{self.context}")}
         arrays |= {name: getattr(state, name) for name in SHAPES}
         buffer = io.BytesIO()

@@ -40,8 +40,7 @@ from tactile_bayes.geometry import FloatArray
 SCAN_SCHEMA: Final = "tactile-bayes/scan/1"
 CHUNK_BYTES: Final = 64 * 1024
 LANDMARK_NAMES: Final = ("sternal_notch", "xiphoid")
-NIPPLE: Final = "nipple"
-"""An optional landmark; a file has a channel for it only where it was touched."""
+NIPPLE: Final = "nipple"  #: An optional landmark; a file has a channel for it only where it was touched.
 TOPICS: Final = ("/pressure", "/pose", "/landmark")
 _NS: Final = 1_000_000_000
 _CALIBRATION: Final = "element_calibration.json"

@@ -442,11 +442,9 @@ _CLOCK: Final = re.compile(r"(?:(\d{1,2}):)?(\d{1,2}):(\d{1,2}(?:\.\d+)?)")
 _DATED: Final = re.compile(r"\d{4}-\d{2}-\d{2}[T ]\d{1,2}:\d{2}:\d{2}(\.\d+)?(Z|[+-]\d{2}:?\d{2})?")
 _UNIT_OF_TIME: Final = re.compile(r"(?:[\[(_ ]|(?<=time))(ms|us|ns|s|min|msec|µs|secs?|seconds)[\])]?$", re.IGNORECASE)
 _ANY_DECIMAL_COMMA: Final = re.compile(r"[+-]?[0-9]*,[0-9]+(e[+-]?[0-9]+)?", re.IGNORECASE)
-FEWEST_LABELS: Final = 8
-"""From so many on, numbers that count up are labels of rows or columns, not readings."""
+FEWEST_LABELS: Final = 8  #: From so many on, numbers that count up are labels of rows or columns, not readings.
 NO_SENSEL: Final = "B"  #: A cell beside the sensor in Tekscan's files.
-_NO_VALUE: Final = ("", "nan", "na", "n/a", "-", "--", NO_SENSEL.lower(), "null")
-"""Words for a missing reading."""
+_NO_VALUE: Final = ("", "nan", "na", "n/a", "-", "--", NO_SENSEL.lower(), "null")  #: Words for a missing reading.
 
 
 class Line(Record):

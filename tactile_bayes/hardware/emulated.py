@@ -73,12 +73,10 @@ class Device:
     open_framing = False  #: True for a device of the open framing, which has a last message.
 
     def start(self) -> None:
-        """Begin to send."""
         self.starts += 1
         self.streaming, self.stopped, self.end_sent = True, False, False
 
     def stop(self) -> None:
-        """Stop sending."""
         self.streaming, self.stopped = False, True
 
     def greet(self) -> None:
@@ -408,7 +406,6 @@ class TcpLink:
         return data
 
     def write(self, data: bytes) -> int:
-        """As `PtyLink.write`."""
         if self._host is None:
             return len(data)
         try:
@@ -429,7 +426,6 @@ class TcpLink:
         self.close()
 
     def close(self) -> None:
-        """Close the connection at once."""
         if self._host is not None:
             self._host.close()
         self._listener.close()
@@ -495,7 +491,6 @@ class Emulator:
                     self.unplugged = True
 
     def _step(self) -> None:
-        """Wait for the next event and handle it."""
         writable = [self.link] if self._waiting else []
         readable, _, _ = select.select([self.link], writable, [], self._wait_s())
         if readable:

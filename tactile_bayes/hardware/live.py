@@ -61,11 +61,9 @@ class Feed(Observer):
             fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
 
     def frame(self, counts: CountArray, device_ns: int) -> None:
-        """Send a recorded frame."""
         self._send("frame", device_ns, time.monotonic_ns(), counts.shape, counts=counts.astype("<u2").tobytes())
 
     def pose(self, pose: PoseReading, device_ns: int) -> None:
-        """Send a recorded pose."""
         self._send("pose", device_ns, pose.position_mm, pose.quaternion_wxyz)
 
     def landmark(self, name: str, position_mm: FloatArray) -> None:
@@ -284,7 +282,6 @@ class LiveMap:
         return tactile_map
 
     def state(self, *, size: str = "", lump_base_mm: FloatArray | None = None) -> LiveState:
-        """The present state for the view."""
         figures = self._map.figures if self._map else {"frames_used": 0.0, "frames_total": 0.0}
         return LiveState(
             tactile_map=self._snapshot(),
@@ -386,7 +383,6 @@ class _LimitedListener(socket.socket):
             time.sleep(SHED_S)
 
     def _wait(self) -> None:
-        """Wait for a connection."""
         while self.fileno() >= 0:
             with suppress(ValueError):  # it was closed meanwhile
                 if select.select([self], [], [], WAIT_S)[0]:
@@ -428,7 +424,6 @@ class LiveServer:
         return f"http://{self._authority}/?token={self._token}"
 
     def show(self, state: LiveState) -> None:
-        """Send a state to every page."""
         text = json.dumps(page_state(state), allow_nan=False)
         with self._changed:
             self._text, self._number = text, self._number + 1

@@ -229,7 +229,6 @@ class Stream:
     _rest: bytes = field(default=b"", repr=False)
 
     def fileno(self) -> int:
-        """File descriptor for `select`."""
         return self.pipe
 
     def wait_until_ready(self, timeout_s: float = READY_S) -> None:

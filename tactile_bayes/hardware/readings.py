@@ -251,7 +251,6 @@ class ArrivalClock:
         return min(self._last, self._now)
 
     def observe(self, device_ns: int, host_ns: int) -> None:
-        """Add one record's times."""
         difference = host_ns - device_ns
         if self.begun_ns is None:
             self.begun_ns, self._last, self._now = host_ns, difference, difference
