@@ -30,16 +30,7 @@ from tactile_bayes.files.instrument import calibration_document, head_document
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.findings import finding_summary
 from tactile_bayes.geometry import FloatArray, apply, inverse
-from tactile_bayes.hardware.live import (
-    Feed,
-    LiveMap,
-    LiveServer,
-    LiveState,
-    colour_limits,
-    grey_levels,
-    parse_address,
-    read_feed,
-)
+from tactile_bayes.hardware import live
 from tactile_bayes.hardware.reading import ENDING
 from tactile_bayes.mapping.map import Orientation, TactileMap, block_sums, orientation_of
 from tactile_bayes.posterior.bump import candidate_centres
@@ -60,7 +51,7 @@ def live_view(
 ) -> Iterator[Any]:
     """Start the view's process; yields an observer for the recorder."""
     if serve:
-        parse_address(serve)  # an error before anything is recorded
+        live.parse_address(serve)  # an error before anything is recorded
     calibration_file = size_calibration_path(size_calibration)
     if calibration_file is not None:
         read_size_calibration(calibration_file)  # likewise
@@ -79,7 +70,7 @@ def live_view(
     assert process.stdin is not None
     with process.stdin as start:
         start.write(json.dumps(setup))
-    feed = Feed(ours)
+    feed = live.Feed(ours)
     try:
         yield feed
     finally:
@@ -215,13 +206,15 @@ def run(pipe: int, setup: dict[str, Any]) -> None:
     """Follow a recording until it ends."""
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)  # the signal ends the recording, and that ends the view
-    live = LiveMap(from_plain(HeadGeometry, setup["head"]), from_plain(ElementCalibration, setup["calibration"]))
+    grown = live.LiveMap(
+        from_plain(HeadGeometry, setup["head"]), from_plain(ElementCalibration, setup["calibration"])
+    )
     estimator = LiveEstimator(setup["size_calibration"])
     with contextlib.ExitStack() as stack:
         stack.callback(estimator.close)
-        displays: list[Callable[[LiveState], None]] = []
+        displays: list[Callable[[live.LiveState], None]] = []
         if setup["serve"]:
-            server = LiveServer(*parse_address(setup["serve"]))
+            server = live.LiveServer(*live.parse_address(setup["serve"]))
             stack.callback(server.close)
             print(f"live view: {server.url}", file=sys.stderr, flush=True)
             displays.append(server.show)
@@ -229,14 +222,14 @@ def run(pipe: int, setup: dict[str, Any]) -> None:
             displays.append(stack.enter_context(terminal_view(keys=setup["keys"])))
         began = time.monotonic()
         drawn, drawings, newest = 0.0, 0, None
-        for batch in read_feed(pipe, BATCH_S):
-            live.take(batch)
+        for batch in live.read_feed(pipe, BATCH_S):
+            grown.take(batch)
             estimator.poll(newest)
             now = time.monotonic()
             if now - drawn < 1 / DRAWINGS_PER_S:
                 continue
             drawn, drawings = now, drawings + 1
-            state = live.state(size=estimator.answer.text, lump_base_mm=estimator.answer.lump_base_mm)
+            state = grown.state(size=estimator.answer.text, lump_base_mm=estimator.answer.lump_base_mm)
             newest = state.tactile_map
             for display in displays:
                 display(state)
@@ -246,13 +239,13 @@ def run(pipe: int, setup: dict[str, Any]) -> None:
 
 
 @contextlib.contextmanager
-def terminal_view(*, keys: bool = False) -> Iterator[Callable[[LiveState], None]]:
+def terminal_view(*, keys: bool = False) -> Iterator[Callable[[live.LiveState], None]]:
     """Draw on a terminal; one line per second where it cannot be redrawn."""
     out = sys.stderr
     if not can_redraw():
         last = 0.0
 
-        def print_line(state: LiveState) -> None:
+        def print_line(state: live.LiveState) -> None:
             nonlocal last
             if time.monotonic() - last >= 1.0:
                 last = time.monotonic()
@@ -262,7 +255,7 @@ def terminal_view(*, keys: bool = False) -> Iterator[Callable[[LiveState], None]
         return
     colour = has_styles()
 
-    def draw(state: LiveState) -> None:
+    def draw(state: live.LiveState) -> None:
         columns, lines = shutil.get_terminal_size()
         text = live_text(state, columns=columns - 1, lines=lines - 1, colour=colour, keys=keys)
         out.write("\x1b[H" + text.replace("\n", "\x1b[K\r\n") + "\x1b[J")
@@ -291,7 +284,7 @@ _MARK: Final = "X"
 _STEPS: Final = 256
 
 
-def live_text(state: LiveState, *, columns: int, lines: int, colour: bool, keys: bool = False) -> str:
+def live_text(state: live.LiveState, *, columns: int, lines: int, colour: bool, keys: bool = False) -> str:
     """One screen of lines, none longer than `columns`; `keys`: the recording's keys can be pressed on this terminal."""
     above = [_pressure(state, columns, colour=colour), _figures(state)[:columns], state.size_words[:columns]]
     below = [*textwrap.wrap(state.landmark_words, columns), RESEARCH_USE[:columns]]
@@ -301,14 +294,14 @@ def live_text(state: LiveState, *, columns: int, lines: int, colour: bool, keys:
     return "\n".join([*above, "", *_picture(state, columns, room, colour=colour), *below])
 
 
-def live_line(state: LiveState) -> str:
+def live_line(state: live.LiveState) -> str:
     """The live view in one line, for terminals that cannot be redrawn."""
     pressure = f"{state.pressure_words} {_ADVICE[state.tone]}".strip()
     behind = f"view {state.latency_ms:.0f} ms behind"
     return f"{pressure}; {_figures(state)}; {state.size_words}; {behind}"
 
 
-def _pressure(state: LiveState, columns: int, *, colour: bool) -> str:
+def _pressure(state: live.LiveState, columns: int, *, colour: bool) -> str:
     words = f" {state.pressure_words:>8}  {_ADVICE[state.tone]}"
     width = max(10, min(40, columns - len(words) - 2))
     level = 0.0 if not np.isfinite(state.pressure_kpa) else state.pressure_kpa
@@ -319,15 +312,15 @@ def _pressure(state: LiveState, columns: int, *, colour: bool) -> str:
     return f"\x1b[{_TONE_COLOUR[state.tone]}m{text}\x1b[0m" if colour else text
 
 
-def _figures(state: LiveState) -> str:
+def _figures(state: live.LiveState) -> str:
     return f"{state.account_words.replace('²', '2')}, {100 * state.used_share:.0f} % used"
 
 
-def _picture(state: LiveState, columns: int, lines: int, *, colour: bool) -> list[str]:
+def _picture(state: live.LiveState, columns: int, lines: int, *, colour: bool) -> list[str]:
     """The map between the labels of its edges, oriented by `orientation_of`, with a legend below."""
     if state.tactile_map is None:
         return ["no map yet: move the head over the lump within the pressure window"[:columns]]
-    view, values = orientation_of(state.tactile_map), grey_levels(state.tactile_map.mean)
+    view, values = orientation_of(state.tactile_map), live.grey_levels(state.tactile_map.mean)
     legend_lines = _LEGEND_LINES if lines >= _LEGEND_LINES + _LEAST_ROWS else 0
     wide, high = columns - 2 * _MARGIN, max(1, lines - 2 - legend_lines)
     pixels = view.screen(values)
@@ -342,7 +335,7 @@ def _picture(state: LiveState, columns: int, lines: int, *, colour: bool) -> lis
         row, column = int(down / step / 2), int(across / step)
         if 0 <= row < len(rows) and 0 <= column < len(rows[row]):
             rows[row][column] = f"\x1b[0;1;97m{_MARK}" if colour else _MARK
-    dark, bright = colour_limits(state.tactile_map.mean) or (np.nan, np.nan)
+    dark, bright = live.colour_limits(state.tactile_map.mean) or (np.nan, np.nan)
     recipe, marked = state.tactile_map.recipe, "" if state.lump_mm is None else f"; {_MARK} the lump"
     scale = f"a character is {step * recipe.cell_mm:g} mm wide{marked}"
     legend = [view.words, f"{recipe.value_words}: dark {dark:.3g} to bright {bright:.3g}", scale][:legend_lines]

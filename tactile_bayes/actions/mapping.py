@@ -29,7 +29,8 @@ def map_action(
     if twice := first_duplicate(scans):
         raise UsageError(f"{twice} is given twice; its frames would count twice: give each scan once")
     if output is None:
-        output = default_map_path(scans[0])
+        first = scans[0]
+        output = first.parent / ("map.nc" if first.stem == "scan" else f"{first.stem}.nc")
         if first_duplicate([*scans, output]) is not None:
             read_scan(output)  # a map given in place of a scan is named as such
         refuse_same([output], scans)
@@ -60,8 +61,3 @@ def map_action(
         if verbose:
             for (_, before), (step, after) in pairwise(times):
                 click.echo(f"{step}: {after - before:.3f} s", err=True)
-
-
-def default_map_path(scan: Path) -> Path:
-    """Default path of a scan's map: in the scan's folder and named after it."""
-    return scan.parent / ("map.nc" if scan.stem == "scan" else f"{scan.stem}.nc")

@@ -182,9 +182,8 @@ def _site_calibration(path: Path, document: dict[str, Any]) -> dict[str, Any]:
 def _repeatability(path: Path, document: dict[str, Any]) -> dict[str, Any]:
     repeatability = read_repeatability(path)
     provenance = dict(document["provenance"])
-    if isinstance(
-        inputs := provenance.get("inputs"), list
-    ):  # without the draws of each exam, of which there may be many
+    inputs = provenance.get("inputs")
+    if isinstance(inputs, list):  # without the draws of each exam, of which there may be many
         provenance["inputs"] = [
             one for one in inputs if not (isinstance(one, dict) and str(one.get("role")).startswith("draws_"))
         ]

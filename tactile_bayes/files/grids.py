@@ -216,8 +216,7 @@ def _read_arrays(path: Path, array: str) -> Grid:
         stated = arrays.pop("spacing_mm")
         sides = stated.reshape(-1)  # MATLAB's numbers have two axes
         if sides.dtype.kind not in "iuf" or len(sides) not in (1, 2):
-            what = f"spacing_mm is {stated.dtype} of shape {stated.shape}"
-            raise BadDataError(what, way_out="it must be one number")
+            raise BadDataError(f"spacing_mm is {stated.dtype} of shape {stated.shape}", way_out="it must be one number")
         return Grid(arrays, (float(sides[0]), float(sides[-1])), notes=notes)
     named = {name: one for name, one in arrays.items() if array in ("", name)}
     flat = {name: one for name, one in named.items() if one.ndim == 2 and min(one.shape) > 1}

@@ -129,8 +129,7 @@ MOST_LOST: Final = 100_000
 def encode_hello(hello: readings.HelloReading) -> bytes:
     """Encode a device's identity: rows and columns (0 for a tracker), saturation count, rate, name."""
     numbers = _HELLO.pack(hello.rows, hello.columns, hello.saturation_count, round(hello.rate_hz * 1000))
-    name = hello.device_id.encode()[:_MAX_ID]
-    return encode_packet(HELLO, numbers + name)
+    return encode_packet(HELLO, numbers + hello.device_id.encode()[:_MAX_ID])
 
 
 def encode_frame(counts: CountArray, *, sequence: int, device_us: int) -> bytes:

@@ -302,18 +302,18 @@ def _choose_tools(
             sent = listed or "one without a name"
             raise DeviceError(f"{port.name}: {fault}; it sends {sent}: give {option} one of them")
         full_names.append(matches[0] if matches else None)
-    candidates = [name for name in tools if name != full_names[1]]
-    if full_names[0] is None and len(candidates) > 1:
+    followed, fixed = full_names
+    candidates = [name for name in tools if name != fixed]
+    if followed is None and len(candidates) > 1:
         raise UsageError(
             f"{port.name} sends several tools: {listed}; name the one on the head with --tool, and one that is fixed "
             "to the body with --reference"
         )
-    if full_names[0] is None and full_names[1] is not None and not candidates:
-        raise UsageError(f"{port.name} sends only the reference, {full_names[1]!r}; is the tool on the head in sight?")
-    followed = full_names[0] if full_names[0] is not None else (candidates[0] if candidates else "")
-    if followed == full_names[1]:
-        raise UsageError(f"{port.name}: the tool and its reference are both {full_names[1]!r}; give two tools")
-    return followed, full_names[1]
+    if followed is None and fixed is not None and not candidates:
+        raise UsageError(f"{port.name} sends only the reference, {fixed!r}; is the tool on the head in sight?")
+    if followed is not None and followed == fixed:
+        raise UsageError(f"{port.name}: the tool and its reference are both {fixed!r}; give two tools")
+    return next(iter(candidates), "") if followed is None else followed, fixed
 
 
 def _open_framing(title: str, baud: int) -> TrackerDriver:
