@@ -206,9 +206,7 @@ def run(pipe: int, setup: dict[str, Any]) -> None:
     """Follow a recording until it ends."""
     for number in ENDING:
         signal.signal(number, signal.SIG_IGN)  # the signal ends the recording, and that ends the view
-    grown = live.LiveMap(
-        from_plain(HeadGeometry, setup["head"]), from_plain(ElementCalibration, setup["calibration"])
-    )
+    grown = live.LiveMap(from_plain(HeadGeometry, setup["head"]), from_plain(ElementCalibration, setup["calibration"]))
     estimator = LiveEstimator(setup["size_calibration"])
     with contextlib.ExitStack() as stack:
         stack.callback(estimator.close)
