@@ -203,7 +203,7 @@ def compare_answers(
     answers = list(chain.from_iterable(visits))
     all_names = list(chain.from_iterable(names))
     inputs = {f"visit_{v}_map_{i}": path for v, maps in enumerate(files, 1) for i, path in enumerate(maps, 1)}
-    calibration, digests = common_calibration(answers, settings, names=all_names, inputs=inputs)
+    calibration, named, digests = common_calibration(answers, settings, names=all_names, inputs=inputs)
     for index, earlier in repeated_scans([_scans([one]) for one in answers]).items():  # they are no two exams
         raise UsageError(f"{all_names[index]} and {all_names[earlier]} are of one scan; give one map of each scan")
     by_number = dict(zip(numbers or map(str, range(1, len(visits) + 1)), visits, strict=True))
@@ -217,7 +217,7 @@ def compare_answers(
     )
     compared = replace(compared, findings=by_severity((*compared.findings, *of_visits)))
     scans = _scans(answers)
-    recorded = {name: value for name, value in settings.recorded().items() if name in _RECORDED}
+    recorded = {name: value for name, value in settings.recorded(size_calibration=named).items() if name in _RECORDED}
     provenance = Provenance("compare", recorded | as_dict(comparing), digests, seed=settings.seed, scans=scans)
     report = compare_report(
         compared,

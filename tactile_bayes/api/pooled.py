@@ -18,6 +18,7 @@ from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError
 from tactile_bayes.files.posterior_nc import write_posterior
 from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.files.reports import EstimateReport, PooledReport
+from tactile_bayes.files.size_json import default_for
 from tactile_bayes.findings import by_severity
 from tactile_bayes.options import PRIORS
 from tactile_bayes.posterior.estimate import way_to_head
@@ -114,7 +115,7 @@ def pool_answers(
     scans = [scan for report in reports for scan in scans_of(report.provenance)]
     check_one_mass(scans)
     inputs = {f"map_{i}": path for i, path in enumerate(files, start=1)}
-    calibration, digests = common_calibration(answers, settings, names=names, inputs=inputs)
+    calibration, named, digests = common_calibration(answers, settings, names=names, inputs=inputs)
     # the maps' values in sorted order are part of the seed: the result does not depend on their order
     fingerprints = sorted(answer.fingerprint for answer in answers)
     places = [place for one in answers if one.shape is not None and (place := patient_place(one.report)) is not None]
@@ -133,7 +134,7 @@ def pool_answers(
         pooled = replace(pooled, reason=f"{pooled.reason}, {sizes} mm")
     pooled = replace(pooled, findings=by_severity(pooled_findings(pooled, reports)))
     # pooled files have the key `calibration`, and the priors together
-    recorded = settings.recorded()
+    recorded = settings.recorded(size_calibration=named)
     prior = {name: recorded.pop(name) for name in PRIORS}
     recorded = {"calibration": recorded.pop("size_calibration"), **recorded, "prior": prior}
     provenance = Provenance("estimate --pool", recorded, digests, seed=settings.seed, scans=scans)
@@ -176,8 +177,8 @@ def without_calibration(reports: Sequence[EstimateReport]) -> str:
 
 def common_calibration(
     answers: Sequence[Answer], settings: Settings, *, names: Sequence[str], inputs: Mapping[str, Path]
-) -> tuple[BodyCalibration, dict[str, str]]:
-    """The one calibration for all maps, and the digests of all files by role."""
+) -> tuple[BodyCalibration, str, dict[str, str]]:
+    """The one calibration for all maps, its name in a provenance, and the digests of all files by role."""
     ways = sorted({answer.normalise for answer in answers})
     if settings.size_calibration is None and len(ways) > 1:
         way_out = "give maps made by one recipe: make the others again with `map`"
@@ -194,4 +195,5 @@ def common_calibration(
         if differs := calibration.recipe.head_differences(answer.head):
             what = f"{name}: the calibration is for another head: {'; '.join(differs)}"
             raise BadDataError(what, way_out=way_to_head(answer.head))
-    return calibration, input_digests({**inputs, "size_calibration": path}, settings, calibration)
+    named = settings.calibration_name or f"{default_for(ways[0])} (shipped)"
+    return calibration, named, input_digests({**inputs, "size_calibration": path}, settings, calibration)

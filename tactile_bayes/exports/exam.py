@@ -27,7 +27,6 @@ from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.posterior_nc import posterior_attributes
 from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
 from tactile_bayes.files.reports import REPORTS, EstimateReport, MassReport, PooledReport, centre_of
-from tactile_bayes.files.size_json import shipped_name
 from tactile_bayes.findings import capitalised, finding_lines
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.inference.draws import Quantity
@@ -195,9 +194,7 @@ class EstimateFile(Record, eq=False):
     def method_words(self) -> str:
         """Method and calibration in a phrase."""
         settings = self.report.origin.settings
-        digests = {one.role: one.sha256 for one in self.report.origin.inputs}
-        named = settings.get("size_calibration") or settings.get("calibration")  # a pooled size by default names none
-        calibration = named or shipped_name(digests.get("size_calibration", "")) or "as shipped"
+        calibration = settings.get("size_calibration") or settings.get("calibration") or "as shipped"
         return plain_line(f"method {settings.get('method') or 'unknown'}, size calibration {calibration}")
 
     @property

@@ -51,11 +51,6 @@ def size_calibration_path(name: str) -> Path | None:
     return path
 
 
-def shipped_name(digest: str) -> str:
-    """Name of the calibration with this SHA-256 that comes with the program; empty for another."""
-    return next((f"{name} (shipped)" for name, file in SHIPPED.items() if sha256(_FOLDER / file) == digest), "")
-
-
 # --- Size calibrations as JSON: over a population, corrected by a site's phantoms, or Eq 6 with draws of its
 # coefficients.
 #

@@ -93,6 +93,7 @@ def test_a_bump_that_became_higher_and_a_little_wider_has_grown(grown: dict) -> 
     assert doubling == pytest.approx(np.log(2) / (rate["median"] / 100), rel=1e-6)
     assert [one["distance_mm"] for one in grown["places"]] == [pytest.approx(0.0, abs=1.0)]
     assert [len(one["maps"]) for one in grown["visits"]] == [2, 2]
+    assert grown["provenance"]["settings"]["size_calibration"] == "solid-mean (shipped)"
     assert [scan.get("side") for scan in grown["provenance"]["scans"]] == ["left", "left", None, None]
 
 

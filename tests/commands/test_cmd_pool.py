@@ -121,6 +121,7 @@ def test_none_gives_widths_and_a_map_made_otherwise_says_why_it_has_no_size(fold
 
 def test_a_pooled_mass_keeps_its_schema_and_its_maps(pooled: dict, folder: Path) -> None:
     check_document(pooled, "pooled.schema.json")
+    assert pooled["provenance"]["settings"]["calibration"] == "solid-mean (shipped)"
     assert [one["map"] for one in pooled["maps"]] == ["mass1.nc", "mass2.nc", "mass3.nc"]
     alone = json.loads(run_here("estimate", "mass1.nc", *FAST, "--json", cwd=folder).stdout)
     size, another = pooled["max_size_mm"], pooled["another_exam"]["max_size_mm"]

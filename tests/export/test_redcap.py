@@ -12,10 +12,7 @@ import pytest
 from export_files import exported
 from in_process import run_here
 
-from tactile_bayes.exports.exam import parse_estimate
 from tactile_bayes.exports.redcap import COMPLETE
-from tactile_bayes.files.atomic import sha256
-from tactile_bayes.files.size_json import size_calibration_path
 
 # REDCap's help: 18 columns; names of lower-case letters, digits and underscores that begin with a letter, at most 26
 # characters advised; field types; validation types; a choice is "CODE, LABEL", parted by " | ".
@@ -150,11 +147,3 @@ def test_no_cell_is_a_formula_or_breaks_the_line(estimate: dict[str, Any], tmp_p
     assert row["tb_mass"] == "'=1"
     assert row["tb_visit"] == "-1"
     assert len((tmp_path / "h.csv").read_text().splitlines()) == 2
-
-
-def test_an_estimate_that_names_no_calibration_has_the_name_of_the_shipped_one(estimate: dict[str, Any]) -> None:
-    """As a pooled one: by its digest; the control is of a digest that is none of ours."""
-    for digest, name in ((sha256(size_calibration_path("eq6")), "eq6 (shipped)"), ("ab" * 32, "as shipped")):
-        told = {"settings": {}, "inputs": [{"role": "size_calibration", "sha256": digest}]}
-        found = parse_estimate(estimate | {"provenance": estimate["provenance"] | told}, Path("e.json"))
-        assert found.method_words.endswith(f"size calibration {name}")
