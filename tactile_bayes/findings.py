@@ -41,6 +41,7 @@ KINDS: Final[Mapping[str, Severity]] = {
     # of a mass
     "side": "caution",
     "outside_calibration": "caution",
+    "own_settings": "caution",
     "irregular": "check",
     "coarse_cells": "check",
     "uneven_level": "check",

@@ -15,6 +15,7 @@ from tactile_bayes.findings import Finding, by_severity, finding
 from tactile_bayes.inference.ensemble import convergence
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.mapping.plausibility import map_findings
+from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import verdict, white
 from tactile_bayes.posterior.bump import Detection, levelled, window_cells
 from tactile_bayes.posterior.correlated import CorrelatedAssessment
@@ -327,7 +328,7 @@ def _estimate_of_lump(task: EstimationTask, assessment: Assessment, candidates: 
         scene=assessment.scene,
         sensitivity=prior_sensitivity(posterior.sigma_x_mm, posterior.sigma_y_mm, quantities, options.prior),
         bump=bump,
-        findings=tuple(_findings(result, cell_mm=cell_mm)),
+        findings=(*_findings(result, cell_mm=cell_mm), *_prior_findings(result, options.prior)),
     )
 
 
@@ -413,7 +414,7 @@ def _findings(result: MapDraws, *, cell_mm: float) -> Iterator[Finding]:
             text = f"the errors of the map were resolved by {cosines} basis functions along each axis, and sizes were "
             text += f"learned with {FIELD_COSINES} or more"
             remedy, on_paper = "leave field_cosines out of the settings", "have the size estimated anew without that"
-            yield finding("outside_calibration", text, remedy, on_paper)
+            yield finding("own_settings", text, remedy, on_paper)
     if posterior.irregular:
         yield _IRREGULAR
     if cell_mm > CELL_PER_SIGMA * min(posterior.medians[1:]):
@@ -428,6 +429,29 @@ def _findings(result: MapDraws, *, cell_mm: float) -> Iterator[Finding]:
             "interval says"
         )
         yield finding("uneven_level", text)
+
+
+def _prior_findings(result: MapDraws, prior: BumpPrior) -> Iterator[Finding]:
+    """Cautions where priors of one's own set the bump as much as the map does.
+
+    They do where the posterior keeps half of the prior's SD, or lies half of its own SD from where it would without it;
+    least squares use none.
+    """
+    bump, own = result.posterior, [] if result.draws.method == "optimise" else verdict.own_priors(prior)
+    amplitude = bump.amplitude / result.fit.bump.scale
+    width = 0.5 * np.log(bump.sigma_x_mm * bump.sigma_y_mm)
+    ratio = 0.5 * np.log(bump.sigma_x_mm / bump.sigma_y_mm)
+    for names, draws, mean, sd in (
+        (("amplitude_sd",), amplitude, 0.0, prior.amplitude_sd),
+        (("width_median_mm", "log_width_sd"), width, np.log(prior.width_median_mm), prior.log_width_sd),
+        (("log_ratio_sd",), ratio, 0.0, prior.log_ratio_sd),
+    ):
+        named, kept = [name for name in names if name in own], float(draws.std()) / sd
+        if named and max(kept, kept * abs(float(draws.mean()) - mean) / sd) > 0.5:
+            given = ", ".join(f"{name} = {getattr(prior, name):g}" for name in named)
+            text = "the size follows the priors it was estimated with as much as the map"
+            remedy = f"{given}: leave {' and '.join(named)} out of the settings"
+            yield finding("own_settings", text, remedy, "have it estimated anew without them")
 
 
 def _omissions(tactile_map: TactileMap, options: SamplerSettings, result: MapDraws) -> tuple[str, ...]:

@@ -156,10 +156,14 @@ def no_verdict(tactile_map: TactileMap) -> Abstention | None:
     return cannot_show(first.text, "; ".join(remedies), "; ".join(on_paper))
 
 
+def own_priors(prior: BumpPrior) -> list[str]:
+    """Names of the priors that are not the default ones."""
+    return [name for name in PRIORS if getattr(prior, name) != getattr(BumpPrior(), name)]
+
+
 def hiding_settings(options: FitSettings) -> Abstention | None:
     """Reason why a fit with priors of one's own, or in a small window, excludes no lump; None with neither."""
-    defaults = BumpPrior()
-    own = [name for name in PRIORS if getattr(options, name) != getattr(defaults, name)]
+    own = own_priors(options)
     own += ["fit_radius_mm"] if (options.fit_radius_mm or FIT_RADIUS_MM) < 0.4 * FIT_RADIUS_MM else []
     if not own:
         return None

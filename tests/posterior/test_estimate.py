@@ -148,6 +148,30 @@ def test_outside_the_calibration_is_flagged() -> None:
     assert not any(one.kind == "outside_calibration" for one in run(use=calibration()).findings)
 
 
+@pytest.mark.parametrize(
+    ("own", "named"),
+    [
+        ({"amplitude_sd": 0.02}, "amplitude_sd = 0.02"),
+        ({"width_median_mm": 6.0, "log_width_sd": 0.01}, "width_median_mm = 6, log_width_sd = 0.01"),
+        ({"log_ratio_sd": 0.03}, "log_ratio_sd = 0.03"),
+        ({"amplitude_sd": 0.5, "width_median_mm": 6.0, "log_width_sd": 0.5, "tilt_sd": 1e-6}, None),
+    ],
+)
+def test_priors_of_ones_own_that_set_the_size_are_a_caution(own: dict[str, float], named: str | None) -> None:
+    cautions = [one.remedy for one in run(fit=replace(OFF, **own)).findings if one.kind == "own_settings"]
+    assert [text.partition(":")[0] for text in cautions] == ([] if named is None else [named])
+    # least squares have no priors
+    unused = run(fit=replace(OFF, **own), method="optimise").findings
+    assert not any(one.kind == "own_settings" for one in unused)
+
+
+def test_errors_resolved_more_coarsely_than_the_calibrations_are_a_caution_that_pools_keep() -> None:
+    field = {"noise": "field", "background": "free"}
+    found = run(fit=replace(OFF, field_cosines=6, **field), use=calibration(replace(RECIPE, **field)))
+    assert [one.kind for one in found.findings] == ["own_settings"]
+    assert found.findings[0].remedy == "leave field_cosines out of the settings"
+
+
 def test_far_outside_the_calibration_there_is_no_size() -> None:
     found = run(use=calibration(), amplitude=2.0)
     assert (found.status, found.code, found.size) == ("no_estimate", "extrapolated", None)
