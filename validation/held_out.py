@@ -25,7 +25,7 @@ from tactile_bayes.files.tables import read_table
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.learn.bodies import learn_population, size_errors
-from tactile_bayes.size.learn.regression import PopulationTable
+from tactile_bayes.size.learn.regression import PopulationTable, rows_of
 from tactile_bayes.studies.population import population_table
 from validation.common import Table, parser
 
@@ -83,7 +83,7 @@ def figures(found: FloatArray) -> tuple[str, ...]:
 
 def classes(table: PopulationTable) -> dict[str, BoolArray]:
     """Classes of lumps, by the first exam of each body."""
-    table = table.rows(np.isin(np.arange(len(table)), np.unique(table.body, return_index=True)[1]))
+    table = rows_of(table, np.isin(np.arange(len(table)), np.unique(table.body, return_index=True)[1]))
     stiffness, seat = np.exp(table.unknowns["stiffness_ratio"]), table.unknowns["seat"]
     ratio, amplitude = np.exp(table.unknowns["depth_mm"]) / table.d_mm, np.exp(table.log_amplitude)
     return {
@@ -109,11 +109,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     members: dict[str, list[BoolArray]] = {}
     for seed in range(1, given.draws + 1):
         taught = np.isin(table.body, np.random.default_rng(seed).permutation(bodies)[: int(LEARNED * len(bodies))])
-        rest = table.rows(~taught)
+        rest = rows_of(table, ~taught)
         without = replace(rest, profile=np.full((len(rest), 3), np.nan))
         one_by_one = replace(rest, body=np.arange(len(rest)))
         for form, residual in FORMS.items():
-            learned = learn_population(table.rows(taught), recipe=recipe, residual=residual)
+            learned = learn_population(rows_of(table, taught), recipe=recipe, residual=residual)
             ways = {"": errors(learned, rest), ", each exam by itself": errors(learned, one_by_one)}
             if residual:
                 ways[", without the head's profile"] = errors(learned, without)

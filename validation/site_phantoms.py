@@ -19,7 +19,7 @@ from tactile_bayes.presets import LEAST_HARD_RATIO
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws
 from tactile_bayes.size.learn.bodies import learn_population
-from tactile_bayes.size.learn.regression import PopulationTable
+from tactile_bayes.size.learn.regression import PopulationTable, rows_of
 from tactile_bayes.size.learn.site import PhantomMap, SitePrior, correct_calibration
 from validation.common import parser
 from validation.held_out import LEARNED, NORMAL_95, errors, population, shipped
@@ -55,9 +55,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     table, rng = population("gain"), np.random.default_rng(SEED)
     bodies = np.unique(table.body)
     taught = np.isin(table.body, np.random.default_rng(1).permutation(bodies)[: int(LEARNED * len(bodies))])
-    calibration = learn_population(table.rows(taught), recipe=shipped("solid").recipe)
-    rest = table.rows(~taught)
-    rest = rest.rows(np.isin(np.arange(len(rest)), np.unique(rest.body, return_index=True)[1]))
+    calibration = learn_population(rows_of(table, taught), recipe=shipped("solid").recipe)
+    rest = rows_of(table, ~taught)
+    rest = rows_of(rest, np.isin(np.arange(len(rest)), np.unique(rest.body, return_index=True)[1]))
     exams = patients_of(calibration, rest)
     hard = np.flatnonzero(np.exp(rest.unknowns["stiffness_ratio"]) >= LEAST_HARD_RATIO)
     for count, stated, off in SITES:

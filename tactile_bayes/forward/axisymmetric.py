@@ -158,10 +158,9 @@ def taxel_compliance(layers: Layers, *, rows: int, columns: int, pitch_mm: float
     offset, weight = pitch_mm * np.sqrt(0.4) * np.array([-1.0, 0.0, 1.0]), np.array([5.0, 14.0, 5.0]) / 24.0
     layering = smooth(np.hypot(dx[:, None, None, None] + offset[:, None], dy[None, :, None, None] + offset[None, :]))
     by_offset += pitch_mm**2 * np.einsum("rcij,i,j->rc", layering, weight, weight)
-    row, column = np.divmod(np.arange(rows * columns), columns)
-    return np.asarray(
-        by_offset[np.abs(row[:, None] - row[None, :]), np.abs(column[:, None] - column[None, :])], dtype=np.float64
-    )
+    places = np.divmod(np.arange(rows * columns), columns)
+    rows_apart, columns_apart = (np.abs(np.subtract.outer(one, one)) for one in places)
+    return np.asarray(by_offset[rows_apart, columns_apart], dtype=np.float64)
 
 
 # --- Change of the skin's compliance by a spheroidal lump in a layered body: finite elements in Fourier modes.

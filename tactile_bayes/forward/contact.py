@@ -34,9 +34,8 @@ class HeadSection(Record):
         half = f"{self.half_width_mm:g} mm, half the head's width"
         require(self.radius_mm > self.half_width_mm, "radius_mm of the head", self.radius_mm, f"be above {half}")
         if self.shoulders not in HEADS:
-            raise BadDataError(
-                f"shoulders of the head is {self.shoulders!r}", way_out=f"it must be {' or '.join(HEADS)}"
-            )
+            what = f"shoulders of the head is {self.shoulders!r}"
+            raise BadDataError(what, way_out=f"it must be {' or '.join(HEADS)}")
         shoulder, name = self.shoulder_mm, "shoulder_mm of the head"
         fits = self.shoulders != SHOULDERS_INSIDE or 0 <= shoulder <= self.half_width_mm
         require(fits, name, shoulder, f"be between 0 and {half}")
@@ -127,9 +126,8 @@ class ContactStiffness(Record, eq=False):
         try:
             np.linalg.cholesky(compliance)
         except np.linalg.LinAlgError:
-            raise BadDataError(
-                "the compliance is not positive definite", way_out="give a body with positive stiffness"
-            ) from None
+            what = "the compliance is not positive definite"
+            raise BadDataError(what, way_out="give a body with positive stiffness") from None
         empty = np.zeros((len(compliance), 0))
         inverse = np.linalg.inv(compliance)
         return cls((inverse + inverse.T) / 2, empty, np.zeros((0, 0)))
@@ -219,6 +217,5 @@ def solve_contact(
             guess[np.flatnonzero(wrong)[-1]] ^= True
         if not (guess & (share > 0)).any():
             guess[int(np.argmin(np.where(share > 0, height_mm, np.inf)))] = True
-    raise NotConvergedError(
-        "the contact between head and skin did not converge", diagnostics={"wrong_signs": float(fewest)}
-    )
+    figures = {"wrong_signs": float(fewest)}
+    raise NotConvergedError("the contact between head and skin did not converge", diagnostics=figures)

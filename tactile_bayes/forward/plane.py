@@ -345,6 +345,17 @@ def lump_pressure(x_mm: FloatArray, *, height_kpa: float, width_mm: float) -> Fl
     return np.asarray(height_kpa * np.exp(-0.5 * (np.asarray(x_mm) / width_mm) ** 2))
 
 
+def fit_lump_pressure(x_mm: FloatArray, data: FloatArray, *, widths_mm: tuple[float, float]) -> tuple[float, float]:
+    """Height and width (mm) of the Gaussian of Eq 2 by least squares, its width between the two given."""
+    low, high = np.log(widths_mm)
+
+    def shape(log_width: float) -> FloatArray:
+        return lump_pressure(x_mm, height_kpa=1.0, width_mm=float(np.exp(log_width)))
+
+    fit = fit_shape(shape, data, grid=np.linspace(low, high, 60))
+    return fit.height, float(np.exp(fit.parameter))
+
+
 def kappa(x_c_mm: FloatArray, *, d_mm: float) -> FloatArray:
     r"""Share of the homogeneous profile that stays under the head at a distance from the lump.
 
@@ -409,18 +420,12 @@ def fit_empirical(
         curvature = scaled / half_width_mm**2
         return EmpiricalModel(1.0, curvature, 0.0, 1.0, d_mm, half_width_mm).homogeneous(s_mm)
 
-    def bump(log_width: float) -> FloatArray:
-        return lump_pressure(s_mm, height_kpa=1.0, width_mm=float(np.exp(log_width)))
-
     # 1 is the profile that falls to 0 at the sides; far below -8 the middle would be a small part of the sides
     far = fit_shape(profile, far_kpa, grid=np.linspace(-8.0, 1.0, 31))
-    # all widths that a frame can show
-    ends = np.log([0.5 * float(s_mm[1] - s_mm[0]), 10.0 * float(np.abs(s_mm).max())])
-    over = fit_shape(
-        bump, centred_kpa - SHARE * (far.height * profile(far.parameter)), grid=np.linspace(ends[0], ends[1], 60)
-    )
-    curvature, width = far.parameter / half_width_mm**2, float(np.exp(over.parameter))
-    return EmpiricalModel(far.height, curvature, over.height, width, d_mm, half_width_mm)
+    every_width = 0.5 * float(s_mm[1] - s_mm[0]), 10.0 * float(np.abs(s_mm).max())  # that a frame can show
+    added = centred_kpa - SHARE * (far.height * profile(far.parameter))
+    height, width = fit_lump_pressure(s_mm, added, widths_mm=every_width)
+    return EmpiricalModel(far.height, far.parameter / half_width_mm**2, height, width, d_mm, half_width_mm)
 
 
 class ShapeFit(Record):

@@ -212,9 +212,8 @@ class Scene(Timing):
                 way_out="describe all lumps of a scene in one way",
             )
         if self.lumps and self.ribs:
-            raise BadDataError(
-                "lump[0] is a bump and rib[0] is tissue", way_out="give the lump depth_ratio, or leave out the rib"
-            )
+            way_out = "give the lump depth_ratio, or leave out the rib"
+            raise BadDataError("lump[0] is a bump and rib[0] is tissue", way_out=way_out)
         check_solid(self.body or SceneBody(), self.solid_lumps, self.ribs)
 
     @property

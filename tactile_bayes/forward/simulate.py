@@ -132,9 +132,8 @@ def felt_at_poses(
     place, most = section.places_mm(rotation, origin_mm), section.most_reach_mm
     reach = float(np.abs(place).max()) + section.half_face_mm + 1.0
     if reach > most:
-        raise BadDataError(
-            f"the head gets {reach:.4g} mm from the lump", way_out=f"the {model} model reaches {most:g} mm"
-        )
+        what = f"the head gets {reach:.4g} mm from the lump"
+        raise BadDataError(what, way_out=f"the {model} model reaches {most:g} mm")
     return section.frames(rotation, origin_mm, mean_kpa, reach_mm=reach, progress=progress)
 
 

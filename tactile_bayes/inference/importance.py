@@ -100,10 +100,8 @@ class Gaussians(Record, eq=False):
     def moments(self) -> tuple[FloatArray, FloatArray]:
         """(p,) mean and (p, p) covariance of the whole."""
         mean = self.weight @ self.mean
-        off = self.mean - mean
-        return mean, np.asarray(
-            np.einsum("h,hpq->pq", self.weight, self.covariance) + (self.weight[:, None] * off).T @ off
-        )
+        within = np.einsum("h,hpq->pq", self.weight, self.covariance)
+        return mean, np.asarray(within + _covariance(self.mean, self.weight, mean))
 
     def conditional(self, last: FloatArray) -> Gaussians:
         """Conditional mixture of the first parameters given (j,) values of the last."""
@@ -203,13 +201,11 @@ def fitted_gaussians(
         z = np.linalg.solve(np.linalg.cholesky(covariance), (theta - centre).T)
         nearest = np.argsort(np.sum(z**2, axis=0), kind="stable")[:ADDED]
         mixed_weight = weight[nearest] + 1.0 / len(theta)
-        covariances.append(
-            _covariance(theta[nearest], mixed_weight / mixed_weight.sum(), centre) + LEAST_VARIANCE * covariance
-        )
+        near = _covariance(theta[nearest], mixed_weight / mixed_weight.sum(), centre)
+        covariances.append(near + LEAST_VARIANCE * covariance)
         points = centre + rng.standard_normal((ADDED, len(centre))) @ np.linalg.cholesky(covariances[-1]).T
-        log_share = np.logaddexp(
-            log_share, np.log(ADDED) + Gaussians.single(centre, covariances[-1]).log_density(theta)
-        )
+        added = Gaussians.single(centre, covariances[-1])
+        log_share = np.logaddexp(log_share, np.log(ADDED) + added.log_density(theta))
         earlier = Gaussians(np.full(number, 1.0 / number), np.array(means[1:]), np.array(covariances[1:]))
         log_share_of_added = np.log(ADDED * number) + earlier.log_density(points)
         log_share = np.concatenate([log_share, np.logaddexp(np.log(n) + first.log_density(points), log_share_of_added)])
@@ -366,10 +362,9 @@ class _Sampler:
 
     def adapted(self) -> _Sampler:
         """Sampler without points whose proposal is fitted to these points."""
-        gaussians, earlier = fitted_gaussians(
-            self._log_density, self._proposal, self.theta, self.log_target.ravel(), rng=self._rng
-        )
-        earlier += self.evaluations
+        points = self.theta, self.log_target.ravel()
+        gaussians, evaluations = fitted_gaussians(self._log_density, self._proposal, *points, rng=self._rng)
+        earlier = self.evaluations + evaluations
         return _Sampler(self._log_density, gaussians, stretch=STRETCH, rng=self._rng, earlier=earlier)
 
     @property

@@ -46,12 +46,9 @@ def frame_sources(
     selections: Sequence[SelectedFrames], *, plane_from_base: FloatArray, cell_mm: float
 ) -> list[FrameSource]:
     """The scans' used frames on one lattice."""
-    return [
-        FrameSource(
-            part, part.projector(plane_from_base=plane_from_base, cell_mm=cell_mm).at(part.poses.part(part.used))
-        )
-        for part in selections
-    ]
+    projectors = [part.projector(plane_from_base=plane_from_base, cell_mm=cell_mm) for part in selections]
+    pairs = zip(selections, projectors, strict=True)
+    return [FrameSource(part, projector.at(part.poses.part(part.used))) for part, projector in pairs]
 
 
 # --- Gains per frame, solved jointly with the map: dividing by the mean would lower the lump.
@@ -253,20 +250,12 @@ def add_all(
 class MapAccumulator:
     """Map that grows by frames, in any portions and order, each divided by its mean, and can be read at any time."""
 
-    def __init__(
-        self,
-        head: HeadGeometry,
-        calibration: ElementCalibration,
-        *,
-        plane_from_base: FloatArray,
-        pressure_window_kpa: tuple[float, float] = PRESSURE_WINDOW_KPA,
-        cell_mm: float = CELL_MM,
-    ) -> None:
+    def __init__(self, head: HeadGeometry, calibration: ElementCalibration, *, plane_from_base: FloatArray) -> None:
         self.plane_from_base = plane_from_base
         taxels = np.ones(head.shape, dtype=bool)
-        self._head, self._readout, self._window_kpa = head, cells.Readout.of(calibration, taxels), pressure_window_kpa
-        self._projector = cells.Projector(head, plane_from_base=plane_from_base, taxels=taxels, cell_mm=cell_mm)
-        self._sums, self._profile = cells.CellSums(cell_mm), GrowingProfile(taxels)
+        self._head, self._readout = head, cells.Readout.of(calibration, taxels)
+        self._projector = cells.Projector(head, plane_from_base=plane_from_base, taxels=taxels, cell_mm=CELL_MM)
+        self._sums, self._profile = cells.CellSums(CELL_MM), GrowingProfile(taxels)
         dropped = ("dropped_no_pose", "dropped_elements", "dropped_low", "dropped_high")
         self._counters = Counter(dict.fromkeys(("frames_total", "frames_used", *dropped, "saturated_readings"), 0))
 
@@ -285,7 +274,7 @@ class MapAccumulator:
     def _add(self, counts: CountArray, poses: cells.FramePoses) -> BoolArray:
         pressure, valid = self._readout.pressure_kpa(counts)
         level, share = self._readout.levels(pressure, valid)
-        low, high, used = gate(poses.known, level, share, pressure_window_kpa=self._window_kpa)
+        low, high, used = gate(poses.known, level, share, pressure_window_kpa=PRESSURE_WINDOW_KPA)
         dropped = {"dropped_no_pose": ~poses.known, "dropped_low": low, "dropped_high": high}
         dropped["dropped_elements"] = ~(used | low | high | ~poses.known)
         self._counters.update({name: int(np.count_nonzero(mask)) for name, mask in dropped.items()})
@@ -303,11 +292,9 @@ class MapAccumulator:
 
     def snapshot(self) -> TactileMap:
         """A copy of the map so far, without `shared_frame_figures`; it has no cell before the first frame."""
-        sums = self._sums.trimmed()
-        low, high = self._window_kpa
         return TactileMap(
-            **sums.map_arrays(),
-            recipe=MapRecipe("scan", "mean", float(sums.cell_mm), (float(low), float(high))),
+            **self._sums.trimmed().map_arrays(),
+            recipe=MapRecipe("scan", "mean", CELL_MM, PRESSURE_WINDOW_KPA),
             plane_from_base=self.plane_from_base,
             frame_count=self._counters["frames_used"],
             quality=self.figures | self._profile.figures(),

@@ -345,9 +345,8 @@ def _screened(rough: _Overlap, trials: Sequence[Trial], *, stretches: int) -> tu
     for trial in trials:
         gain = rough.judge(*trial).gain_over(stated)
         odds = -stretches * gain - log(len(trials) + 1)
-        if stretches * (gain + _ROUGH_MARGIN) >= log(LIKELY_ODDS) or (
-            trial[0] in _ARRAY[1:] and odds < log(LIKELY_ODDS)
-        ):
+        may_fit = stretches * (gain + _ROUGH_MARGIN) >= log(LIKELY_ODDS)
+        if may_fit or (trial[0] in _ARRAY[1:] and odds < log(LIKELY_ODDS)):
             close.append(trial)
         elif trial[0]:
             excluded[trial[0][0]] = odds
@@ -552,9 +551,8 @@ class _Overlap(Record, eq=False, dict=True):
         taxels = array.weight.T @ apply(tracker_from_head, surface.reshape(-1, 3)[array.taxels])
         middle, path = taxels.mean(axis=0), self._path(corrections)
         centre, offsets = path.places_mm(middle), taxels - middle
-        scatter = len(offsets) * np.cov(centre.T, bias=True) + np.mean(
-            path.rotation @ (offsets.T @ offsets) @ path.rotation.swapaxes(1, 2), axis=0
-        )
+        spread = path.rotation @ (offsets.T @ offsets) @ path.rotation.swapaxes(1, 2)
+        scatter = len(offsets) * np.cov(centre.T, bias=True) + spread.mean(axis=0)
         axes = np.linalg.eigh(scatter)[1]
         plane, normal = axes[:, [2, 1]].T, axes[:, 0]
         place = (centre @ plane.T)[:, :, None] + plane @ path.rotation @ offsets.T

@@ -81,11 +81,6 @@ def _rise_at(sums: CellSums, rises: FloatArray, cell: IndexArray) -> float:
     return float(rises[row, column]) if on_map else float("nan")
 
 
-def highest_point_mm(selections: Sequence[SelectedFrames], plane: Plane) -> FloatArray:
-    """(2,) highest point of the smoothed map on `plane`."""
-    return np.asarray(_highest(*_rises(selections, plane))[::-1] * _CELL_MM)
-
-
 def _moved(parts: Sequence[SelectedFrames], plane: Plane, told: _Parts) -> tuple[Finding, ...]:
     """Caution where two parts have their highest rises each where the other has none: one lump would be mapped twice.
 
@@ -122,15 +117,15 @@ def local_plane(
     None takes half the diagonal of the array, within which it reaches the point, and widens it while the frames span no
     plane. A stated radius without frames, or whose frames span no plane, is a `BadDataError`.
     """
-    highest, distances = highest_point_mm(selections, plane), []
+    highest_mm = _highest(*_rises(selections, plane))[::-1] * _CELL_MM
+    distances, reaches = [], []
     for part in selections:
         head = part.scan.head
         middle = apply(inverse(head.scanhead_from_tracker), head.surface_mm.reshape(-1, 3).mean(axis=0))
         centre = apply(plane.plane_from_base, part.poses.places_mm(middle))
-        distances.append(np.linalg.norm(centre[:, :2] - highest, axis=1))
-    radius = radius_mm or max(
-        float(np.hypot(*np.ptp(part.scan.head.surface_mm[..., :2].reshape(-1, 2), axis=0))) / 2 for part in selections
-    )
+        distances.append(np.linalg.norm(centre[:, :2] - highest_mm, axis=1))
+        reaches.append(float(np.hypot(*np.ptp(head.surface_mm[..., :2].reshape(-1, 2), axis=0))) / 2)
+    radius = radius_mm or max(reaches)
     while True:
         near = [part.used & (distance <= radius) for part, distance in zip(selections, distances, strict=True)]
         moments = _moments(selections, near)
@@ -354,9 +349,8 @@ def _check_same_examination(scans: list[Scan]) -> None:
         facts = [absent | dict(scan.session) for scan in scans]
         values = sorted({fact[name] for fact in facts if name in fact})
         if len(values) > 1:
-            raise BadDataError(
-                f"the scans differ in {name} ({', '.join(values)})", way_out="build one map per examination"
-            )
+            what = f"the scans differ in {name} ({', '.join(values)})"
+            raise BadDataError(what, way_out="build one map per examination")
 
 
 def _as_map(

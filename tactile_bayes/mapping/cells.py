@@ -304,12 +304,8 @@ class CellSums:
             old_bottom, old_right = old_top + rows, old_left + columns
             if top >= old_top and left >= old_left and bottom <= old_bottom and right <= old_right:
                 return
-            top, left, bottom, right = (
-                min(top, old_top),
-                min(left, old_left),
-                max(bottom, old_bottom),
-                max(right, old_right),
-            )
+            top, left = min(top, old_top), min(left, old_left)
+            bottom, right = max(bottom, old_bottom), max(right, old_right)
         refuse_vast(bottom - top, right - left, self.cell_mm)
         self.first = (top - _GROWTH, left - _GROWTH)
         for name in ("count", "total", "square"):

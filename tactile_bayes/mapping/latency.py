@@ -372,12 +372,11 @@ class StrokeShift(Record):
 
 def find_strokes(sources: Sequence[FrameSource]) -> list[StrokeShift]:
     """Runs of the scans' used frames in one direction along x, their shifts unknown yet; a turn ends a run."""
+    paths = [source.projection.shift[:, 0] * source.projection.cell_mm for source in sources]
     return [
         StrokeShift(start, stop, number, direction)
-        for number, source in enumerate(sources)
-        for start, stop, direction in convention.strokes_along(
-            source.projection.shift[:, 0] * source.projection.cell_mm
-        )
+        for number, path in enumerate(paths)
+        for start, stop, direction in convention.strokes_along(path)
     ]
 
 
@@ -397,9 +396,8 @@ def register_strokes(sources: Sequence[FrameSource]) -> tuple[list[FrameSource],
     """
     strokes = find_strokes(sources)
     if len(strokes) < 2:
-        raise BadDataError(
-            f"the scan has {len(strokes)} stroke over {convention.LEAST_REACH_MM:g} mm", way_out="scan back and forth"
-        )
+        what = f"the scan has {len(strokes)} stroke over {convention.LEAST_REACH_MM:g} mm"
+        raise BadDataError(what, way_out="scan back and forth")
     numbers = [len(one.frames) * 5e-3 / convention.POOL_S * one.selection.readout.size / 4 for one in sources]
     every = [max(1, int(np.ceil(len(strokes) * readings / _MOST_NUMBERS))) for readings in numbers]
     parts, shifts = _stroke_frames(sources, strokes, every), np.zeros(len(strokes))
@@ -420,9 +418,8 @@ def register_strokes(sources: Sequence[FrameSource]) -> tuple[list[FrameSource],
         replace(stroke, shift_mm=float(shift), sd_mm=float(error), known=bool(sure))
         for stroke, shift, error, sure in zip(strokes, shifts, errors, known, strict=True)
     ]
-    return [
-        _shifted_back(source, [one for one in shifted if one.scan == n]) for n, source in enumerate(sources)
-    ], shifted
+    moved = [_shifted_back(source, [one for one in shifted if one.scan == n]) for n, source in enumerate(sources)]
+    return moved, shifted
 
 
 def mobility(strokes: Sequence[StrokeShift]) -> tuple[float, float]:
@@ -434,17 +431,14 @@ def mobility(strokes: Sequence[StrokeShift]) -> tuple[float, float]:
     groups = [[stroke for stroke in strokes if stroke.known and stroke.direction == direction] for direction in (1, -1)]
     if not all(groups):
         return float("nan"), float("nan")
-    means = [np.mean([one.shift_mm for one in group]) for group in groups]
-    # The spread between strokes of one direction says more than the errors of single ones, where there are several.
-    errors = [
-        max(
-            float(np.std([one.shift_mm for one in group], ddof=1)) if len(group) > 1 else 0.0,
-            float(np.mean([one.sd_mm for one in group])),
-        )
-        / np.sqrt(len(group))
-        for group in groups
-    ]
-    return float(means[0] - means[1]) / 2, float(np.hypot(*errors)) / 2
+    means, errors = [], []
+    for group in groups:
+        shifts_mm, sd_mm = [one.shift_mm for one in group], float(np.mean([one.sd_mm for one in group]))
+        if len(group) > 1:  # the spread between strokes of one direction says more than the errors of single ones
+            sd_mm = max(sd_mm, float(np.std(shifts_mm, ddof=1)))
+        means.append(float(np.mean(shifts_mm)))
+        errors.append(sd_mm / np.sqrt(len(group)))
+    return (means[0] - means[1]) / 2, float(np.hypot(*errors)) / 2
 
 
 class _StrokeFrames(Record, eq=False):
@@ -476,9 +470,8 @@ def _stroke_frames(
         sample = convention.every_stretch(source.selection.scan.frames.time_s[source.frames], every[number])
         coarse = CoarseFrames.of(source.selection, source.frames[sample])
         numbers = [n for n, stroke in enumerate(strokes) if stroke.scan == number]
-        stroke = (
-            np.searchsorted([strokes[n].start for n in numbers], sample[coarse.first], side="right") - 1 + numbers[0]
-        )
+        starts = [strokes[n].start for n in numbers]
+        stroke = np.searchsorted(starts, sample[coarse.first], side="right") - 1 + numbers[0]
         parts.append(_StrokeFrames(coarse, coarse.places_mm(source.projection.part(sample)), stroke))
     return parts
 
@@ -563,9 +556,8 @@ def stroke_lag_figures(sources: Sequence[FrameSource]) -> dict[str, float]:
     Above 0 strokes see the lump ahead, as if dragged along; a pose that is late by t gives -v t. Empty where strokes
     went one way only, or nothing in the map has a slope. One linear step from no shift: above 1 mm it is rough.
     """
-    every = convention.thinning(
-        (source.selection.scan.frames.time_s[source.frames] for source in sources), most=LAG_FRAMES
-    )
+    times_s = (source.selection.scan.frames.time_s[source.frames] for source in sources)
+    every = convention.thinning(times_s, most=LAG_FRAMES)
     strokes = find_strokes(sources)
     parts = _stroke_frames(sources, strokes, [every] * len(sources))
     directions = np.array([stroke.direction for stroke in strokes])

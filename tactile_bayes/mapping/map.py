@@ -46,9 +46,8 @@ class MapRecipe(Record):
     latency_ms: float = 0.0  #: Delay of a pose's stamp against the frames.
     flat_field: bool = False  #: True where readings were divided by the head's own response.
     registered: bool = False  #: True where the strokes were shifted onto each other.
-    units: str = (
-        ""  #: Units of an imported grid's values, as the user named them; empty where unknown. A scan's are kPa.
-    )
+    units: str = ""
+    """Units of an imported grid's values, as the user named them; empty where unknown. A scan's are kPa."""
 
     @property
     def value_unit(self) -> str:
@@ -99,10 +98,8 @@ class TactileMap(Record, eq=False):
     def __post_init__(self) -> None:
         shape = (len(self.y_mm), len(self.x_mm))
         for name in ("mean", "variance", "count"):
-            if getattr(self, name).shape != shape:
-                raise BadDataError(
-                    f"{name} has shape {getattr(self, name).shape}", way_out=f"it must be {shape} (ny, nx)"
-                )
+            if (actual := getattr(self, name).shape) != shape:
+                raise BadDataError(f"{name} has shape {actual}", way_out=f"it must be {shape} (ny, nx)")
         if self.count.size and self.count.min() < 0:
             raise BadDataError(f"count holds {self.count.min()}", way_out="counts must not be negative")
         if not self.recipe.cell_mm > 0:
@@ -141,10 +138,7 @@ class TactileMap(Record, eq=False):
     @property
     def few(self) -> BoolArray:
         """(ny, nx) True for cells with data from fewer than `FEW_READINGS` readings; none where counts are unknown."""
-        few: BoolArray = (self.count > 0) & (self.count < FEW_READINGS)
-        if not self.counts_known:
-            few = np.zeros_like(few)
-        return few
+        return np.asarray((self.count > 0) & (self.count < FEW_READINGS) & self.counts_known)
 
 
 # --- Notice for maps with many more cells than a fit needs.
@@ -288,9 +282,8 @@ def handling_findings(quality: Mapping[str, float]) -> Iterator[Finding]:
         check = "check the tracker's lever arm and quaternion order"
         yield finding("tilted_head", text, check, "hold it flat; if it was, have the tracker's mounting checked")
     if quality.get("yaw_sd_deg", 0.0) > MOST_YAW_DEG:
-        text = (
-            f"the head was turned by {quality['yaw_sd_deg']:.0f} degrees (SD): the lump's length and breadth are mixed"
-        )
+        turned = f"the head was turned by {quality['yaw_sd_deg']:.0f} degrees (SD)"
+        text = f"{turned}: the lump's length and breadth are mixed"
         remedy = "keep the head square to its strokes"
         yield finding("turned_head", text, remedy, remedy)
 

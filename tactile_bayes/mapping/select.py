@@ -76,9 +76,8 @@ def find_faults(scan: Scan) -> tuple[TaxelFault, ...]:
     faults[(constant & moving) | (sticks & (len(scan.frames) >= MIN_FRAMES))] = "stuck"
     faults[saturated > SATURATED_SHARE] = "saturated"
     faults[(scan.element_calibration.gain_kpa_per_count == 0) | empty | weak] = "dead"
-    return tuple(
-        TaxelFault(row, column, str(faults[row, column])) for row, column in np.argwhere(faults != "").tolist()
-    )
+    faulty = np.argwhere(faults != "").tolist()
+    return tuple(TaxelFault(row, column, str(faults[row, column])) for row, column in faulty)
 
 
 def _kinds(faults: Iterable[TaxelFault]) -> str:

@@ -95,9 +95,7 @@ class Surroundings(Record, eq=False):
             piece -= piece.min()
             pieces = int(piece.max()) + 1
             cells, size = (strip * pieces + piece).ravel(), (int(strip.max()) + 1) * pieces
-            sums = np.stack([np.bincount(cells, cell_values, minlength=size) for cell_values in flat]).reshape(
-                2, -1, pieces
-            )
+            sums = np.stack([np.bincount(cells, one, minlength=size).reshape(-1, pieces) for one in flat])
             crest = across.min() + STRIP_MM * np.arange(sums.shape[1])
             distance_in_widths = (crest - places[of_angle, 1, None]) / np.exp(places[of_angle, 2, None])
             number, total = np.exp(-0.5 * distance_in_widths**2) @ sums
@@ -150,9 +148,7 @@ def add_neighbour(
         extra: _fit_neighbour(plain, surroundings, extra, rising, forced=requested == extra)
         for extra, rising in places.items()
     }
-    supported = [
-        extra for extra, (fit, log_odds, _) in fits.items() if fit is not None and log_odds > np.log(SECOND_ODDS)
-    ]
+    supported = [extra for extra, (_, log_odds, _) in fits.items() if log_odds > np.log(SECOND_ODDS)]
     likeliest = max(supported, key=lambda extra: fits[extra][1], default=None)
     chosen_extra = requested or likeliest
     tests = []
@@ -546,9 +542,8 @@ def _posterior(
 ) -> MapPosterior:
     """Draws by name, with tracker position error added, and for a non-Gaussian bump the spread over noise fields."""
     shape = draws.theta.shape[:2]
-    theta = draws.theta + _random_shifts(fit, draws, position_covariance + exponent_covariance(fit), rng).reshape(
-        draws.theta.shape
-    )
+    shifts = _random_shifts(fit, draws, position_covariance + exponent_covariance(fit), rng)
+    theta = draws.theta + shifts.reshape(draws.theta.shape)
     sigma_x, sigma_y, angle = drawn_widths(*fit.scene.widths(theta))
     amplitude, level, noise_sd = fit.target.draw_linear(draws.flat, rng, solved=cache)
     return MapPosterior(

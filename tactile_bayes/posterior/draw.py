@@ -56,8 +56,8 @@ def check_options(options: SamplerSettings) -> None:
         options_in_use = {
             "a scene": options.scene not in ("auto", "none"),
             "an accuracy in mm": options.accuracy_mm is not None,
+            "a checkpoint": options.store is not None,
         }
-        options_in_use |= {"a checkpoint": options.store is not None}
         for name, in_use in options_in_use.items():
             if in_use:
                 raise UsageError(f'{name} needs correlated errors; give noise = "field" in --settings FILE.toml')

@@ -201,9 +201,8 @@ def draw_with_size(task: EstimationTask, assessment: Assessment) -> MapDraws:
     result = replace(result, calibration=calibration, fault=fault)
     if fault is not None:
         return result
-    return replace(
-        result, size=draw_sizes(posterior, calibration=calibration, priors=options.size_priors, rng=task.rng)
-    )
+    size = draw_sizes(posterior, calibration=calibration, priors=options.size_priors, rng=task.rng)
+    return replace(result, size=size)
 
 
 # --- The answer for one map: a size, widths, or the reason for neither.
@@ -250,7 +249,7 @@ def estimate_map(
     estimate = _estimate_of_map(EstimationTask(tactile_map, calibration, options, rng, progress))
     if estimate.code in NO_LUMP and options.scene != "none":
         reason = verdict.no_verdict(tactile_map) or verdict.hiding_settings(options)
-        estimate = estimate if reason is None else _no_estimate(reason, estimate.candidates)
+        estimate = estimate if reason is None else no_estimate(reason, estimate.candidates)
     of_map = (*map_findings(tactile_map), *tactile_map.findings)
     return replace(estimate, findings=by_severity((*of_map, *estimate.findings)))
 
@@ -259,28 +258,28 @@ def _estimate_of_map(task: EstimationTask) -> Estimate:
     """Estimate of the lump's size, or the reason why there is none."""
     tactile_map, options = task.tactile_map, task.options
     if not tactile_map.covered.any():
-        return _no_estimate(Abstention("empty", "the map has no covered cell"))
+        return no_estimate(Abstention("empty", "the map has no covered cell"))
     where = verdict.searched_area(tactile_map, options.centre_mm)
     candidates, assessment = search(tactile_map, options)
     if not candidates:
         reason = f"no lump found {where}: nothing rises above the background"
-        return _no_estimate(Abstention("empty", reason, verdict.FEEL_AGAIN, verdict.FEEL_AGAIN_ON_PAPER))
+        return no_estimate(Abstention("empty", reason, verdict.FEEL_AGAIN, verdict.FEEL_AGAIN_ON_PAPER))
     if assessment is None:
         likeliest = likeliest_lump(tactile_map, candidates, options)
         why = verdict.no_bump_reason(tactile_map, candidates, likeliest, where=where)
         if likeliest is None:
-            return _no_estimate(why, candidates)
+            return no_estimate(why, candidates)
         fit, detection = None if likeliest.candidate is None else likeliest.candidate.fit, likeliest.detection
         lump = detection.probability >= DETECTED and why.code not in NO_LUMP
-        estimate = _no_estimate(why, candidates, detection, fit.modal() if lump and fit is not None else None)
+        estimate = no_estimate(why, candidates, detection, fit.modal() if lump and fit is not None else None)
         return replace(estimate, weighed=likeliest)
     # the bump at the mode where the evidence is for a lump, else that of least squares
     bump = assessment.bump() if assessment.detection.probability >= DETECTED else assessment.fit.modal()
     weighed = verdict.weigh(tactile_map, assessment.detection, bump)
     if assessment.detection.probability < DETECTED or weighed.probability < verdict.LIKELY:
-        estimate = _no_estimate(verdict.undetected_reason(weighed, where=where), candidates, assessment.detection)
+        estimate = no_estimate(verdict.undetected_reason(weighed, where=where), candidates, assessment.detection)
     elif options.scene == "none":
-        estimate = _no_estimate(Abstention("undetected", "no lump was assumed"), candidates, assessment.detection)
+        estimate = no_estimate(Abstention("undetected", "no lump was assumed"), candidates, assessment.detection)
     else:
         estimate = _estimate_of_lump(task, assessment, candidates)
     if estimate.code == "ridge" and not estimate.reason.startswith("no lump found"):
@@ -294,7 +293,7 @@ def _estimate_of_lump(task: EstimationTask, assessment: Assessment, candidates: 
     detection, bump = assessment.detection, assessment.bump()
     hopeless = verdict.width_fault(bump.sigma_x_mm, bump.sigma_y_mm, cell_mm=cell_mm, margin=verdict.HOPELESS)
     if hopeless is not None:
-        return _no_estimate(hopeless, candidates, detection, bump)
+        return no_estimate(hopeless, candidates, detection, bump)
     try:
         result = draw_until_accurate(task, assessment)
     except NotConvergedError as error:
@@ -303,7 +302,7 @@ def _estimate_of_lump(task: EstimationTask, assessment: Assessment, candidates: 
             why = Abstention("method", str(error), error.advice, "have the size estimated again without this neighbour")
         elif options.method == "ensemble" or not options.correlated:
             raise
-        return _no_estimate(why, candidates, detection, bump)
+        return no_estimate(why, candidates, detection, bump)
     detection, posterior, size, fault = result.detection, result.posterior, result.size, result.fault
     diagnostics = _diagnostics(result)
     if size is not None and size.invalid > MOST_INVALID * size.d_x_mm.size:
@@ -311,7 +310,7 @@ def _estimate_of_lump(task: EstimationTask, assessment: Assessment, candidates: 
         advice = "learn a calibration whose table holds such lumps"
         fault = Abstention("extrapolated", reason, advice, terms.UNLIKE_ON_PAPER)
     if fault is not None:
-        return _no_estimate(fault, candidates, detection, bump, diagnostics if fault.code == "extrapolated" else {})
+        return no_estimate(fault, candidates, detection, bump, diagnostics if fault.code == "extrapolated" else {})
     quantities = {"sigma_x_mm": posterior.sigma_x_mm, "sigma_y_mm": posterior.sigma_y_mm}
     quantities |= {} if size is None else {"max_size_mm": size.max_size_mm}
     return Estimate(
@@ -332,7 +331,7 @@ def _estimate_of_lump(task: EstimationTask, assessment: Assessment, candidates: 
     )
 
 
-def _no_estimate(
+def no_estimate(
     reason: Abstention,
     candidates: tuple[Candidate, ...] = (),
     detection: Detection | None = None,
@@ -380,9 +379,8 @@ def _remedy_for_recipe(recipe: terms.Recipe, tactile_map: TactileMap) -> str:
     map_recipe = (tactile_map.recipe.normalise, tactile_map.recipe.flat_field_known)
     required = (recipe.normalise, map_recipe[1] if recipe.flat_field is None else recipe.flat_field)
     if map_recipe[0] != required[0] or (map_recipe[1] is not None and map_recipe[1] != required[1]):
-        return (
-            f"make the map again with {recipe.map_command}, or give --size-calibration solid or eq6 for a default map"
-        )
+        again = f"make the map again with {recipe.map_command}"
+        return f"{again}, or give --size-calibration solid or eq6 for a default map"
     return "leave the fit's options to the calibration, or learn a calibration for these"
 
 

@@ -86,11 +86,10 @@ class FieldFit(Record, eq=False, dict=True):
         """
         mixture, dof = self.mixture, float(self.target.dof)
         widen = (dof + len(self.mode)) / dof
+        numbers = rng.multinomial(number, mixture.weight).tolist()
         parts = [
-            student_draws(mean, widen * covariance, dof=dof, number=int(n), rng=rng)
-            for mean, covariance, n in zip(
-                mixture.mean, mixture.covariance, rng.multinomial(number, mixture.weight), strict=True
-            )
+            student_draws(mean, widen * covariance, dof=dof, number=n, rng=rng)
+            for mean, covariance, n in zip(mixture.mean, mixture.covariance, numbers, strict=True)
         ]
         flat = rng.permutation(np.concatenate(parts))
         checked = flat[:WEIGHED_DRAWS]

@@ -317,9 +317,8 @@ class CollapsedTarget:
     def select_fields(self, theta: FloatArray) -> bool:
         """Keep only the noise fields with evidence at one shape; True if others were kept before."""
         before = self.selected_fields()
-        self._fields, self._left_out_evidence = self.linear.with_evidence(
-            self.scene.templates(theta[None], self.window)
-        )
+        templates = self.scene.templates(theta[None], self.window)
+        self._fields, self._left_out_evidence = self.linear.with_evidence(templates)
         return before != self.selected_fields()
 
     def select_lengths(self) -> None:
@@ -379,9 +378,8 @@ class CollapsedTarget:
         """Log Bayes factor of a slope against none at one shape: the Savage-Dickey ratio of its components at 0."""
         (solution,) = self._solutions(theta[None])
         weight = solution.evidence[0] - np.logaddexp.reduce(solution.evidence[0])
-        level, inverse = (
-            np.concatenate(parts) for parts in zip(*((one.level(), one.inverse) for one in self.fields), strict=True)
-        )
+        level = np.concatenate([one.level() for one in self.fields])
+        inverse = np.concatenate([one.inverse for one in self.fields])
         slope = solution.level_slope[0][:, :, 1:3]
         mean = level[:, 1:3] - np.einsum("hv,hvc->hc", solution.amplitude[0], slope)
         spread = np.einsum("hvc,hvw,hwd->hcd", slope, np.linalg.inv(solution.power[0]), slope)
@@ -428,9 +426,8 @@ class CollapsedTarget:
             base_inner, template_inner = Inner.of(bump_projected, columns), Inner.of(projected, columns)
             base.append(self.linear.solve([base_inner], None, columns).evidence[0])
             cross = base_inner.product(template_inner, product, columns)
-            evidence.append(
-                self.linear.solve([base_inner.repeated(len(product)), template_inner], cross, columns).evidence
-            )
+            both = [base_inner.repeated(len(product)), template_inner]
+            evidence.append(self.linear.solve(both, cross, columns).evidence)
         gained = np.logaddexp.reduce(np.concatenate(evidence, axis=1), axis=1)
         return np.asarray(gained - np.logaddexp.reduce(np.concatenate(base)))
 

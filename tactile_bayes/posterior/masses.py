@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import logit
 
 from tactile_bayes.declarations import as_dict, replace
-from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, NotConvergedError
+from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, Abstention, NotConvergedError
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import (
     SMOOTHING_MM,
@@ -22,7 +22,7 @@ from tactile_bayes.posterior.bump import (
 )
 from tactile_bayes.posterior.correlated import LEAST_RISE
 from tactile_bayes.posterior.draw import MapPosterior, ModalBump, SamplerSettings
-from tactile_bayes.posterior.estimate import likeliest_lump, search
+from tactile_bayes.posterior.estimate import likeliest_lump, no_estimate, search
 from tactile_bayes.posterior.result import Estimate, Mass, Rise
 from tactile_bayes.posterior.verdict import BEYOND_IT, LIKELY, MORE_LINES, MORE_LINES_ON_PAPER, weigh
 from tactile_bayes.posterior.white import AT_RIM, Candidate
@@ -334,19 +334,12 @@ def _mass_at_rise(
 
 def _mass_without_size(rise: Rise, code: str, why: str, advice: str, on_paper: str = "") -> Mass:
     """Mass at a rise that is likely a lump, with the reason for no size."""
-    estimate = Estimate("no_estimate", why, code=code, advice=advice, on_paper=on_paper or advice, bump=rise)
+    estimate = no_estimate(Abstention(code, why, advice, on_paper or advice), bump=rise)
     return _mass_of_estimate(estimate, rise, rise.probability)
 
 
 def _unresolved(estimate: Estimate, why: str) -> Estimate:
-    return Estimate(
-        "no_estimate",
-        why,
-        detection=estimate.detection,
-        code="unresolved",
-        advice=LINES_OVER_BOTH,
-        on_paper=LINES_OVER_BOTH,
-    )
+    return no_estimate(Abstention("unresolved", why, LINES_OVER_BOTH, LINES_OVER_BOTH), detection=estimate.detection)
 
 
 def _estimate_or_reason(tactile_map: TactileMap, options: SamplerSettings, estimator: Estimator) -> Estimate:
@@ -354,7 +347,7 @@ def _estimate_or_reason(tactile_map: TactileMap, options: SamplerSettings, estim
     try:
         return estimator(tactile_map, options)
     except NotConvergedError as error:
-        return Estimate("no_estimate", f"no method converged: {error}", code="method")
+        return no_estimate(Abstention("method", f"no method converged: {error}"))
 
 
 def _same_lump(estimate: Estimate, rise: Rise, first: Estimate) -> bool:

@@ -219,9 +219,8 @@ def _leave_one_out_density(precision: _Precision, regressors: FloatArray, value:
     squares = float(residual @ centred) - residual**2 / power
     scale = squares / (dof * power)
     constant = lgamma((dof + 1) / 2) - lgamma(dof / 2) - 0.5 * log(dof * pi)
-    return np.asarray(
-        constant - 0.5 * np.log(scale) - 0.5 * (dof + 1) * np.log1p((residual / power) ** 2 / (dof * scale))
-    )
+    log_kernel = np.log1p((residual / power) ** 2 / (dof * scale))
+    return np.asarray(constant - 0.5 * np.log(scale) - 0.5 * (dof + 1) * log_kernel)
 
 
 # --- Fitted values of an estimate's window: level, tilt, bump and neighbour, without noise.
@@ -344,10 +343,8 @@ def _prior(
     allowed = np.flatnonzero(p + np.hypot(q, r) <= np.log(problem.widest_mm))[:PRIOR_DRAWS]
     sigma_x, sigma_y, angle = principal_widths(p[allowed], q[allowed], r[allowed])
     amplitude = fit.target.amplitude_sd * rng.standard_normal(len(allowed))
-    distance, direction = (
-        problem.radius_mm * np.sqrt(rng.uniform(size=len(allowed))),
-        rng.uniform(0, 2 * np.pi, len(allowed)),
-    )
+    distance = problem.radius_mm * np.sqrt(rng.uniform(size=len(allowed)))
+    direction = rng.uniform(0, 2 * np.pi, len(allowed))
     values = {"amplitude": amplitude, "sigma_x_mm": sigma_x, "sigma_y_mm": sigma_y, "angle_rad": angle}
     values |= {"x_mm": middle[0] + distance * np.cos(direction), "y_mm": middle[1] + distance * np.sin(direction)}
     notes = {"left_out": "level, tilt and noise scale have improper priors"}

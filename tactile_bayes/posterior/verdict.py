@@ -132,9 +132,8 @@ def searched_area(tactile_map: TactileMap, centre_mm: tuple[float, float] | None
         area = float(trusted_cells(tactile_map).sum()) * tactile_map.recipe.cell_mm**2 / 100.0
         return f"on the {f'{area:.0f}' if area >= 10 else f'{area:.2g}'} cm2 that the map covers"
     if not on_map(tactile_map, *centre_mm):
-        reach = " and ".join(
-            f"{name} from {low:g} to {high:g} mm" for name, (low, high) in map_ends(tactile_map).items()
-        )
+        ends = map_ends(tactile_map).items()
+        reach = " and ".join(f"{name} from {low:g} to {high:g} mm" for name, (low, high) in ends)
         place = f"centre_mm ({centre_mm[0]:g}, {centre_mm[1]:g})"
         raise UsageError(f"{place} lies off the map, which has {reach}; give a place on it")
     return _near_text(centre_mm)

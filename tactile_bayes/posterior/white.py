@@ -224,7 +224,7 @@ def fit_bump(
     check_background(tactile_map, options)
     level = None if options.background == "free" else tactile_map.background
     bump = Bump(rotated=options.rotation == "on", background=level, scale=value_scale(tactile_map))
-    centre, start, weight_variance = centre_mm, None, None
+    centre, starts, weight_variance = centre_mm, list[FloatArray](), None
     widths = START_WIDTHS_MM if options.start_width_mm is None else (options.start_width_mm,)
     for _ in range(6):
         cells = window_cells(tactile_map, centre, radius_mm=options.fit_radius_mm)
@@ -233,17 +233,13 @@ def fit_bump(
         if min(np.ptp(cells.row), np.ptp(cells.column)) == 0:
             return None, f"{FEW_CELLS} (all in one line)"
         weight = np.ones(len(cells)) if weight_variance is None else count_weights(cells, weight_variance)
-        starts = (
-            [start]
-            if start is not None
-            else [_start_vector(tactile_map, bump, cells, centre, width) for width in widths]
-        )
+        starts = starts or [_start_vector(tactile_map, bump, cells, centre, width) for width in widths]
         fit = _best_fit(bump, cells, starts, weight=weight, centre=centre, options=options)
         shift = float(np.hypot(fit.theta[1] - centre[0], fit.theta[2] - centre[1]))
         if not fit.converged or shift > options.fit_radius_mm / 2:
             return None, f"no bump with a flank on every side within {options.fit_radius_mm:g} mm"
         settled = weight_variance is not None and shift < 0.25 * cells.cell_mm
-        centre, start = (float(fit.theta[1]), float(fit.theta[2])), fit.theta
+        centre, starts = (float(fit.theta[1]), float(fit.theta[2])), [fit.theta]
         weight_variance = float(np.mean(fit.residual**2))
         if settled:
             break

@@ -422,9 +422,8 @@ class LinearModel:
         plain = np.ascontiguousarray(weighted.reshape(len(shares) * (c + 1), low.shape[1]).T)
         log_det = np.log1p(power).sum(axis=-1) + volume
         floor = FLOOR * float(self._gram[c, c]) + 1e-300
-        return FieldColumns(
-            field, shares, log_prior, np.ascontiguousarray(weight.T), plain, gram, inverse, log_det, floor
-        )
+        removed = np.ascontiguousarray(weight.T)
+        return FieldColumns(field, shares, log_prior, removed, plain, gram, inverse, log_det, floor)
 
     def every_field(self) -> Iterator[FieldColumns]:
         """No field, then each length from the longest on with all shares, computed when reached."""

@@ -126,9 +126,8 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
     def __repr__(self) -> str:
         corrected = "" if self.site is None else f", corrected by {self.site.phantoms} phantoms"
         cautions = () if self.site is None else self.site.cautions
-        return terms.calibration_words(
-            type(self), f"{self.source}{corrected}, lumps", self.recipe, self.domain, cautions
-        )
+        lumps = f"{self.source}{corrected}, lumps"
+        return terms.calibration_words(type(self), lumps, self.recipe, self.domain, cautions)
 
     def at_fat(self, profiles: Sequence[tuple[float, ...] | None]) -> BodyCalibration:
         """The calibration for a mass whose maps have these `presets.HEAD_PROFILE`, None for a map without one.

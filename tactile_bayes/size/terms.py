@@ -189,9 +189,6 @@ class HiddenTerms(Record, eq=False, omit_defaults=True):
         return float(np.log(value)) if name in LOGGED else value
 
 
-PARAMETERS: Final = ("c0", "c1")
-
-
 class SiteShift(Record, eq=False):
     r"""Correction of a calibration over bodies by a site's own lumps of known size, its posterior taken as normal.
 

@@ -283,9 +283,8 @@ def joint_sizes(
     flat = [one for maps in visits for one in maps]
     matched, replicates = matched_draws(flat, number, rng)
     ends = np.cumsum([len(maps) for maps in visits])
-    parts = [
-        MassMaps.of(matched[end - len(maps) : end], fit) for maps, end, fit in zip(visits, ends, fits, strict=True)
-    ]
+    spans = zip(visits, ends, fits, strict=True)
+    parts = [MassMaps.of(matched[end - len(maps) : end], fit) for maps, end, fit in spans]
     middle = np.mean([one.by_map.mean(axis=0) for one in parts], axis=0)
     points = draws.paired_points(middle, replicates, DIMENSIONS, rng)
     tau = between.at(points[:, 0], *[(one.centre, one.noise) for one in parts])  # one for all visits
@@ -325,9 +324,8 @@ def _covariance(
     terms, exams, widths = (
         np.stack([getattr(part, name) for part in parts], axis=1) for name in ("terms", "variance", "log_width")
     )
-    bodies = np.stack(
-        [at.body_sd(one.log_amplitude, one.log_width, score) for one, at in zip(parts, fitted, strict=True)], axis=1
-    )
+    pairs = zip(parts, fitted, strict=True)
+    bodies = np.stack([at.body_sd(one.log_amplitude, one.log_width, score) for one, at in pairs], axis=1)
     covariance = bodies[:, :, None] * correlation * bodies[:, None, :]
     covariance = covariance + (terms @ fitted[0].coefficient_covariance) @ np.swapaxes(terms, 1, 2)
     covariance[:, range(len(parts)), range(len(parts))] += exams
@@ -375,10 +373,8 @@ def _with_amplitudes(
     gain = np.stack(gains)[index]
     moved = np.einsum("nvc,nc->vn", gain, departs[index, :, np.arange(len(points))])
     projection = np.eye(v) + exponents[index, None, None] * gain @ contrasts
-    corrected = projection @ covariance @ np.swapaxes(projection, 1, 2) + gain @ noise_covariance @ np.swapaxes(
-        gain, 1, 2
-    )
-    return mean - moved, corrected
+    corrected = projection @ covariance @ np.swapaxes(projection, 1, 2)
+    return mean - moved, corrected + gain @ noise_covariance @ np.swapaxes(gain, 1, 2)
 
 
 def _draw_sizes(mean: FloatArray, covariance: FloatArray, z: FloatArray, replicates: draws.Labels) -> FloatArray:

@@ -215,15 +215,13 @@ class Tradeoff(Record):
 
     def cheapest_sufficient(self) -> MeasuredSetting | None:
         """The cheapest usable setting within the tolerance, or the default where that costs hardly more."""
-        within = [
-            row for row in self.rows if row.usable and not self.exceeds_tolerance(row) and row.ends_off_mm is not None
-        ]
+        within = [row for row in self.rows if row.usable and row.ends_off_mm is not None]
+        within = [row for row in within if not self.exceeds_tolerance(row)]
         if not within:
             return None
         best = min(within, key=lambda one: one.seconds)
-        return (
-            self.default if self.default in within and best.seconds > WORTHWHILE_SHARE * self.default.seconds else best
-        )
+        saves_little = best.seconds > WORTHWHILE_SHARE * self.default.seconds
+        return self.default if saves_little and self.default in within else best
 
     def exceeds_tolerance(self, one: MeasuredSetting) -> bool:
         """True if a setting's interval ends are further off than the tolerance."""
@@ -356,9 +354,8 @@ def _beside_chains(one: EstimateSetting) -> EstimateSetting:
     if one.options.method == "ensemble":
         return replace(one, weight=one.weight / 8.0)
     if one.axis in (FIELD, WINDOW):
-        return replace(
-            one, label=f"{one.label}, laplace", options=_with_method(one.options, "laplace"), weight=0.05 * one.weight
-        )
+        by_laplace = _with_method(one.options, "laplace")
+        return replace(one, label=f"{one.label}, laplace", options=by_laplace, weight=0.05 * one.weight)
     return replace(one, weight=0.2 * one.weight)
 
 

@@ -135,10 +135,7 @@ def compare(scene: TableScene, *, settings: StudySettings, surface: plane.Surfac
     elastic_map, empirical_map = plane.build_line(elastic), plane.build_line(empirical)
     inside = np.abs(elastic_map.x_mm) <= settings.fit_radius_mm
     ours, theirs = empirical_map.mean[inside], elastic_map.mean[inside]
-    empirical_taxels, elastic_taxels = (
-        empirical.as_taxels(presets.HEAD_PITCH_MM),
-        elastic.as_taxels(presets.HEAD_PITCH_MM),
-    )
+    empirical_taxels, elastic_taxels = (one.as_taxels(presets.HEAD_PITCH_MM) for one in (empirical, elastic))
     frames = empirical_taxels.at(0.0), elastic_taxels.at(0.0)
     shares = frames[0] / frames[0].mean(), frames[1] / frames[1].mean()
     return Agreement(
@@ -209,10 +206,9 @@ class FrameAgreement(Record, eq=False):
     @property
     def differences(self) -> tuple[float, float]:
         """Mean squared differences from the elastic and the empirical model, as shares of their sums of squares."""
-        measured = self.measured.pressure_kpa
-        return mean_squared_difference(measured, self.elastic_kpa), mean_squared_difference(
-            measured, self.empirical_kpa
-        )
+        models = self.elastic_kpa, self.empirical_kpa
+        elastic, empirical = (mean_squared_difference(self.measured.pressure_kpa, one) for one in models)
+        return elastic, empirical
 
 
 def compare_frames(
@@ -304,10 +300,8 @@ def measured_frames(
     tracker_from_head, plane_rotation = inverse(scan.head.scanhead_from_tracker), tactile_map.plane_from_base[:3, :3]
     on_base = selected.poses.rotation[used]
     origin = selected.poses.position_mm[used] + on_base @ tracker_from_head[:3, 3]
-    origin, rotation = (
-        origin @ plane_rotation.T + tactile_map.plane_from_base[:3, 3],
-        plane_rotation @ on_base @ tracker_from_head[:3, :3],
-    )
+    origin = origin @ plane_rotation.T + tactile_map.plane_from_base[:3, 3]
+    rotation = plane_rotation @ on_base @ tracker_from_head[:3, :3]
     pressure = scan.element_calibration.to_kpa(scan.frames.counts[used])
     pressure[:, ~selected.good_taxels] = np.nan
     lump = _bump(tactile_map, place_mm)
@@ -377,13 +371,8 @@ def line_bump(measured: MeasuredScan, tactile_map: TactileMap) -> tuple[float, f
     """Amplitude and sigma (mm) of Eq 5, level 1, on the map's centre line within `FIT_RADIUS_MM` of the lump."""
     x, mean = centre_row(measured, tactile_map)
     near = np.abs(x) <= presets.FIT_RADIUS_MM
-
-    def bump(log_width: float) -> FloatArray:
-        return plane.lump_pressure(x[near], height_kpa=1.0, width_mm=float(np.exp(log_width)))
-
-    ends = np.log([0.5 * tactile_map.recipe.cell_mm, presets.FIT_RADIUS_MM])
-    fit = plane.fit_shape(bump, mean[near] - 1.0, grid=np.linspace(ends[0], ends[1], 60))
-    return fit.height, float(np.exp(fit.parameter))
+    widths_mm = 0.5 * tactile_map.recipe.cell_mm, presets.FIT_RADIUS_MM
+    return plane.fit_lump_pressure(x[near], mean[near] - 1.0, widths_mm=widths_mm)
 
 
 def residual_slope(measured: MeasuredScan, model_map: TactileMap) -> dict[str, float]:
@@ -432,10 +421,8 @@ def _map_cells(measured: MeasuredScan, model_map: TactileMap) -> np.ndarray[tupl
             f"the maps have {measured_map.mean.shape} and {model_map.mean.shape} cells",
             way_out="some frames of the model are bad",
         )
-    distance_mm = np.hypot(
-        measured_map.x_mm[None, :] - measured.place_mm[0], measured_map.y_mm[:, None] - measured.place_mm[1]
-    )
-    return np.asarray(measured_map.covered & model_map.covered & (distance_mm <= NEAR_MM))
+    x, y = measured_map.x_mm - measured.place_mm[0], measured_map.y_mm - measured.place_mm[1]
+    return np.asarray(measured_map.covered & model_map.covered & (np.hypot(x, y[:, None]) <= NEAR_MM))
 
 
 def _centre_row(measured: MeasuredScan) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
@@ -455,9 +442,8 @@ def _bump(tactile_map: TactileMap, place_mm: tuple[float, float] | None) -> Bump
     options = SamplerSettings()
     if place_mm is not None:
         return fit_bump(tactile_map, place_mm, options=options)[0]
-    return next(
-        (one.fit for one in fitted_candidates(tactile_map, options) if one.fit is not None and not one.fault), None
-    )
+    lumps = (one.fit for one in fitted_candidates(tactile_map, options) if one.fit is not None and not one.fault)
+    return next(lumps, None)
 
 
 def _check_array(scan: Scan, scene: Scene) -> None:

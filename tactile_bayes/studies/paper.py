@@ -404,9 +404,8 @@ class HomogeneousTissue(TissueOptions):
         for name in ("modulus_kpa", "pressure_kpa"):
             low, high = getattr(self, name)
             if not low <= high:
-                raise BadDataError(
-                    f"{name} is {low:g} to {high:g}", way_out="give two numbers above 0, the lower first"
-                )
+                way_out = "give two numbers above 0, the lower first"
+                raise BadDataError(f"{name} is {low:g} to {high:g}", way_out=way_out)
 
     @property
     def moduli_kpa(self) -> FloatArray:

@@ -96,9 +96,8 @@ def coverage(ranks: IntArray, draws: int, probability: float) -> RankCoverage:
     if abs(tail - round(tail)) > 1e-9:
         raise ValueError(f"{draws} draws have no central interval of probability {probability:g}")
     covered = (ranks >= round(tail)) & (ranks <= draws - round(tail))
-    return RankCoverage(
-        probability, float(covered.mean()), float(np.sqrt(probability * (1.0 - probability) / len(ranks)))
-    )
+    error = float(np.sqrt(probability * (1.0 - probability) / len(ranks)))
+    return RankCoverage(probability, float(covered.mean()), error)
 
 
 def ecdf_counts(ranks: IntArray, draws: int) -> IntArray:

@@ -164,10 +164,8 @@ def measure_forward(case: LumpCase, model: str, rule: SizeRule, *, share: float,
     answer = tradeoff.reference.answer
     assert answer is not None
     assert answer.reported is not None  # a width at least
-    accuracy_words = (
-        f"leaves {100 * rule.scatter:.0f} % (SD of ln d): that is the interval, for these maps have no errors"
-    )
-    notes = [f"Sizes by {rule.source}, which itself {accuracy_words}."]
+    left = f"{100 * rule.scatter:.0f} % (SD of ln d): that is the interval, for these maps have no errors"
+    notes = [f"Sizes by {rule.source}, which itself leaves {left}."]
     if outside := rule.outside(*amplitude_and_widths(answer)):
         notes.append(f"The map is none of the calibration's: {', '.join(outside)}.")
     return replace(tradeoff, tolerance_mm=float(f"{share * answer.reported.median:.3g}"), notes=tuple(notes))
@@ -277,9 +275,8 @@ def learned_rule(rows: Sequence[paper.StudyRow]) -> SizeRule:
     ratios = [largest(row.amplitude, row.sigma_x_mm, row.sigma_y_mm) / row.d_mm for row in detectable]
     scatter = float(np.sqrt(np.mean(np.log(np.maximum(ratios, 1e-3)) ** 2))) if detectable else float("nan")
     kind = "balls" if len(axes) == 2 else "cylinders"
-    return SizeRule(
-        largest, scatter, f"Eq 6 in two stages from {len(detectable)} hard {kind} of 10 to 25 mm in this body"
-    )
+    source = f"Eq 6 in two stages from {len(detectable)} hard {kind} of 10 to 25 mm in this body"
+    return SizeRule(largest, scatter, source)
 
 
 def calibrated_rule(calibration: Calibration, *, name: str) -> SizeRule:
@@ -340,14 +337,10 @@ def map_settings(scan: Scan) -> list[Setting[MapBuild]]:
     choices += [Setting(FRAMES, f"--every {n}", MapBuild({"every": n}), 0.5 + 0.5 / n) for n in EVERY]
     for s in (share * whole_s for share in SHARES_OF_TIME if whole_s > 0):
         choices.append(Setting(TIME, f"the first {s:.3g} s of {whole_s:.3g} s", MapBuild(duration_s=s), usable=False))
-    others = [normalise for normalise in NORMALISE if normalise != DEFAULT_NORMALISE]
-    return [
-        *choices,
-        *(
-            Setting(LEVEL, f"--normalise {normalise}", MapBuild({"normalise": normalise}), usable=False)
-            for normalise in others
-        ),
-    ]
+    for normalise in NORMALISE:
+        if normalise != DEFAULT_NORMALISE:
+            choices.append(Setting(LEVEL, f"--normalise {normalise}", MapBuild({"normalise": normalise}), usable=False))
+    return choices
 
 
 def measure_map(scan: Scan, *, inputs: Inputs, work: StudyRun) -> Tradeoff:

@@ -379,9 +379,8 @@ def compare_methods(sizes: ModalitySizes, *, intervals: Intervals, error_ratio: 
         "passing_bablok": _kept(partial(lines.passing_bablok, confidence=level)),
     }
     figures: dict[str, Figure] = {}
-    for name, statistic, scale in _statistics(
-        error_ratio, fits, "slope" if intervals.method == "corrected" else "linear"
-    ):
+    slope: Scale = "slope" if intervals.method == "corrected" else "linear"
+    for name, statistic, scale in _statistics(error_ratio, fits, slope):
         on = scale if isinstance(statistic, SumStatistic) or len(x) <= MOST_REFITTED else None
         figures[name] = figure(statistic, detected, scale=on, intervals=intervals, leverage=_squared_distance)
     figures |= limit_figures(detected, intervals=intervals)

@@ -244,9 +244,8 @@ class LogModel:
         prior2 = max(self.spread**2 - float(np.mean(self._caliper2)), 0.25 * self.spread**2)
         shrinkage = prior2 / (prior2 + self._caliper2)
         mean = bias[:, None] + slope[:, None] * shrinkage * self._x
-        variance = (
-            slope[:, None] ** 2 * shrinkage * self._caliper2 + tau2[:, None] + omega2[:, None] / self._number[None, :]
-        )
+        variance = slope[:, None] ** 2 * shrinkage * self._caliper2 + tau2[:, None]
+        variance = variance + omega2[:, None] / self._number
         off = (self._y - mean) / variance
         log_like = -0.5 * np.sum((self._y - mean) * off + np.log(variance), axis=1)
         log_like += self._patients_part(rho2, off, 1 / variance)

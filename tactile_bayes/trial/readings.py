@@ -186,21 +186,19 @@ def gather(readings: Iterable[Reading], ex_vivo_mm: Mapping[MassKey, float]) -> 
     for name, group in groupby(ordered, key=lambda r: r.modality):
         rows = list(group)
         keys, done = {r.key for r in rows}, [r for r in rows if r.status != "not_done"]
-        by_mass = {key: [r.size_mm for r in of_mass] for key, of_mass in groupby(done, key=lambda r: r.key)}
-        replicates = tuple(
-            np.array([size for size in sizes_mm if size is not None], dtype=np.float64) for sizes_mm in by_mass.values()
-        )
+        by_mass = {
+            key: np.array([r.size_mm for r in of_mass if r.size_mm is not None], dtype=np.float64)
+            for key, of_mass in groupby(done, key=lambda r: r.key)
+        }
         with np.errstate(over="ignore"):  # figures refuse an infinite mean
             # equal readings are their own mean, to the last bit: rounding would be an error beside excision
-            means = [
-                np.clip(values.mean(), values.min(), values.max()) if len(values) else 0.0 for values in replicates
-            ]
+            means = [np.clip(mm.mean(), mm.min(), mm.max()) if len(mm) else 0.0 for mm in by_mass.values()]
         sizes[name] = ModalitySizes(
             name=name,
             patient=np.array([patient_number[patient] for patient, _ in by_mass], dtype=np.int64),
             ex_vivo_mm=np.array([ex_vivo_mm[key] for key in by_mass], dtype=np.float64),
             size_mm=np.array(means),
-            replicates_mm=replicates,
+            replicates_mm=tuple(by_mass.values()),
             readings=len(done),
             masses_not_done=len(keys) - len(by_mass),
             masses_without_reading=len(ex_vivo_mm) - len(keys),
@@ -390,9 +388,8 @@ def _visits_around_excision(
     if after and not before:
         first = min(after, key=lambda name: first_row[name])
         problem = f"visit {first} is after excision on {excised}, and so is every other of this mass"
-        raise fault(
-            first_row[first], "date", problem, way_out="correct the date here or of excision, or leave the readings out"
-        )
+        way_out = "correct the date here or of excision, or leave the readings out"
+        raise fault(first_row[first], "date", problem, way_out=way_out)
     if len(first_row) > 1:
         _check_visits_named(rows, fault=fault)
     order = visits_in_order(before)

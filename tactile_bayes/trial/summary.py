@@ -215,9 +215,8 @@ def prediction_of(trial: Trial, modality: str) -> Prediction | None:
     ex_vivo = np.array([trial.ex_vivo_mm[key] for key, _ in stated], dtype=np.float64)
     caliper = np.array([trial.ex_vivo_sd_mm.get(key) or 0.0 for key, _ in stated]) / ex_vivo
     medians, sds = np.array([uncertainty for _, uncertainty in stated], dtype=np.float64).T
-    return Prediction(
-        medians, np.sqrt(sds**2 + np.log1p(caliper**2)), np.log(ex_vivo), np.array([masses[key] for key, _ in stated])
-    )
+    numbers = np.array([masses[key] for key, _ in stated])
+    return Prediction(medians, np.sqrt(sds**2 + np.log1p(caliper**2)), np.log(ex_vivo), numbers)
 
 
 def _advice(scale: float, ends: Ends, masses: int, refuted: bool) -> str:
@@ -225,15 +224,11 @@ def _advice(scale: float, ends: Ends, masses: int, refuted: bool) -> str:
     if masses < MIN_PATIENTS:
         return f"too few masses ({masses}) to judge; at least {MIN_PATIENTS} are needed"
     if ends[0] <= 1 <= ends[1]:
-        return (
-            "widths agree with the errors, but their shape or centre does not: look at the PIT histogram"
-            if refuted
-            else "no change: the widths agree with the errors found"
-        )
-    word = "too narrow" if scale > 1 else "too wide"
-    return (
-        f"stated uncertainties are {word}: multiply the SD of log size by {scale:.2f} ({ends[0]:.2f} to {ends[1]:.2f})"
-    )
+        if refuted:
+            return "widths agree with the errors, but their shape or centre does not: look at the PIT histogram"
+        return "no change: the widths agree with the errors found"
+    word, factor = "too narrow" if scale > 1 else "too wide", f"{scale:.2f} ({ends[0]:.2f} to {ends[1]:.2f})"
+    return f"stated uncertainties are {word}: multiply the SD of log size by {factor}"
 
 
 # --- The report: counts, figures, coverage and calibration of each modality, and modalities compared.

@@ -15,7 +15,7 @@ from tactile_bayes.files.size_json import read_size_calibration, write_size_cali
 from tactile_bayes.size.bodies import UNLIKE_SD, BodyCalibration
 from tactile_bayes.size.draws import ShapeDraws
 from tactile_bayes.size.learn.bodies import learn_other_sd, learn_population, size_errors
-from tactile_bayes.size.learn.regression import PopulationTable
+from tactile_bayes.size.learn.regression import PopulationTable, rows_of
 from tactile_bayes.size.pooling import SizePriors, pool_maps, pooled_size
 from tactile_bayes.size.terms import Recipe
 
@@ -216,7 +216,7 @@ def test_errors_of_bodies_left_out_are_those_of_refitting() -> None:
     errors = []
     for fold in range(10):
         out = full.body % 10 == fold
-        one = learn_eq6(full.rows(~out), recipe=RECIPE)
+        one = learn_eq6(rows_of(full, ~out), recipe=RECIPE)
         log_size = one.log_size(full.log_amplitude[out], full.log_width[out])
         errors.append(np.abs(np.expm1(log_size.reshape(-1, 2).mean(axis=1) - np.log(full.d_mm[out][::2]))))
     assert closed == pytest.approx(100 * np.mean(np.concatenate(errors)), rel=0.1)

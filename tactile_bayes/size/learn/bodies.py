@@ -50,9 +50,8 @@ def learn_population(
     exam, noise = _exams(rows, eq6, size, slope)
     fitted = None
     if residual and rows.depth is not None:
-        fitted = regression.fit_residual(
-            regression.BodyResiduals(rows.of_bodies(eq6.data), rows.spread_terms(eq6.data), left, noise)
-        )
+        residuals = regression.BodyResiduals(rows.of_bodies(eq6.data), rows.spread_terms(eq6.data), left, noise)
+        fitted = regression.fit_residual(residuals)
         steps = np.eye(3)[:2] * _STEP  # along u and v
         slopes = [(fitted.at(rows.values + h) - fitted.at(rows.values - h)) / (2 * _STEP) for h in steps]
         size, slope = size + fitted.at(rows.values), slope + np.stack(slopes)
@@ -82,7 +81,7 @@ class TableRows(Record, eq=False):
         if table.profile is not None and table.log_fat is not None:
             known = np.isfinite(table.profile.sum(axis=1))
             if len(np.unique(table.body[known])) >= LEAST_BODIES:
-                maps, depth = table.rows(known), learn_depth(table.profile[known], table.log_fat[known])
+                maps, depth = regression.rows_of(table, known), learn_depth(table.profile[known], table.log_fat[known])
                 log_depth = depth.log_depth(table.profile[known])
         rows = np.column_stack([maps.log_amplitude, maps.log_width, log_depth])
         centre = [round(float(column.mean()), 3) for column in rows.T]
@@ -271,9 +270,8 @@ def size_errors(
     calibration: BodyCalibration, table: regression.PopulationTable, *, known: Sequence[str] = ()
 ) -> SizeErrors:
     """Errors of a table's bodies, each by all its exams, given the true values of the properties in `known`."""
-    bodies = np.unique(table.body)
-    errors = np.array([size_error(calibration, table.rows(table.body == body), known=known) for body in bodies])
-    return SizeErrors(*errors.T)
+    exams = (regression.rows_of(table, table.body == body) for body in np.unique(table.body))
+    return SizeErrors(*np.array([size_error(calibration, one, known=known) for one in exams]).T)
 
 
 def size_error(
@@ -289,9 +287,8 @@ def size_error(
     middle = a.mean(keepdims=True), p.mean(keepdims=True)
     values = {name: float(exams.unknowns[name][0]) for name in known}
     values = {name: float(np.exp(value)) if name in LOGGED else value for name, value in values.items()}
-    expected, variance_left = known_body(
-        calibrated, values, *middle, calibrated.table_sd(calibrated.body_sd(*middle, np.zeros(1)))
-    )
+    table_sd = calibrated.table_sd(calibrated.body_sd(*middle, np.zeros(1)))
+    expected, variance_left = known_body(calibrated, values, *middle, table_sd)
     exam = (noise.mean() + np.exp(2 * calibrated.spread.log_exam_sd)) / len(exams)
     variance = variance_left[0] + calibrated.other_sd**2 + calibrated.coefficient_variance(terms)[0] + exam
     size = calibrated.log_size(a, p).mean() + expected[0]

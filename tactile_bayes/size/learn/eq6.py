@@ -102,9 +102,8 @@ def axis_rows(table: SizeTable) -> list[AxisRows]:
     """Rows with positive amplitude for the regression of each axis: across the head, and along it where widths are."""
     rising = table.amplitude > 0
     if rising.sum() < 8:
-        raise BadDataError(
-            f"{int(rising.sum())} rows with a positive amplitude", way_out="Eq 6 has 4 coefficients: give at least 8"
-        )
+        what = f"{int(rising.sum())} rows with a positive amplitude"
+        raise BadDataError(what, way_out="Eq 6 has 4 coefficients: give at least 8")
     if np.ptp(table.d_mm[rising]) <= 0:
         raise BadDataError("all rows have one diameter", way_out="a calibration needs lumps of several sizes")
     if any(s is not None and np.ptp(s[rising]) <= 0 for s in (table.sigma_x_mm, table.sigma_y_mm)):

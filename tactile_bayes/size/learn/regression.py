@@ -55,10 +55,6 @@ class PopulationTable(Record, eq=False):
     def __len__(self) -> int:
         return len(self.d_mm)
 
-    def rows(self, keep: BoolArray) -> PopulationTable:
-        """Copy with the rows where `keep` is true."""
-        return rows_of(self, keep)
-
 
 def rows_of(columns: T, keep: BoolArray) -> T:
     """A copy of a table, whose fields are columns or tables or None, with the rows where `keep` is true."""

@@ -180,9 +180,8 @@ def _misfit(applied: BodyCalibration, maps: Sequence[PhantomMap]) -> str:
 def _row(applied: BodyCalibration, maps: Sequence[PhantomMap]) -> tuple[float, ...]:
     """Residual of a phantom under the calibration, as the columns of `PhantomResiduals`."""
     log_size = log_sizes(applied, [one.shape for one in maps])
-    log_a, log_width = (
-        np.array([np.nanmean(getattr(m.shape, n)) for m in maps]) for n in ("log_amplitude", "log_width")
-    )
+    log_a = np.array([np.nanmean(one.shape.log_amplitude) for one in maps])
+    log_width = np.array([np.nanmean(one.shape.log_width) for one in maps])
     left = np.array([np.log(m.d_mm) - np.nanmean(size) for m, size in zip(maps, log_size, strict=True)])
     body_sd = applied.body_sd(log_a, log_width, np.zeros(len(maps))).mean()
     table_sd = float(applied.table_sd(body_sd))
@@ -293,9 +292,8 @@ def learn_repeatability(repeats: Sequence[RepeatedExams], *, fewest: int = FEWES
     masses = sorted({one.mass for one in repeats})
     if len(masses) < fewest:
         what = f"{len(masses)} {'mass has' if len(masses) == 1 else 'masses have'} repeated exams with sizes"
-        raise BadDataError(
-            what, way_out=f"give at least {fewest}: one or two masses do not tell an unusual mass from a site's spread"
-        )
+        way_out = f"give at least {fewest}: one or two masses do not tell an unusual mass from a site's spread"
+        raise BadDataError(what, way_out=way_out)
     by_exams = np.stack([restricted_log_likelihood(one.centre, one.noise, GRID) for one in repeats])
     density = _density(by_exams.sum(axis=0))
     by_chance = []
@@ -320,8 +318,6 @@ def _summary(density: FloatArray, masses: int, maps: int, outlying: tuple[str, .
     """Quantiles, and the log-normal with the same means of tau^2 and tau^4: a map's size has tau in its variance."""
     square, fourth = float(density @ GRID**2), float(density @ GRID**4)
     tails = 0.5 * (1.0 - PROBABILITY)
-    low, median, high = np.interp((tails, 0.5, 1.0 - tails), np.cumsum(density) - 0.5 * density, GRID)
+    low, median, high = np.interp((tails, 0.5, 1.0 - tails), np.cumsum(density) - 0.5 * density, GRID).tolist()
     log_sd = float(np.sqrt(max(np.log(fourth / square**2), 0.0) / 4.0))
-    return Repeatability(
-        float(np.sqrt(square)), log_sd, float(median), float(low), float(high), masses, maps, outlying=outlying
-    )
+    return Repeatability(float(np.sqrt(square)), log_sd, median, low, high, masses, maps, outlying=outlying)
