@@ -9,6 +9,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 # --- Every error the program can explain in one line, each with the exit code it ends in.
 #
@@ -186,7 +187,8 @@ def one_line(error: BaseException) -> str:
 # --- Reasons for giving no number: a sentence, a code for programs, and the remedy.
 
 CANNOT_SHOW = "cannot_show"  #: Code of data that cannot show a lump even where there is one.
-CODES = ("empty", "undetected", "ridge", CANNOT_SHOW, "unresolved", "window", "prior", "extrapolated", "method")
+Code = Literal["empty", "undetected", "ridge", "cannot_show", "unresolved", "window", "prior", "extrapolated", "method"]
+CODES = get_args(Code)
 NO_LUMP = ("empty", "undetected", "ridge")
 """Codes of maps that show no lump where one would show; the others but `CANNOT_SHOW` show one without a size."""
 

@@ -181,5 +181,4 @@ def patient_from_base(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, *, n
 def patient_from_plane(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, plane_from_base: FloatArray) -> FloatArray:
     """(4, 4) as `patient_from_base` but from the plane, whose z points into the body; landmarks in `base`."""
     patient = patient_from_base(sternal_notch_mm, xiphoid_mm, normal=plane_from_base[2, :3])
-    transform: FloatArray = patient @ inverse(plane_from_base)
-    return transform
+    return np.asarray(patient @ inverse(plane_from_base))

@@ -329,6 +329,8 @@ class IdentityOptions(Options):
 
 
 Baud = Annotated[int, Meta(ge=300)]
+Side = Literal["left", "right", "phantom"]
+Posture = Literal["supine", "oblique", "sitting", "phantom"]
 
 
 class RecordOptions(Options, kw_only=True):
@@ -369,8 +371,8 @@ class RecordOptions(Options, kw_only=True):
     accept_calibration: Annotated[bool, "Accept an array calibration that is stale or of another head."] = False
     calibration_days: Annotated[float, Meta(ge=0), "Age from which an array calibration is stale, days."] = 1.0
     landmarks: Annotated[Path | None, cli_meta("FILE"), "Take landmarks from a JSON file or a scan."] = None
-    side: Annotated[Literal["left", "right", "phantom"] | None, "Breast that is scanned."] = None
-    posture: Annotated[Literal["supine", "oblique", "sitting", "phantom"] | None, "Posture during the scan."] = None
+    side: Annotated[Side | None, "Breast that is scanned."] = None
+    posture: Annotated[Posture | None, "Posture during the scan."] = None
     lubricant: Annotated[str | None, cli_meta("TEXT"), "Lubricant on the skin."] = None
     examiner: Annotated[str | None, cli_meta("CODE"), "Code of the examiner, not a name."] = None
     subject: Annotated[str | None, cli_meta("CODE"), "Code of the patient, not a name."] = None

@@ -108,8 +108,7 @@ class Campaign:
 
     def files(self, step: str, name: str) -> Mapping[str, str]:
         """Digests of the files that a step made of an exam or mass, by their names; empty where it made none."""
-        made: Mapping[str, str] = self.result(step, name).get("files", {})
-        return made
+        return dict(self.result(step, name).get("files", {}))
 
     def run(self) -> None:
         """Run what is missing; what is done is kept where the disk is full, the cluster is lost, or on Ctrl-C."""

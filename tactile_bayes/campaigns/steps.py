@@ -24,6 +24,7 @@ from tactile_bayes.campaigns.exams import ARRAYS, OWN_AXES, Match, estimate_matc
 from tactile_bayes.declarations import EXACT, Record, field, from_plain, replace, rounded, to_plain
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files import manifest_csv as layout
+from tactile_bayes.files import reading
 from tactile_bayes.files.atomic import sha256, write_bytes, write_text
 from tactile_bayes.files.documents import read_record
 from tactile_bayes.files.imports import read_arrays
@@ -31,7 +32,6 @@ from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.map_nc import read_map, read_map_and_scans, write_map
 from tactile_bayes.files.npz import read_shape, write_shape
 from tactile_bayes.files.provenance import Provenance, scan_facts
-from tactile_bayes.files.reading import NETCDF_BYTES, downloaded, kind_of, read_bytes, upload
 from tactile_bayes.files.reports import EstimateReport, json_text
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
 from tactile_bayes.findings import Finding, by_severity
@@ -125,8 +125,6 @@ FILES: Final = {
 }
 """The files that each step may write."""
 UNWRITTEN: Final = "unwritten"  #: Key of a result that the disk did not take: the campaign's fault, not the exam's.
-_A_MAP, _ARRAYS = "a map or posterior (netCDF)", "an archive (.npz or a spreadsheet)"
-"""Names that `kind_of` gives to files that are no scans."""
 
 Result = dict[str, Any]
 Made = tuple[Result, Writes]  #: Results of a step, and a writer for each of its files.
@@ -194,15 +192,15 @@ def make_map(
     object store, downloaded for as long as the map is made.
     """
     if address:
-        with downloaded(address) as path:
+        with reading.downloaded(address) as path:
             return make_map(path, source_sha256=source_sha256, expected=expected, normalise=normalise)
     if sha256(source) != source_sha256:
         raise BadDataError("changed while the campaign ran", way_out="run the campaign again")
-    kind, arrays = kind_of(source), source.suffix.lower() in ARRAYS
-    if kind == _A_MAP and not arrays:
+    kind, arrays = reading.kind_of(source), source.suffix.lower() in ARRAYS
+    if kind == reading.MAP and not arrays:
         return _copy_map(source, expected)
     writes: Writes = {}
-    if kind == _ARRAYS or arrays:
+    if kind == reading.ARCHIVE or arrays:
         scan = read_arrays(source)
         made = Provenance("import", {"as": "scan", "lost": [], "correct": []}, inputs={"source": source_sha256})
         writes[layout.SCAN] = lambda path: write_scan(path, scan, provenance=made, force=True)
@@ -223,7 +221,7 @@ def _copy_map(source: Path, expected: Mapping[str, str]) -> Made:
     tactile_map, scans = read_map_and_scans(source)
     for facts in scans:
         check_facts(expected, facts)
-    data = read_bytes(source, most=NETCDF_BYTES)
+    data = reading.read_bytes(source, most=reading.NETCDF_BYTES)
     result = {"scans": list(scans), "synthetic": None, "normalise": tactile_map.recipe.normalise}
     return result, {layout.MAP: lambda path: write_bytes(path, data, force=True)}
 
@@ -359,7 +357,7 @@ def copy_files(folder: Path, files: Sequence[str], *, to: str) -> Made:
     """Copy files into an object store."""
     try:
         for name in files:
-            upload(folder / name, f"{to}/{name}")
+            reading.upload(folder / name, f"{to}/{name}")
     except UsageError as error:
         return {UNWRITTEN: str(error)}, {}
     return {}, {}

@@ -11,12 +11,12 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import cache, partial
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
 from tactile_bayes.declarations import Meta, Record, field, from_plain, names_of, replace, schema_name, short_repr
 from tactile_bayes.errors import BadDataError, in_file, suggestion
 from tactile_bayes.files import reading
-from tactile_bayes.options import TrialSettings
+from tactile_bayes.options import Posture, Side, TrialSettings
 from tactile_bayes.scans import Scan
 
 # --- The schemas in data_schema/, from a wheel or a checkout.
@@ -29,8 +29,7 @@ def load_schema(name: str) -> dict[str, Any]:
     """Load the schema ``data_schema/NAME`` (``size_calibration.schema.json``, ``trial.table.json``...)."""
     for folder in (_PACKAGE / "data_schema", _PACKAGE.parent / "data_schema"):
         if (folder / name).is_file():
-            document: dict[str, Any] = json.loads((folder / name).read_text(encoding="utf-8"))
-            return document
+            return dict(json.loads((folder / name).read_text(encoding="utf-8")))
     raise FileNotFoundError(f"schema {name} is not installed with this program")
 
 
@@ -86,7 +85,7 @@ def load_json(path: Path, *, way_out: str = "give a file this program wrote") ->
         raise error.with_path(path) from None
 
 
-def parse_json(text: str, *, name: str = "", way_out: str = "copy the file again") -> object:
+def parse_json(text: str, *, name: str = "", way_out: str = reading.COPY_AGAIN) -> object:
     """Parse a JSON text as `load_json` does; `name` is the part of a file that the text is, empty for a whole file."""
     with reading.decoding(f"{name} is not JSON".lstrip(), way_out=way_out):
         document: object = json.loads(text, object_pairs_hook=partial(_object, way_out=way_out))
@@ -189,7 +188,6 @@ _CODE: Final = "a text in quotes of up to {} letters from A to Z and a to z, dig
 Code = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,32}$", extra={"words": _CODE.format(32)})]
 Examiner = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,16}$", extra={"words": _CODE.format(16)})]
 Days = Annotated[str, Meta(pattern="^-?[0-9]{1,6}$", extra={"words": "a whole number of days in quotes"})]
-Posture = Literal["supine", "oblique", "sitting", "phantom"]
 _FACT_NAME: Final = "^[a-z][a-z0-9_]{0,39}$"
 FactName = Annotated[str, Meta(pattern=_FACT_NAME)]
 Fact = Annotated[str, Meta(max_length=2000, extra={"words": "a text in quotes of up to 2000 letters"})]
@@ -205,7 +203,7 @@ class Session(Record, forbid_unknown_fields=False):
     head_id: Text64 | None = None  #: Identity of the scan head.
     array_id: Text64 | None = None  #: Identity or serial number of the pressure array.
     tracker_id: Text64 | None = None  #: Identity or serial number of the tracker.
-    side: Literal["left", "right", "phantom"] | None = None  #: Breast that was scanned, or a phantom.
+    side: Side | None = None  #: Breast that was scanned, or a phantom.
     posture: Posture | None = None  #: Posture during the scan.
     lubricant: Text64 | None = None  #: Lubricant on the skin; `none` for none.
     examiner: Examiner | None = None  #: Coded examiner, not a name.

@@ -19,7 +19,7 @@ from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from numpy.typing import NDArray
 
 from tactile_bayes.errors import BadDataError, in_file
-from tactile_bayes.files.reading import MCAP_MAGIC, check_limit, open_input, readable, unpacked_limit, wrong_kind
+from tactile_bayes.files.reading import MCAP_MAGIC, SCAN, check_limit, open_input, readable, unpacked_limit, wrong_kind
 
 # --- Decompression of MCAP chunks within the declared and the total size limit.
 
@@ -202,7 +202,7 @@ def _check_magic(stream: IO[bytes], path: Path) -> None:
         what = "is empty" if not start else f"is cut off in its header ({len(start)} bytes)"
     else:
         what = f"is not an MCAP file (it starts with {start!r})"
-    raise wrong_kind(path, "a scan", what=what, way_out="give a scan from `record`, `import` or `simulate`")
+    raise wrong_kind(path, SCAN, what=what, way_out="give a scan from `record`, `import` or `simulate`")
 
 
 def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:

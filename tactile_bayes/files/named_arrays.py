@@ -55,7 +55,6 @@ _NPY: Final = np.lib.format.MAGIC_PREFIX
 _KNOWN: Final = (_ZIP, _NPY, _MAT_5, _MAT_73, reading.HDF5_MAGIC, reading.MCAP_MAGIC, b"CDF")
 _USER_BLOCK: Final = 512  # bytes before the HDF5 file in a .mat of version 7.3
 _LOOKED_AT: Final = _USER_BLOCK + len(reading.HDF5_MAGIC)
-_COPY_AGAIN: Final = "copy the file again"
 _MOST_LEVELS: Final = 8
 
 
@@ -156,7 +155,7 @@ def _orient(arrays: Arrays, grids: Iterable[str], x: np.ndarray, y: np.ndarray) 
 def _netcdf_3(path: Path) -> Arrays:
     data = reading.read_bytes(path, most=reading.NETCDF_BYTES)
     with (
-        reading.decoding("is not a whole netCDF-3 file", way_out=_COPY_AGAIN),
+        reading.decoding("is not a whole netCDF-3 file"),
         warnings.catch_warnings(action="ignore"),
         scipy.io.netcdf_file(io.BytesIO(data), "r", mmap=False) as file,
     ):
@@ -166,7 +165,7 @@ def _netcdf_3(path: Path) -> Arrays:
 
 def _hdf5(path: Path, choose: Choose, *, begins_at: int = 0) -> Arrays:
     """Arrays of an HDF5 file; MATLAB's of version 7.3 is one."""
-    with open_netcdf(path, way_out=_COPY_AGAIN, begins_at=begins_at) as root:
+    with open_netcdf(path, way_out=reading.COPY_AGAIN, begins_at=begins_at) as root:
         members = dict(_members(root, "", levels=_MOST_LEVELS))
         return {name: np.asarray(members[name].numbers(name.rpartition(".")[2])) for name in choose(list(members))}
 
@@ -204,7 +203,7 @@ def _mat_5(path: Path) -> Arrays:
     order = "<" if data[126:128] == b"IM" else ">"
     most = reading.unpacked_limit(len(data))
     arrays: Arrays = {}
-    with reading.decoding("is not a whole .mat file", way_out=_COPY_AGAIN):
+    with reading.decoding("is not a whole .mat file"):
         for kind, element in _elements(data[_HEADER:], order):
             parts = [(kind, element)]
             if kind == _COMPRESSED:
@@ -229,7 +228,7 @@ def _elements(data: bytes, order: str) -> Iterator[Element]:
             start = at + 8
             end = start + length + (-length % 8 if kind != _COMPRESSED else 0)
         if length > len(data) - start:
-            raise BadDataError("ends within an array", way_out=_COPY_AGAIN)
+            raise BadDataError("ends within an array", way_out=reading.COPY_AGAIN)
         yield kind, data[start : start + length]
         at = end
 
@@ -252,7 +251,7 @@ def _matrix_arrays(matrix: bytes, order: str, name: str, levels: int) -> Iterato
     elif kind in _NUMERIC and not flags & _COMPLEX:
         values = _numbers(next(elements), order)
         if min(shape, default=0) < 0 or math.prod(shape) != len(values):
-            raise BadDataError(f"{name} has {len(values)} numbers for a shape of {shape}", way_out=_COPY_AGAIN)
+            raise BadDataError(f"{name} has {len(values)} numbers for a shape of {shape}", way_out=reading.COPY_AGAIN)
         yield name, values.reshape(shape, order="F")
     elif name:
         yield name, _NO_NUMBERS
@@ -261,7 +260,7 @@ def _matrix_arrays(matrix: bytes, order: str, name: str, levels: int) -> Iterato
 def _numbers(element: Element, order: str) -> np.ndarray:
     kind, content = element
     if kind not in _TYPES:
-        raise BadDataError(f"holds numbers of type {kind}", way_out=_COPY_AGAIN)
+        raise BadDataError(f"holds numbers of type {kind}", way_out=reading.COPY_AGAIN)
     return np.frombuffer(content, dtype=f"{order}{_TYPES[kind]}")
 
 

@@ -295,7 +295,7 @@ def open_netcdf(path: Path, *, way_out: str, begins_at: int = 0) -> Iterator[Gro
     with in_file(path), reading.open_input(path) as stream, reading.decoding(_DAMAGED, way_out=way_out):
         stream.seek(begins_at)
         if stream.read(len(reading.HDF5_MAGIC)) != reading.HDF5_MAGIC:
-            raise reading.wrong_kind(path, "a map or posterior (netCDF)", what=_DAMAGED, way_out=way_out)
+            raise reading.wrong_kind(path, reading.MAP, what=_DAMAGED, way_out=way_out)
         reading.check_limit(stream.seek(0, io.SEEK_END), reading.NETCDF_BYTES, what="it has {} bytes")
         stream.seek(0)
         data = stream.read()

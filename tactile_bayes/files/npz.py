@@ -24,7 +24,6 @@ from tactile_bayes.size.draws import ShapeDraws
 
 Arrays = dict[str, np.ndarray[Any, np.dtype[Any]]]
 
-_COPY_AGAIN: Final = "copy the file again"
 _ENCRYPTED: Final = 0x1
 _HEADERS: Final = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -80,7 +79,7 @@ def load_npy(path: Path) -> Arrays:
 
 
 def _array(stream: IO[bytes], length: int, name: str) -> np.ndarray[Any, np.dtype[Any]]:
-    with reading.decoding(f"{name} is damaged", way_out=_COPY_AGAIN):
+    with reading.decoding(f"{name} is damaged"):
         shape, in_columns, dtype = _HEADERS[np.lib.format.read_magic(stream)](stream)
         if dtype.hasobject:
             what = f"{name} holds Python objects, which are never unpickled"
@@ -88,7 +87,7 @@ def _array(stream: IO[bytes], length: int, name: str) -> np.ndarray[Any, np.dtyp
         size, bytes_held = math.prod(shape) * dtype.itemsize, length - stream.tell()
         if bytes_held != size:
             what = f"{name} declares {size:,} bytes (shape {shape}, {dtype}) and holds {bytes_held:,}"
-            raise BadDataError(what, way_out=_COPY_AGAIN)
+            raise BadDataError(what, way_out=reading.COPY_AGAIN)
         data = bytearray(stream.read())  # up to the end of the member, so that its checksum is looked at
         flat: np.ndarray[Any, np.dtype[Any]] = np.frombuffer(data, dtype=dtype)
         return flat.reshape(shape, order="F" if in_columns else "C")

@@ -140,8 +140,11 @@ def limit_factor() -> float:
     return factor
 
 
+COPY_AGAIN: Final = "copy the file again"
+
+
 @contextlib.contextmanager
-def decoding(what: str, *, way_out: str) -> Iterator[None]:
+def decoding(what: str, *, way_out: str = COPY_AGAIN) -> Iterator[None]:
     """Turn any error of a decoder on damaged bytes into a `BadDataError` with the text `what`: ``"cannot be decoded"``.
 
     Only calls into decoders of other packages belong inside: each of them has error classes of its own, and damaged
@@ -178,13 +181,13 @@ def readable(path: Path) -> Iterator[None]:
 MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 HDF5_MAGIC: Final = b"\x89HDF\r\n\x1a\n"
 ZIP_MAGIC: Final = b"PK\x03\x04"
-_SCAN, _MAP, _ARCHIVE = "a scan", "a map or posterior (netCDF)", "an archive (.npz or a spreadsheet)"
+SCAN, MAP, ARCHIVE = "a scan", "a map or posterior (netCDF)", "an archive (.npz or a spreadsheet)"
 _IMAGE, _NETCDF_3 = "an image", "a netCDF-3 file"
 _ESTIMATE, _POOLED = "an estimate (JSON)", "a pooled estimate (JSON)"
 _BEGINNINGS = {
-    MCAP_MAGIC: _SCAN,
-    HDF5_MAGIC: _MAP,
-    ZIP_MAGIC: _ARCHIVE,
+    MCAP_MAGIC: SCAN,
+    HDF5_MAGIC: MAP,
+    ZIP_MAGIC: ARCHIVE,
     **dict.fromkeys((b"\x89PNG", b"II*\x00", b"MM\x00*", b"P5"), _IMAGE),
     b"%PDF": "a PDF",
     b"PAR1": "a Parquet file",
@@ -204,12 +207,12 @@ _DOCUMENTS = {
     "plan": "a trial plan (JSON)",
 }
 _WAYS = {
-    (_SCAN, _MAP): "build its map first: `tactile-bayes map {path} -o MAP.nc`",
-    (_ARCHIVE, _SCAN): "bring it in first: `tactile-bayes import {path} -o SCAN.mcap`",
-    (_ARCHIVE, _MAP): "bring it in first: `tactile-bayes import --help` says how",
-    (_IMAGE, _MAP): "bring it in first: `tactile-bayes import {path} --as map -o MAP.nc`",
-    (_NETCDF_3, _MAP): "convert it to netCDF-4, for example `nccopy -k nc4 {path} NEW.nc`",
-    (_MAP, _SCAN): "give the scan that the map was built from",
+    (SCAN, MAP): "build its map first: `tactile-bayes map {path} -o MAP.nc`",
+    (ARCHIVE, SCAN): "bring it in first: `tactile-bayes import {path} -o SCAN.mcap`",
+    (ARCHIVE, MAP): "bring it in first: `tactile-bayes import --help` says how",
+    (_IMAGE, MAP): "bring it in first: `tactile-bayes import {path} --as map -o MAP.nc`",
+    (_NETCDF_3, MAP): "convert it to netCDF-4, for example `nccopy -k nc4 {path} NEW.nc`",
+    (MAP, SCAN): "give the scan that the map was built from",
     (_POOLED, _ESTIMATE): "give the maps that were pooled",
 }
 _LOOKED_AT = 4096

@@ -18,7 +18,7 @@ from tactile_bayes.declarations import (
     rounded,
     to_plain,
 )
-from tactile_bayes.errors import BadDataError
+from tactile_bayes.errors import BadDataError, Code
 from tactile_bayes.files.documents import dump_json
 from tactile_bayes.findings import Finding, Verdict
 from tactile_bayes.inference.draws import Quantity
@@ -32,9 +32,7 @@ Number1 = Annotated[int, Meta(ge=1)]
 Length = Annotated[float, Meta(gt=0, le=500)]
 Diameter = Length | None
 Three = tuple[Diameter, Diameter, Diameter]
-ReasonCode = Literal[
-    "", "empty", "undetected", "ridge", "cannot_show", "unresolved", "window", "prior", "extrapolated", "method"
-]
+ReasonCode = Literal["", Code]
 Shape = Literal["round", "ellipse", "rotated"]
 Findings = Annotated[
     tuple[Finding, ...], described("What speaks against the result, cautions first; see docs/formats.md")
@@ -61,8 +59,7 @@ class Report(Sized, kw_only=True):
     @property
     def document(self) -> dict[str, Any]:
         """Plain data, as the file has them."""
-        document: dict[str, Any] = to_plain(self, digits=EXACT)
-        return document
+        return dict(to_plain(self, digits=EXACT))
 
     @property
     def origin(self) -> Origin:

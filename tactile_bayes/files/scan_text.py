@@ -25,28 +25,26 @@ from tactile_bayes.geometry import BoolArray, FloatArray
 # --- Poses: columns by their names, or numbers in a stated layout.
 
 _NAMES: Final[Mapping[str, str]] = {
-    **dict.fromkeys(("tx", "x", "px", "posx", "positionx"), "x"),
-    **dict.fromkeys(("ty", "y", "py", "posy", "positiony"), "y"),
-    **dict.fromkeys(("tz", "z", "pz", "posz", "positionz"), "z"),
-    **dict.fromkeys(("q0", "qw", "w", "rotw", "orientationw"), "qw"),
-    **dict.fromkeys(("qx", "q1", "orientationx"), "qx"),
-    **dict.fromkeys(("qy", "q2", "orientationy"), "qy"),
-    **dict.fromkeys(("qz", "q3", "orientationz"), "qz"),
-    **dict.fromkeys(("az", "azimuth", "azi"), "azimuth"),
-    **dict.fromkeys(("el", "elevation", "elev"), "elevation"),
-    **dict.fromkeys(("roll", "ro", "rl"), "roll"),
-    **dict.fromkeys(
-        (
-            *("time", "t", "zeit", "timestamp", "epoch", "datetime"),
-            *("times", "timems", "timestampms", "timeus", "secs", "seconds"),
-        ),
-        "time",
-    ),
-    **dict.fromkeys(("timespecs",), "seconds"),
-    **dict.fromkeys(("timespecns",), "nanoseconds"),
-    **dict.fromkeys(("frame", "framenumber", "frameno"), "frame"),
-    **dict.fromkeys(("state", "status", "transformstatus", "trackingstatus"), "status"),
-    **dict.fromkeys(("tool", "toolid", "toolinfo", "port", "porthandle", "toolhandle", "station", "sensor"), "tool"),
+    name: kind
+    for kind, names in {
+        "x": "tx x px posx positionx",
+        "y": "ty y py posy positiony",
+        "z": "tz z pz posz positionz",
+        "qw": "q0 qw w rotw orientationw",
+        "qx": "qx q1 orientationx",
+        "qy": "qy q2 orientationy",
+        "qz": "qz q3 orientationz",
+        "azimuth": "az azimuth azi",
+        "elevation": "el elevation elev",
+        "roll": "roll ro rl",
+        "time": "time t zeit timestamp epoch datetime times timems timestampms timeus secs seconds",
+        "seconds": "timespecs",
+        "nanoseconds": "timespecns",
+        "frame": "frame framenumber frameno",
+        "status": "state status transformstatus trackingstatus",
+        "tool": "tool toolid toolinfo port porthandle toolhandle station sensor",
+    }.items()
+    for name in names.split()
 }
 """What a column is, by its name in small letters and digits."""
 _ROTATIONS: Final = {"wxyz": ("qw", "qx", "qy", "qz"), "euler": ("azimuth", "elevation", "roll")}

@@ -36,7 +36,6 @@ _TYPES: Final = {
     "MET_FLOAT": "f4",
     "MET_DOUBLE": "f8",
 }
-_COPY_AGAIN: Final = "copy the file again"
 
 
 def is_sequence(path: Path) -> bool:
@@ -51,7 +50,7 @@ def read_sequence(path: Path, stated: Stated, *, frames: bool) -> Source:
         last = _LAST_KEY.search(data)
         if last is None or last[1] != b"LOCAL":
             raise BadDataError("has no numbers behind a line ElementDataFile = LOCAL", way_out="save it as one .mha")
-        with decoding("is no metafile", way_out=_COPY_AGAIN):
+        with decoding("is no metafile"):
             keys = dict(_LINE.findall(data[: last.end()].decode("utf-8")))
         poses = _poses(keys, stated)
         return replace(poses, arrays={**poses.arrays, **_frames(keys, data[last.end() :])}) if frames else poses
@@ -65,7 +64,7 @@ def _values_per_frame(keys: dict[str, str], name: str, number: int) -> list[str]
 def _numbers(texts: list[str], width: int) -> FloatArray:
     """(n, width) numbers, NaN where a frame has none."""
     rows = [text.split() for text in texts]
-    with decoding("holds a transform or a time that is no number", way_out=_COPY_AGAIN):
+    with decoding("holds a transform or a time that is no number"):
         return np.array([[float(one) for one in row] if len(row) == width else [np.nan] * width for row in rows])
 
 
@@ -87,7 +86,7 @@ def _poses(keys: dict[str, str], stated: Stated) -> Source:
 
 def _frames(keys: dict[str, str], data: bytes) -> Arrays:
     """(n, rows, columns) numbers and their times; the first axis of a metafile runs along a row."""
-    with decoding("is no metafile", way_out=_COPY_AGAIN):
+    with decoding("is no metafile"):
         shape = tuple(int(one) for one in reversed(keys["DimSize"].split()))
         kind = np.dtype(_TYPES[keys["ElementType"]])
     if keys.get("BinaryDataByteOrderMSB", keys.get("ElementByteOrderMSB", "False")) == "True":
@@ -96,7 +95,7 @@ def _frames(keys: dict[str, str], data: bytes) -> Arrays:
     size = int(np.prod(shape, dtype=object)) * kind.itemsize
     check_limit(size, unpacked_limit(len(data)), what="its frames unpack to {} bytes")
     if keys.get("CompressedData", "False") == "True":
-        with decoding("is not whole", way_out=_COPY_AGAIN):
+        with decoding("is not whole"):
             data = zlib.decompressobj().decompress(data, size + 1)
     if len(shape) != 3 or len(data) != size or min(shape) < 1:
         what = f"has DimSize {keys['DimSize']} of {kind} and {len(data)} bytes"
