@@ -406,11 +406,7 @@ class Outcome(Record, Generic[Result]):
 
 
 class BatchInterrupted(KeyboardInterrupt):
-    """Ctrl-C during a batch, with the finished outcomes.
-
-    `store` is the path that keeps the results for the next run, `before` the number of items done by earlier batches
-    of the same run.
-    """
+    """Ctrl-C during a batch, with its outcomes; `store` keeps the results, `before` counts those of earlier batches."""
 
     def __init__(self, outcomes: Sequence[Outcome[Any]], *, total: int, store: Path | None, before: int = 0) -> None:
         self.outcomes = list(outcomes)

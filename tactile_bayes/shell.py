@@ -131,10 +131,7 @@ def printable(text: str) -> str:
 
 
 class PrintableStream:
-    """A text stream that escapes control characters and, on a terminal, wraps lines; otherwise as the one underneath.
-
-    A failed write is an error where `required` (standard output), else ignored (standard error: nowhere to report it).
-    """
+    """A text stream that escapes control characters and wraps lines on a terminal; a `required` one must be written."""
 
     def __init__(self, stream: TextIO, *, required: bool) -> None:
         self._stream = stream

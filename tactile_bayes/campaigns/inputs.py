@@ -80,11 +80,7 @@ def unchanged(folder: Path, result: Result) -> bool:
 def remove_stale_files(
     folder: Path, exams: Sequence[Exam], files_of: Callable[[str, str], Collection[str]], *, unread: Collection[str]
 ) -> list[str]:
-    """Remove files of earlier runs that this one did not make; returns folders of exams that the table does not list.
-
-    `files_of`: names of the files that a step of this run made for an exam or mass; `unread`: exams whose file could
-    not be read, which keep their files.
-    """
+    """Remove what this run did not make, but of exams that are `unread`; returns the folders of exams of no row."""
     left = []
     spared = {*unread, *(name for exam in exams if exam.name in unread for name in (exam.of_mass, exam.of_visits))}
     _clear(folder, known=FILES[_BESIDE], made=files_of(_BESIDE, SITE))
@@ -159,11 +155,7 @@ def _digest(file: tuple[str, Path, str]) -> dict[str, Any]:
 def read_sources(
     exams: Sequence[Exam], *, store: BatchStore | None, keep: bool, executor: Executor | None, progress: Progress
 ) -> tuple[dict[Path, str], dict[Path, str]]:
-    """SHA-256 of every exam's file by its path, from the journal where the file is as it was then, and faults of files.
-
-    New digests go into the journal (`keep`), or else files in object stores that are not known are passed over. A lost
-    cluster is a `TactileBayesError`.
-    """
+    """SHA-256 of each exam's file by its path, read or from the journal (`keep`: into it, too), and faults."""
     files = {exam.path: (exam, *_digest_key(exam)) for exam in {exam.path: exam for exam in exams}.values()}
     values: Mapping[str, Any] = {} if store is None else store
     known = {path: values[key]["sha256"] for path, (_, key, settled) in files.items() if settled and key in values}

@@ -63,11 +63,7 @@ def no_bar(_label: str) -> AbstractContextManager[Progress]:
 
 @dataclass(eq=False)
 class Campaign:
-    """A run, or the plan of one, and how far it is: results by step and name, faults by name, counts of steps.
-
-    A plan (`dry`) runs and writes nothing. `bar` gives, for what is counted ("files read", "steps"), a context with a
-    callback for those done and those needed.
-    """
+    """A run (or with `dry` its plan) and how far it is: results by step and name, faults by name, counts of steps."""
 
     exams: Sequence[Exam]
     folder: Path
@@ -136,11 +132,7 @@ class Campaign:
                 self._run_masses("compare", growing, self._compare_task, masses=len(masses_with_visits(sound)))
 
     def _steps(self, exams: int, masses: int, *, learns: bool = False, compared: int = 0) -> dict[str, int]:
-        """Steps that so many exams and masses take, done or not.
-
-        `masses` are to be pooled, `compared` between visits; where the repeats may teach the spread between exams
-        (`learns`), every exam gets its size by it.
-        """
+        """Steps of so many exams, masses to pool and masses to compare; repeats that may teach the spread add some."""
         needed = {"map": exams, "estimate": exams, "figures": exams * self.settings.figures, "page": exams}
         needed |= {"pool": masses, "compare": compared}
         needed |= {"repeatability": 1, "size": exams} if learns else {}

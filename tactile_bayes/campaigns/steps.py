@@ -163,11 +163,7 @@ def _write_staged(task: Task, writes: Writes) -> Result:
 
 
 def run_step(task: Task) -> Result:
-    """Run a step; returns the digests of its files by name, their staging folder, its seconds, and its other results.
-
-    `put_in_place` moves the files to their place: a worker that outlives its command must not. A fault of the exam is a
-    `TactileBayesError` without a path.
-    """
+    """Run a step; returns its results, and digests and folder of its files, which `put_in_place` takes from there."""
     begun, begun_cpu = time.perf_counter(), time.thread_time()
     try:
         facts, writes = task.make()
@@ -186,11 +182,7 @@ def run_step(task: Task) -> Result:
 def make_map(
     source: Path, *, source_sha256: str, expected: Mapping[str, str], normalise: str, address: str = ""
 ) -> Made:
-    """The exam's map from its scan or its arrays (brought in as `import` does), or the map that its file is.
-
-    `expected`: the table's facts of the exam, by column; a file of another exam is refused. `address`: of a file in an
-    object store, downloaded for as long as the map is made.
-    """
+    """The exam's map from its scan or arrays, or as its file is one; one of another exam than `expected` is refused."""
     if address:
         with reading.downloaded(address) as path:
             return make_map(path, source_sha256=source_sha256, expected=expected, normalise=normalise)
@@ -313,10 +305,7 @@ def make_pool(folder: Path, names: Sequence[str], settings: Settings) -> Made:
 def make_growth(
     folder: Path, visits: Sequence[Sequence[str]], settings: Settings, *, course: Course, figures: bool
 ) -> Made:
-    """Compare the visits of a mass as `compare` does; the table says that they are of one where landmarks do not.
-
-    `visits`: names of each visit's exams in order of time, with folders below `folder`; `course`: the table's facts.
-    """
+    """Compare the visits of a mass as `compare` does; the table says that they are of one where landmarks do not."""
     answers = [[_answer(folder / name) for name in names] for names in visits]
     with_draws = [one for maps in answers for one in maps if one.shape is not None]
     placed = all(answer.report.centre_patient_mm is not None for answer in with_draws)

@@ -338,8 +338,7 @@ def _pose_table(messages: Messages) -> FloatArray:
 
 
 def _landmarks(records: McapRecords) -> scans.Landmarks | None:
-    """Last touch of each landmark, and the largest distance of an earlier one; None unless all `LANDMARK_NAMES` were
-    touched."""
+    """Last touches, and the largest distance of an earlier one; None unless all `LANDMARK_NAMES` were touched."""
     points, apart = {}, []
     for name in (*LANDMARK_NAMES, NIPPLE):
         touches = records.messages("/landmark", schema="foxglove.PoseInFrame", name=name)
@@ -421,14 +420,10 @@ class RecordingWriter(ScanWriter):
         self._send_message(self._log_channel, message, device_ns=device_ns, host_ns=host_ns)
 
     def flush(self) -> None:
-        """Close the chunk and hand it to the system, from where it survives this process.
-
-        Within `SYNC_S` it is on the disk too, and survives the computer. An OSError may be that of the disk before this
-        call.
-        """
+        """Hand the chunk to the system, where it survives this process; within `SYNC_S` it is on the disk too."""
         self._writer.flush()
         if self._synced is not None and self._synced.done():
-            self._synced.result()
+            self._synced.result()  # raises what the disk did not take
         if not self._asked:
             self._asked = True
             self._synced = self._thread.submit(self._sync, self._stream.fileno())

@@ -546,10 +546,7 @@ def split_fields(text: str, separator: str) -> list[str]:
 
 
 def comma_numbers(rows: Iterable[Sequence[str]], marks: Sequence[str] = (), *, way_out: str) -> list[str]:
-    """Fields of rows of numbers that have a decimal comma, or commas between thousands.
-
-    With a `way_out` they are refused where all may have commas between thousands: which is meant cannot be told.
-    """
+    """Fields of number rows with commas; with a `way_out` refused where all may separate thousands or decimals."""
     fields = (field for row in rows if _is_number_row(row, marks) for field in row)
     commas = [one for one in fields if _ANY_DECIMAL_COMMA.fullmatch(one) or may_be_thousands(one)]
     if way_out and commas and all(map(may_be_thousands, commas)):
