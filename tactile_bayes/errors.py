@@ -12,9 +12,6 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 # --- Every error the program can explain in one line, each with the exit code it ends in.
-#
-# Exit codes: 0 done, 1 fault, 2 usage, 3 bad data, 4 device, 5 not converged, 6 no estimate, 130 interrupted, 141
-# the reader of the output has gone.
 
 EXIT_DONE = 0
 EXIT_FAULT = 1

@@ -51,8 +51,7 @@ def size_calibration_path(name: str) -> Path | None:
     return path
 
 
-# --- Size calibrations as JSON: over a population, corrected by a site's phantoms, or Eq 6 with draws of its
-# coefficients.
+# --- Size calibrations as JSON: over a population, corrected by a site's phantoms, or Eq 6 with its draws.
 #
 # The file of each is its record with a header; numbers keep nine significant digits, the residual's covariance six.
 

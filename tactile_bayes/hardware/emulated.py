@@ -30,8 +30,6 @@ from tactile_bayes.options import FaultOptions
 from tactile_bayes.scans import Scan, TrackerPoses
 
 # --- Emulated devices: a scan's frames and poses as a head or a tracker sends them, with faults on request.
-#
-# The recorder treats them as any other devices.
 
 _NS: Final = 1_000_000_000
 # A command with arguments ends in CR; what is left are commands of one letter.

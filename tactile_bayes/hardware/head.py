@@ -103,10 +103,7 @@ class PacketParser(readings.Parser):
         return Packet(kind, sequence, device_us, body[HEADER.size : -CRC_BYTES])
 
 
-# --- Packets of the scan head, and of a tracker in the same framing: encoding and decoding of payloads.
-#
-# All numbers are little-endian. Kinds below 128 go from the device to the host, the others from the host to the
-# device.
+# --- Packets of the scan head, and of a tracker in the same framing; kinds from 128 on go from the host to the device.
 
 HELLO: Final = 1
 FRAME: Final = 2

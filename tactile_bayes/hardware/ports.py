@@ -26,8 +26,6 @@ from tactile_bayes.errors import DeviceError
 from tactile_bayes.hardware import reading
 
 # --- Ports by URL: a serial device, a socket, or another program's terminal.
-#
-# A `DeviceError` from here is one line: which port, what was expected, what came, what to try.
 
 ANSWER_S = 2.5  #: How long a device may take to answer.
 SILENT_S: Final = 3.0  #: Without a byte for so long a device has gone.

@@ -55,8 +55,6 @@ def encode_bird(numbers: Sequence[float]) -> bytes:
 # space and the length of the quaternion; LIBERTY's header has a size, whose tolerance is the closing space: firmware
 # may count it or not.
 #
-# References
-# ----------
 # Polhemus, 3SPACE FASTRAK User's Manual, revision G (2012); PATRIOT and LIBERTY user manuals.
 
 FASTRAK: Final = struct.Struct("<7f")  # position, quaternion

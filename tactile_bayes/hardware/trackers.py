@@ -55,8 +55,6 @@ def crc64(data: bytes) -> int:
 # (protocol version 3) the body is an extended header, the content, and metadata: pairs of key and value, of which
 # TransformValid and TransformStatus (PLUS, 3D Slicer) say whether the tool is seen. Lengths are in mm.
 #
-# References
-# ----------
 # OpenIGTLink protocol, version 3.0 (2017): header, TRANSFORM, POSITION (QTRANS), TDATA, QTDATA; igtl_qtdata.h for the
 # names of the last, which have 20 bytes there and in use, and 32 in the text.
 
