@@ -34,15 +34,7 @@ from tactile_bayes.trial.readings import at_excision, day_of
 # --- Tables: exams done, failures, and the trial table that `validate` takes.
 
 TACTILE, POOLED_MODALITY = "tactile", "tactile-pooled"
-_TRIAL_COLUMNS: Final = (
-    "patient", "mass", "modality", "replicate", "size_mm", "status", "sd_mm", "low_mm", "high_mm", "probability",
-    "reader", "visit", "date", "reason", "synthetic",
-)  # fmt: skip
-
-
-_SIZES: Final = {
-    "size_mm": "median", "sd_mm": "sd", "low_mm": "low", "high_mm": "high", "probability": "probability",
-}  # fmt: skip
+_SIZES: Final = {"size_mm": "median", "sd_mm": "sd", "low_mm": "low", "high_mm": "high", "probability": "probability"}
 
 
 Pooled = Mapping[str, PooledReport]  #: Each pooled mass, by its name.
@@ -297,7 +289,7 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
         **({layout.GROWN: [grown_line(one) for one in growth]} if growth else {}),
     }
     for name, lines in tables.items():
-        columns = _TRIAL_COLUMNS if name == layout.TRIAL else layout.columns_of(Path(name).stem)
+        columns = [column for column in layout.columns_of(Path(name).stem) if column != "posterior"]
         write_text(folder / name, layout.table_text(lines, columns), force=True)
     report, fault = ("", "") if excised is None else _write_report(folder, campaign.settings, growth)
     if not tables[layout.TRIAL]:

@@ -115,7 +115,6 @@ def read_feed(pipe: int, every_s: float) -> Iterator[list[FeedMessage]]:
 
 # Numbers of used frames at which the plane is fitted again: the first frames lie on a line.
 REFIT_AT: Final = (100, 200, 400, 800, 1600)
-LANDMARKS: Final = ("sternal_notch", "xiphoid")
 _KEPT_POSES: Final = 400
 _PATIENCE_NS: Final = 150_000_000
 
@@ -273,9 +272,9 @@ class LiveMap:
         if self._map is None or not self._map.figures["frames_used"]:
             return None
         tactile_map = self._map.snapshot()
-        if tactile_map.plane_from_base is None or not all(name in self._landmarks for name in LANDMARKS):
+        notch, xiphoid = map(self._landmarks.get, ("sternal_notch", "xiphoid"))
+        if tactile_map.plane_from_base is None or notch is None or xiphoid is None:
             return tactile_map
-        notch, xiphoid = (self._landmarks[name] for name in LANDMARKS)
         with suppress(BadDataError):  # two landmarks in one place give no axes
             axes = patient_from_plane(notch, xiphoid, tactile_map.plane_from_base)
             return replace(tactile_map, patient_from_plane=axes)
