@@ -256,9 +256,8 @@ def _decode_value(kind: Any, value: object) -> object:
         return np.asarray(msgspec.convert(value, nested), dtype=np.float64)
     except ValueError as error:  # msgspec's is one
         uneven = not isinstance(error, msgspec.ValidationError)
-        raise BadDataError(
-            "has rows of different lengths" if uneven else "", way_out="give numbers, the same count in each row"
-        ) from None
+        what = "has rows of different lengths" if uneven else ""
+        raise BadDataError(what, way_out="give numbers, the same count in each row") from None
 
 
 def _encode_array(value: object) -> object:

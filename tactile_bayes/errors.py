@@ -68,9 +68,8 @@ def check_number(
         if inside and not (open_ends and number in (least, most)) and math.isfinite(number):
             return
     value_text = f"{value:g}" if isinstance(value, float) else _shortened(repr(value))
-    raise UsageError(
-        f"{name} is {value_text}; give {number_words(least, most, _ENDS if open_ends else (), whole=whole)}"
-    )
+    fault = f"{name} is {value_text}; give {number_words(least, most, _ENDS if open_ends else (), whole=whole)}"
+    raise UsageError(fault)
 
 
 _ENDS = ("min", "max")

@@ -91,10 +91,8 @@ def check_rigid(transform: FloatArray, *, name: str) -> None:
     rotation = transform[:3, :3]
     departure = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if departure > NOT_RIGID or np.linalg.det(rotation) < 0 or not np.array_equal(transform[3], [0, 0, 0, 1]):
-        raise BadDataError(
-            f"{name} is not a rigid transform (R R^T departs from 1 by {departure:.1e})",
-            way_out="give a proper rotation and a translation in mm, last row 0 0 0 1",
-        )
+        what = f"{name} is not a rigid transform (R R^T departs from 1 by {departure:.1e})"
+        raise BadDataError(what, way_out="give a proper rotation and a translation in mm, last row 0 0 0 1")
 
 
 class Plane(Record, eq=False):
@@ -124,26 +122,21 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
     variances, axes = np.linalg.eigh(covariance_mm2)
     shortest, middle, longest = np.sqrt(np.maximum(variances, 0.0)).tolist()
     if not middle > 0.05 * longest or not middle > 1e-9:
-        raise BadDataError(
-            f"the taxel centres lie on a line (spread {longest:.3g} by {middle:.3g} mm)",
-            way_out="scan with strokes side by side",
-        )
+        what = f"the taxel centres lie on a line (spread {longest:.3g} by {middle:.3g} mm)"
+        raise BadDataError(what, way_out="scan with strokes side by side")
     normal = axes[:, 0]
     agreement = float(normal @ head_z) / max(float(np.linalg.norm(head_z)), 1e-300)
     if abs(agreement) < 0.9:
         angle = np.degrees(np.arccos(abs(agreement)))
-        raise BadDataError(
-            f"the plane of the motion and the head's face are {angle:.0f} degrees apart",
-            way_out="check the quaternion order (scalar first) and scanhead_from_tracker",
-        )
+        what = f"the plane of the motion and the head's face are {angle:.0f} degrees apart"
+        raise BadDataError(what, way_out="check the quaternion order (scalar first) and scanhead_from_tracker")
     normal = normal if agreement > 0 else -normal
     x_axis = head_x - (head_x @ normal) * normal
     length, full = math.sqrt(x_axis @ x_axis), float(np.linalg.norm(head_x))
     if not length > 0.1 * full:
-        raise BadDataError(
-            f"the head's x axis is perpendicular to the plane of motion (projected length {length:.2g} of {full:.2g})",
-            way_out="check scanhead_from_tracker, and keep the head's direction while scanning",
-        )
+        projected = f"projected length {length:.2g} of {full:.2g}"
+        what = f"the head's x axis is perpendicular to the plane of motion ({projected})"
+        raise BadDataError(what, way_out="check scanhead_from_tracker, and keep the head's direction while scanning")
     x_axis = x_axis / length
     rotation = np.stack([x_axis, np.cross(normal, x_axis), normal])
     return Plane(rigid(rotation, -rotation @ centroid_mm), shortest, np.array([longest, middle, shortest]))
@@ -162,17 +155,14 @@ def patient_from_base(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, *, n
     along = sternal_notch_mm - xiphoid_mm
     length = float(np.linalg.norm(along))
     if not length > LEAST_APART_MM:
-        raise BadDataError(
-            f"sternal notch and xiphoid are {length:.2f} mm apart",
-            way_out="correct them, or touch both before the scan",
-        )
+        what = f"sternal notch and xiphoid are {length:.2f} mm apart"
+        raise BadDataError(what, way_out="correct them, or touch both before the scan")
     y_axis = along / length
     z_axis = normal - (normal @ y_axis) * y_axis
     size = float(np.linalg.norm(z_axis))
     if size < 0.1:
-        raise BadDataError(
-            "the line of the landmarks runs along the plane's normal", way_out="correct them, or touch both anew"
-        )
+        what = "the line of the landmarks runs along the plane's normal"
+        raise BadDataError(what, way_out="correct them, or touch both anew")
     z_axis = z_axis / size
     rotation = np.stack([np.cross(y_axis, z_axis), y_axis, z_axis])
     return rigid(rotation, -rotation @ xiphoid_mm)

@@ -158,9 +158,8 @@ class MapOptions(Options):
         if self.normalise != "none" and not low > 0:
             raise UsageError("pressure_window_kpa starts at 0; frames are divided by their mean, give more")
         if self.latency_ms == "auto" and self.register_strokes:
-            raise UsageError(
-                "a lump that follows the head mimics a latency; with register_strokes give latency_ms a number"
-            )
+            fault = "a lump that follows the head mimics a latency; with register_strokes give latency_ms a number"
+            raise UsageError(fault)
 
 
 GROWTH_SHARES: Final = (0.2,)

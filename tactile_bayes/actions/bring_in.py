@@ -166,9 +166,8 @@ def _lengths(scan: Scan) -> str:
     """Lengths of a scan in a line, by which a wrong unit shows."""
     lever = float(np.linalg.norm(scan.head.scanhead_from_tracker[:3, 3]))
     sides = np.ptp(scan.poses.position_mm, axis=0)
-    line = (
-        f"the sensor lies {lever:.3g} mm from the head, and moved by {' x '.join(f'{side:.0f}' for side in sides)} mm"
-    )
+    moved = " x ".join(f"{side:.0f}" for side in sides)
+    line = f"the sensor lies {lever:.3g} mm from the head, and moved by {moved} mm"
     return f"{LEADS['check']}{line}: no breast is so large; check their unit" if sides.max() > MOST_SPAN_MM else line
 
 

@@ -140,10 +140,8 @@ def _pivot(url: str, protocol: str, tool: str | None, duration_s: float) -> None
         port.write(driver.stop)
     finally:
         port.close()
-    sense = rotation_sense(
-        np.array([pose.position_mm for pose in poses]).reshape(-1, 3),
-        np.array([pose.quaternion_wxyz for pose in poses]).reshape(-1, 4),
-    )
+    positions = np.array([pose.position_mm for pose in poses]).reshape(-1, 3)
+    sense = rotation_sense(positions, np.array([pose.quaternion_wxyz for pose in poses]).reshape(-1, 4))
     click.echo(f"{len(poses)} poses, turned by {sense.turn_deg:.0f} degrees: {sense}")
 
 

@@ -90,9 +90,8 @@ def demo_action(output: Path, method: str, force: bool) -> None:
     truth = read_scan_report(output / "scan.mcap").truth
     assert truth is not None  # the embedded scan is simulated
     true_mm = float(truth["lumps"][0]["d_mm"])
-    click.echo(
-        f"The scan is simulated: a ball of {true_mm:g} mm in a breast of fat and gland ({output / 'scene.toml'})."
-    )
+    scene = output / "scene.toml"
+    click.echo(f"The scan is simulated: a ball of {true_mm:g} mm in a breast of fat and gland ({scene}).")
     click.echo(f"Each step is printed as the command that repeats it by hand.{_how_to_type()}")
     step(
         "1. Build the tactile map: all readings of the scan, averaged in cells of 1 mm.",

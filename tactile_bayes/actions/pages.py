@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
@@ -101,9 +102,8 @@ def report_action(
     labels, page = PageLabels(title, name, day), PageFiles(output, pdf, force)
     page.check()
     typed = [name for name in options if name in typed_options()]
-    exam = exam_from_files(
-        files, lambda: make_settings(**options), typed=typed, notice=lambda line: click.echo(line, err=True)
-    )
+    notice = partial(click.echo, err=True)
+    exam = exam_from_files(files, partial(make_settings, **options), typed=typed, notice=notice)
     exam = replace(exam, labels=labels)
     page.write(exam_page(exam))
     if exam.main.tactile_map is None:

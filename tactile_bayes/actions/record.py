@@ -356,9 +356,8 @@ def _connect(request: Request, stack: ExitStack) -> tuple[HelloReading, tuple[De
 
 def _check_fit(hello: HelloReading, head: HeadGeometry, request: Request) -> None:
     if not hello.rows * hello.columns:
-        raise DeviceError(
-            f"head {request.head_url}: {hello.device_id!r} is a device without taxels; give a head's port"
-        )
+        fault = f"head {request.head_url}: {hello.device_id!r} is a device without taxels; give a head's port"
+        raise DeviceError(fault)
     if (hello.rows, hello.columns) != head.shape:
         raise UsageError(
             f"head {request.head_url} has {hello.rows} x {hello.columns} taxels, the geometry given is for "

@@ -185,9 +185,8 @@ def run_study(
     if failed:
         if output is None:
             click.echo(study_csv(_rows(outcomes)), nl=False)
-        raise TactileBayesError(
-            f"{len(failed)} of {len(outcomes)} geometries failed, the first ({failed[0].key}): {failed[0].error}"
-        )
+        fault = f"{len(failed)} of {len(outcomes)} geometries failed, the first ({failed[0].key}): {failed[0].error}"
+        raise TactileBayesError(fault)
     return _rows(outcomes)
 
 
@@ -298,9 +297,8 @@ def compare_model_action(
         with progress_bar(f"frames, {fidelity}") as progress:
             comparisons.append(compare_model(measured, body, fidelity=fidelity, head=head, progress=progress))
     if figure is not None:
-        paper_head.comparison_figure(
-            measured, comparisons, figure, title=f"{scan.stem} against {scene.stem}", force=force
-        )
+        title = f"{scan.stem} against {scene.stem}"
+        paper_head.comparison_figure(measured, comparisons, figure, title=title, force=force)
     if as_json:
         click.echo(dump_json(paper_head.comparison_document(measured, comparisons, inputs=inputs)), nl=False)
         return

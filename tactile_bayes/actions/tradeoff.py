@@ -149,9 +149,8 @@ def tradeoff_forward_action(
     # a raster's frames are divided by their means
     default_rules = {tradeoffs.PLANE: "plane-strain", tradeoffs.SOLID: "solid-mean"}
     rules = {model: _rule(case, model, size_calibration or name) for model, name in default_rules.items()}
-    by_model = {
-        model: _measure_forward(case, model, rule, tolerance_percent / 100, runs) for model, rule in rules.items()
-    }
+    share = tolerance_percent / 100
+    by_model = {model: _measure_forward(case, model, rule, share, runs) for model, rule in rules.items()}
     plane = by_model[tradeoffs.PLANE]
     notes = (*plane.notes, tradeoffs.dimensions_note(case, plane, by_model[tradeoffs.SOLID], rules))
     warning = outside_range(case.d_mm, case.depth_ratio)

@@ -182,9 +182,8 @@ def trial_lines(
     visits: dict[str, list[ExamRow]] = defaultdict(list)
     for row in in_trial if pooled else ():
         visits[row.exam.of_mass].append(row)
-    readings += [
-        _trial_reading(_pooled_row(campaign, some, pooled.get(name)), POOLED_MODALITY) for name, some in visits.items()
-    ]
+    pooled_rows = (_pooled_row(campaign, some, pooled.get(name)) for name, some in visits.items())
+    readings += [_trial_reading(row, POOLED_MODALITY) for row in pooled_rows]
     count: Counter[tuple[object, ...]] = Counter()
     for reading in readings:
         key = (reading["patient"], reading["mass"], reading["modality"])
@@ -439,9 +438,8 @@ def index_html(
     of_patients = f"{counted(len(masses), 'mass')} of {counted(patients, 'patient')}"
     lines = [f"{of_patients}; {counted(len(rows), 'exam')}: {counts}."]
     if len(shown) < len(masses):
-        lines.append(
-            f"Here are the {len(shown)} to be looked at first; all are in {layout.DONE} and {layout.FAILURES}."
-        )
+        tables = f"{layout.DONE} and {layout.FAILURES}"
+        lines.append(f"Here are the {len(shown)} to be looked at first; all are in {tables}.")
     lines += [repeatability_words(campaign)] if campaign.repeatability else []
     return campaign_html(shown, lines=lines, links=links, version=__version__)
 

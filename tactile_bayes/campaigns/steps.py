@@ -220,16 +220,15 @@ def _copy_map(source: Path, expected: Mapping[str, str]) -> Made:
 
 def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
     """Refuse a file whose facts contradict the table's; one that either lacks is not compared, nor are capitals."""
-    both = {
-        ours: facts[theirs] for ours, theirs in layout.SAME_IN_SCANS.items() if facts.get(theirs) and expected.get(ours)
-    }
+    in_file = {ours: facts.get(theirs) for ours, theirs in layout.SAME_IN_SCANS.items()}
+    both = {name: value for name, value in in_file.items() if value and expected.get(name)}
     differs = [name for name, value in both.items() if value.casefold() != expected[name].casefold()]
     if not differs:
         return
     shown = list(dict.fromkeys([*(name for name in ("patient", "side") if name in both), *differs]))
-    in_table, in_file = (", ".join(f"{name} {one[name]}" for name in shown) for one in (expected, both))
+    table_words, file_words = (", ".join(f"{name} {one[name]}" for name in shown) for one in (expected, both))
     way_out = "is it another exam's file? correct the row or the file"
-    raise BadDataError(f"the table says {in_table}; the file says {in_file}", way_out=way_out)
+    raise BadDataError(f"the table says {table_words}; the file says {file_words}", way_out=way_out)
 
 
 def make_estimate(folder: Path, settings: Settings, match: Match | None, side: str) -> Made:
@@ -313,20 +312,16 @@ def make_growth(
     days = days_from_first(None, course.dates if course.dates and all(course.dates) else None)
     comparing = CompareOptions(days=days, same_mass=not placed)
     compared = compare_answers(answers, settings, comparing, names=visits, files=files, numbers=course.numbers)
-    report = compared.report.checked()
+    comparison, report = compared.compared, compared.report.checked()
     drawn_maps = [
         [DrawnMap(read_map(path), one.report) for path, one in zip(paths, maps, strict=True)]
         for paths, maps in zip(files, answers, strict=True)
     ]
-    page = growth_page(compared.compared, report, drawn_maps, course)
-    writes: Writes = {
-        layout.COMPARED: lambda path: write_text(path, json_text(report), force=True),
-        layout.GROWTH_PAGE: lambda path: write_text(path, page, force=True),
-    }
-    if figures and compared.compared.joint is not None:
-        writes[layout.COMPARED_FIGURE] = lambda path: draw_comparison(
-            compared.compared, report, drawn_maps, path, force=True
-        )
+    page = growth_page(comparison, report, drawn_maps, course)
+    writes: Writes = {layout.COMPARED: lambda path: write_text(path, json_text(report), force=True)}
+    writes[layout.GROWTH_PAGE] = lambda path: write_text(path, page, force=True)
+    if figures and comparison.joint is not None:
+        writes[layout.COMPARED_FIGURE] = lambda path: draw_comparison(comparison, report, drawn_maps, path, force=True)
     return {}, writes
 
 

@@ -165,9 +165,8 @@ class GridOptions(Options, kw_only=True):
         super().__post_init__()
         for name, value in (("units", self.units), ("level", self.level)):
             if value is not None and self.normalise != "none":
-                raise UsageError(
-                    f"--{name} is for values that were not divided; leave it out or --normalise {self.normalise}"
-                )
+                fault = f"--{name} is for values that were not divided; leave it out or --normalise {self.normalise}"
+                raise UsageError(fault)
         if self.units is not None and not (self.units.isprintable() and 0 < len(self.units.strip()) <= _LONGEST_UNITS):
             what = f"--units {self.units[:30]!r} is not a unit"
             raise UsageError(f"{what}; give up to {_LONGEST_UNITS} letters, such as kPa")

@@ -142,9 +142,8 @@ def _parts(where: str, item: object, *, way_out: str) -> Iterator[tuple[str, obj
         yield from ((f"{where}[{i}]", value) for i, value in enumerate(item))
     elif isinstance(item, int | float) and not -_LARGEST <= item <= _LARGEST:
         value = str(item) if isinstance(item, float) else f"a whole number of {len(str(abs(item)))} digits"
-        raise BadDataError(
-            f"{where or 'the document'} is {value}", way_out=f"give a finite number of at most {_LARGEST:.3g}"
-        )
+        what = f"{where or 'the document'} is {value}"
+        raise BadDataError(what, way_out=f"give a finite number of at most {_LARGEST:.3g}")
     elif isinstance(item, str):
         check_text(where, item, way_out=way_out)
 

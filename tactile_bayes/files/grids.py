@@ -95,9 +95,8 @@ def _numbers_within(rows: Sequence[list[str]], no_value: Sequence[str]) -> tuple
         faulty = next((row for row in rows if any(map(is_number, row))), None)
         if faulty is None:
             first_text = next((field for row in rows for field in row if field), "")
-            raise BadDataError(
-                f"holds {first_text[:30]!r} and no number" if first_text else "is empty", way_out=_WAY_OUT
-            )
+            what = f"holds {first_text[:30]!r} and no number" if first_text else "is empty"
+            raise BadDataError(what, way_out=_WAY_OUT)
         return rows.index(faulty), len(rows)
     first, last = plain[0], plain[-1] + 1
     while last < len(rows) and any(map(is_number, rows[last])):  # a faulty row is an error, not left out
@@ -399,9 +398,8 @@ def _average_cells(tactile_map: TactileMap, times: int) -> TactileMap:
     known = block_sums(tactile_map.covered.astype(np.float64), times) >= times**2 / 2
     each = np.where(known, total, np.nan)
     mean = block_sums(weight * np.nan_to_num(tactile_map.mean), times) / each
-    square = (
-        block_sums(weight * (np.nan_to_num(tactile_map.variance) + np.nan_to_num(tactile_map.mean) ** 2), times) / each
-    )
+    squares = np.nan_to_num(tactile_map.variance) + np.nan_to_num(tactile_map.mean) ** 2
+    square = block_sums(weight * squares, times) / each
     variance = np.maximum(square - mean**2, 0.0) if tactile_map.counts_known else np.where(known, 0.0, np.nan)
     count = np.where(known, total if tactile_map.counts_known else 1.0, 0.0).astype(np.int64)
     x_mm, y_mm = (axis[::times] + (times - 1) / 2 * np.ptp(axis[:2]) for axis in (tactile_map.x_mm, tactile_map.y_mm))
@@ -450,9 +448,8 @@ def _spacing(grid: Grid, *, stated_mm: float | None) -> tuple[float, list[str]]:
             raise UsageError(f"--spacing-mm is {stated_mm:g}, but the file says {value:g}; leave the option out")
     else:
         mm = grid.resolution_mm[0] if grid.resolution_mm else None
-        resolution_words = (
-            f"its resolution says {mm:.4g} mm a pixel ({25.4 / mm:.4g} dpi, often of a print)" if mm else ""
-        )
+        dots = f" ({25.4 / mm:.4g} dpi, often of a print)" if mm else ""
+        resolution_words = f"its resolution says {mm:.4g} mm a pixel{dots}" if mm else ""
         if stated_mm is None:
             resolution_words = resolution_words and f"; {resolution_words}"
             raise UsageError(f"a grid needs --spacing-mm, the side of its square cells in mm{resolution_words}")

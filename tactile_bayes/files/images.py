@@ -76,9 +76,8 @@ def _decode_tiff_or_png(data: bytes) -> Grid:
         try:
             image = Image.open(io.BytesIO(data), formats=("TIFF", "PNG"))
         except UnidentifiedImageError:
-            what = (
-                "is a JPEG, whose values are changed where it saves space" if data[:3] == _JPEG else "is not an image"
-            )
+            jpeg = "is a JPEG, whose values are changed where it saves space"
+            what = jpeg if data[:3] == _JPEG else "is not an image"
             if data[:4] in (b"II*\x00", b"MM\x00*"):  # a TIFF that Pillow has no mode for
                 directory: Any = TiffImagePlugin.ImageFileDirectory_v2(data[:8])
                 stream = io.BytesIO(data)

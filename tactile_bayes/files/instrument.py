@@ -262,9 +262,8 @@ def scene_of(document: Mapping[str, Any]) -> scenes.Scene:
     file = from_plain(SceneFile, document)
     tables = {name: getattr(file, name) for name in names_of(file)}
     bumps, tissue = _lumps(tables.pop("lump"), document.get("lump", ()))
-    return scenes.Scene(
-        **as_dict(tables.pop("scene")), lumps=bumps, solid_lumps=tissue, ribs=tables.pop("rib"), **tables
-    )
+    timing, ribs = as_dict(tables.pop("scene")), tables.pop("rib")
+    return scenes.Scene(**timing, lumps=bumps, solid_lumps=tissue, ribs=ribs, **tables)
 
 
 def _lumps(

@@ -356,9 +356,8 @@ def plain_names(
 
 def _guess_names(shapes: Mapping[str, Shape]) -> dict[str, str]:
     """Layout's name -> the file's, for arrays called by a plain word or the only ones of their shape."""
-    shapes_unclaimed = {
-        name: tuple(one for one in shape if one != 1) for name, shape in shapes.items() if name not in KNOWN
-    }
+    unclaimed = [name for name in shapes if name not in KNOWN]
+    shapes_unclaimed = {name: tuple(one for one in shapes[name] if one != 1) for name in unclaimed}
 
     def of(fits: Callable[[Shape], bool]) -> list[str]:
         return [name for name, shape in shapes_unclaimed.items() if fits(shape)]

@@ -261,9 +261,7 @@ def as_declared(values: Any, attributes: Mapping[str, Any]) -> Any:
     missing = np.zeros(np.shape(values), dtype=bool)
     for name in names[:2]:
         missing |= np.isin(values, numeric.get(name, np.array([], values.dtype)))
-    scale, offset = (
-        float(numeric.get(name, [default])[0]) for name, default in (("scale_factor", 1), ("add_offset", 0))
-    )
+    scale, offset = (float(numeric.get(name, [one])[0]) for name, one in (("scale_factor", 1), ("add_offset", 0)))
     if not missing.any() and (scale, offset) == (1, 0):
         return values
     return np.where(missing, np.nan, values * scale + offset)

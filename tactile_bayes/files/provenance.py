@@ -60,10 +60,8 @@ def scans_of(document: object) -> tuple[dict[str, str], ...]:
     scans = document.get("scans") if isinstance(document, dict) else None
     if not isinstance(scans, list):
         return ()
-    known = (*_DIGESTS, *EXAM_FACTS)
-    return tuple(
-        {name: one[name] for name in known if isinstance(one.get(name), str)} for one in scans if isinstance(one, dict)
-    )
+    known, tables = (*_DIGESTS, *EXAM_FACTS), (one for one in scans if isinstance(one, dict))
+    return tuple({name: one[name] for name in known if isinstance(one.get(name), str)} for one in tables)
 
 
 def recordings(scans: Sequence[Mapping[str, str]]) -> Iterator[str]:

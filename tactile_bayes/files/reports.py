@@ -82,10 +82,8 @@ class Report(Sized, kw_only=True):
     @property
     def rounded(self) -> Self:
         """The report in nine significant digits, but for diagnostics, prior and provenance."""
-        unrounded = {
-            name: getattr(self, name) for name in ("diagnostics", "prior", "provenance") if hasattr(self, name)
-        }
-        return replace(rounded(self), **unrounded)
+        names = [name for name in ("diagnostics", "prior", "provenance") if hasattr(self, name)]
+        return replace(rounded(self), **{name: getattr(self, name) for name in names})
 
     def checked(self) -> Self:
         """The report, checked by its declaration as a file is."""

@@ -128,9 +128,8 @@ def choose_tool(names: Sequence[str], stated: Stated, *, place: str) -> str:
         matches = [name for name in names if stated.tool in (name, name.split()[0], name.split("To")[0])]
         if len(matches) == 1:
             return matches[0]
-        raise BadDataError(
-            f"has no one tool {stated.tool!r} in {place}", way_out=f"--tool is one of {', '.join(names)}"
-        )
+        what = f"has no one tool {stated.tool!r} in {place}"
+        raise BadDataError(what, way_out=f"--tool is one of {', '.join(names)}")
     if len(names) > 1:
         raise BadDataError(f"has {len(names)} tools in {place}: {', '.join(names)}", way_out="choose one, --tool NAME")
     return names[0]
@@ -164,9 +163,8 @@ def _poses_by_names(lines: Sequence[Line], header: Line, stated: Stated) -> Sour
     if not rows:
         raise BadDataError(f"line {header.number} names columns, and no row stands below it", way_out="give the poses")
     columns, rows = _columns_and_rows_of_tool(header, kinds, rows, names, stated)
-    order = (
-        (3, 4, 5, 0, 6, 7, 8, 1, 9, 10, 11, 2) if matrix_names else range(len(names))
-    )  # rows of a matrix: R, then place
+    matrix_rows = (3, 4, 5, 0, 6, 7, 8, 1, 9, 10, 11, 2)  # R, then place
+    order = matrix_rows if matrix_names else range(len(names))
     numbers = np.column_stack([_column_values(rows, columns[names[i]]) for i in order])
     if layout == "euler" and _RADIANS.search(header.fields[columns["azimuth"]]):
         numbers[:, 3:] *= 180 / np.pi
@@ -231,9 +229,8 @@ def _reasons_by_status(status: Sequence[str], stated: Stated) -> list[str]:
         if stated.pose_good is None and len(values) == 1:
             return [""] * len(status)
         counts_of_status = ", ".join(f"{value or 'blank'} ({number} rows)" for value, number in values.most_common(6))
-        raise BadDataError(
-            f"its status is {counts_of_status}", way_out="give the one in which the tool is seen, --pose-good VALUE"
-        )
+        what = f"its status is {counts_of_status}"
+        raise BadDataError(what, way_out="give the one in which the tool is seen, --pose-good VALUE")
     return ["" if value.lower() in good else f"with status {value or 'blank'}" for value in status]
 
 
@@ -478,9 +475,8 @@ def _frames_of_blocks(
     if len(times) == len(frames):
         arrays["frame_time_s"] = np.array(times)
         notes.append("times of the frames by the lines above them")
-    notes.append(
-        f"{len(frames)} frames, each a block of {frames.shape[1]} rows (the first at line {blocks[0][0].number})"
-    )
+    first = f"the first at line {blocks[0][0].number}"
+    notes.append(f"{len(frames)} frames, each a block of {frames.shape[1]} rows ({first})")
     return Source(arrays, stated, tuple(notes))
 
 

@@ -383,9 +383,8 @@ def _parse_number(text: str, field: Mapping[str, Any]) -> float:
             raise BadDataError(what, way_out=f"write {whole}{rest} or {whole}.{rest}, whichever is meant")
         raise BadDataError(f"{_shown(text)} has a decimal comma", way_out=f"write {whole}.{rest}")
     if text[0] in "<>≤≥":
-        raise BadDataError(
-            f"{_shown(text)} is a bound, not a number", way_out="give the number measured, or leave it out"
-        )
+        what = f"{_shown(text)} is a bound, not a number"
+        raise BadDataError(what, way_out="give the number measured, or leave it out")
     if text.endswith("%"):
         way_out = "write the number that is meant without it, as 12.5 or 0.125"
         raise BadDataError(f"{_shown(text)} has a percent sign", way_out=way_out)

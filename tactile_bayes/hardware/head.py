@@ -210,9 +210,8 @@ class HeadParser(PacketParser):
         rows, columns, saturation, millihertz = _HELLO.unpack_from(packet.payload)
         name = readings.printable(packet.payload[_HELLO.size :])
         if self.hello is not None and (name, rows, columns) != self.hello[:3]:
-            self.fault = (
-                f"it sent a HELLO of {name!r} with {rows} x {columns} taxels beside that of {self.hello.device_id!r}"
-            )
+            first = self.hello.device_id
+            self.fault = f"it sent a HELLO of {name!r} with {rows} x {columns} taxels beside that of {first!r}"
             return None
         self.hello = readings.HelloReading(name, rows, columns, saturation, millihertz / 1000)
         return self.hello
@@ -259,9 +258,8 @@ class BladderStep(Record, eq=False):
         if not np.isfinite(pressure_kpa) or pressure_kpa < 0:
             raise BadDataError(f"a step of {pressure_kpa} kPa", way_out="give the bladder's pressure, 0 or more")
         if len(frames) < MIN_FRAMES:
-            raise BadDataError(
-                f"the step of {pressure_kpa:g} kPa has {len(frames)} frames", way_out=f"record {MIN_FRAMES} or more"
-            )
+            what = f"the step of {pressure_kpa:g} kPa has {len(frames)} frames"
+            raise BadDataError(what, way_out=f"record {MIN_FRAMES} or more")
         saturated: NDArray[np.bool_] = np.asarray((frames >= saturation_count).any(axis=0))
         return cls(float(pressure_kpa), frames.mean(axis=0), saturated)
 
@@ -305,9 +303,8 @@ def fit_array(steps: Sequence[BladderStep], *, saturation_count: int) -> ArrayFi
     gain, offset = line[1], line[0]
     if (gain[good] < 0).any():
         row, column = (int(i) for i in np.argwhere(good & (gain < 0))[0])
-        raise BadDataError(
-            f"row {row} column {column} reads less under more pressure", way_out="check the steps' pressures"
-        )
+        what = f"row {row} column {column} reads less under more pressure"
+        raise BadDataError(what, way_out="check the steps' pressures")
     return ArrayFit(
         calibration=ElementCalibration(gain, offset, saturation_count=saturation_count),
         curvature_kpa_per_count2=curve[2],
@@ -399,9 +396,8 @@ def rotation_sense(position_mm: FloatArray, quaternion_wxyz: FloatArray) -> Rota
     traces = np.einsum("nij,ij->n", rotation, rotation[0])
     turn_deg = float(np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)).max()))
     if turn_deg < LEAST_TURN_DEG:
-        raise BadDataError(
-            f"the sensor was turned by {turn_deg:.0f} degrees only", way_out=f"turn it by {LEAST_TURN_DEG:g} or more"
-        )
+        what = f"the sensor was turned by {turn_deg:.0f} degrees only"
+        raise BadDataError(what, way_out=f"turn it by {LEAST_TURN_DEG:g} or more")
     as_given, inverted = (_fixed_point_rms_mm(position_mm, one) for one in (rotation, rotation.transpose(0, 2, 1)))
     return RotationSense(as_given, inverted, turn_deg)
 

@@ -342,9 +342,8 @@ def parse_address(text: str) -> tuple[str, int]:
     except ValueError:
         loopback = False
     if not loopback:
-        raise UsageError(
-            f"--serve {text} can be reached from other computers; give 127.0.0.1:PORT and use an SSH tunnel"
-        )
+        fault = f"--serve {text} can be reached from other computers; give 127.0.0.1:PORT and use an SSH tunnel"
+        raise UsageError(fault)
     return host, int(port)
 
 

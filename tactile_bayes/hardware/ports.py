@@ -138,13 +138,11 @@ def _open(url: str, baud: int, role: str) -> Any:
             port.rts = False  # high holds a Flock of Birds in reset
         port.open()
     except ValueError as error:
-        raise DeviceError(
-            f"{role} {url}: not a port ({error}); give /dev/ttyUSB0, socket://HOST:PORT or rfc2217://HOST:PORT"
-        ) from None
+        fault = f"{role} {url}: not a port ({error}); give /dev/ttyUSB0, socket://HOST:PORT or rfc2217://HOST:PORT"
+        raise DeviceError(fault) from None
     except GONE as error:
-        raise DeviceError(
-            f"{role} {url}: cannot be opened ({reason(error)}); `tactile-bayes devices` lists what is there"
-        ) from None
+        fault = f"{role} {url}: cannot be opened ({reason(error)}); `tactile-bayes devices` lists what is there"
+        raise DeviceError(fault) from None
     return port
 
 

@@ -409,9 +409,8 @@ class NdiTracker:
 def serve(tracker: NdiTracker, line: socket.socket) -> None:
     """Serve the tracker in the open framing until the other end closes."""
     commands, sending, number = head.PacketParser(), False, 0
-    latest: dict[str, readings.ToolReading] = {
-        tool: readings.MissingReading("not measured yet", tool) for tool in tracker.tools.values()
-    }
+    not_yet = [readings.MissingReading("not measured yet", tool) for tool in tracker.tools.values()]
+    latest: dict[str, readings.ToolReading] = {one.tool: one for one in not_yet}
     line.setblocking(False)
     while True:
         wire = b""
