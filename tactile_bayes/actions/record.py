@@ -19,7 +19,7 @@ from typing import Any
 import click
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, path_of, plain, takes
+from tactile_bayes.api.arguments import PathLike, path_of, takes
 from tactile_bayes.commands.options import protect_inputs
 from tactile_bayes.declarations import as_dict, default_of, field
 from tactile_bayes.errors import EXIT_DONE, EXIT_INTERRUPTED, DeviceError, UsageError, check_number
@@ -442,9 +442,8 @@ def record(
     UsageError
         When options contradict each other, or the file exists and `force` is false.
     """
-    values = {name: plain(value) for name, value in options.items()}
     check_number("duration_s", duration_s, 0, open_ends=True)
-    values |= {name: path_of(values[name]) for name in _PATHS if name in values}
+    values = options | {name: path_of(options[name]) for name in _PATHS if name in options}
     roms = values.get("tracker_rom", ())
     values["tracker_rom"] = tuple(map(path_of, [roms] if isinstance(roms, str | Path) else roms))
     values |= {"output": path_of(output), "head_url": head, "duration_s": duration_s, "at_once": True}

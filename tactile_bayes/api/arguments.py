@@ -83,8 +83,8 @@ def takes(
 ) -> Callable[[Callable[_Given, _Returned]], Callable[_Given, _Returned]]:
     """Decorate a public function as `door` does; its further keywords are the fields of these records.
 
-    Help and completion show each with its default. A keyword that was left out is not passed on: the record that the
-    function makes of the others has the default.
+    Help and completion show each with its default. Their numbers of numpy are passed on as Python's. A keyword that was
+    left out is not passed on: the record that the function makes of the others has the default.
     """
     fields = {name: default_of(record, name) for record in records for name in names_of(record) if name not in without}
 
@@ -97,6 +97,8 @@ def takes(
             for name in keywords:
                 if name not in names:
                     raise TypeError(f"{function.__name__} has no keyword {name!r}; {suggestion(name, names)}")
+                if name in fields:
+                    keywords[name] = plain(keywords[name])
             return call(*args, **keywords)
 
         called.__doc__ = _with_options(function.__doc__ or "", records, fields)

@@ -40,7 +40,7 @@ from tactile_bayes.report.pages import PageFiles
 
 def settings_of(options: Mapping[str, Any]) -> Settings:
     """Make settings from keywords, with the command line's defaults."""
-    values = {name: plain(value) for name, value in options.items()}
+    values = dict(options)
     calibration, repeatability = values.get("size_calibration"), values.get("repeatability")
     if not (calibration is None or isinstance(calibration, str) or hasattr(calibration, "recipe")):
         values["size_calibration"] = str(path_of(calibration))

@@ -54,7 +54,6 @@ if TYPE_CHECKING:
 # --- Scans and tactile maps: read, simulate, build, show.
 
 _POSE_COLUMNS = ["time", "x", "y", "z", "qw", "qx", "qy", "qz"]
-_HEAD_SCHEMA = "tactile-bayes/head/1"
 _DEMO = Path(__file__).resolve().parents[1] / "demo" / "scan.mcap"
 
 
@@ -191,8 +190,7 @@ def build_map(
         raise UsageError(
             f"scan {later + 1} is the recording of scan {earlier + 1}, whose frames would count twice; give it once"
         )
-    keywords = {name: plain(value) for name, value in options.items()}
-    return Map(build(loaded, max_pose_gap_ms=max_pose_gap_ms, progress=progress, **keywords), scans=tuple(facts))
+    return Map(build(loaded, max_pose_gap_ms=max_pose_gap_ms, progress=progress, **options), scans=tuple(facts))
 
 
 @door
@@ -323,9 +321,8 @@ def map_of(given: Any, **stated: Any) -> Map:
         raise UsageError(f"a map is wanted, not {type(given).__name__}; {way_out}")
     marks = stated.get("no_value", ())
     marks = [marks] if isinstance(marks, str) or not isinstance(marks, Iterable) else marks
-    keywords = {name: plain(value) for name, value in stated.items()}
-    keywords["no_value"] = tuple(mark if isinstance(mark, str) else repr(plain(mark)) for mark in marks)
-    options = GridOptions(**keywords)
+    no_value = tuple(mark if isinstance(mark, str) else repr(plain(mark)) for mark in marks)
+    options = GridOptions(**stated | {"no_value": no_value})
     if path is not None:
         return Map(import_grid(path, options)[0])
     steps = _own_steps(given)
@@ -410,7 +407,7 @@ def scan(
         named = from_plain(ArrayMap, dict(columns), where="columns")
     else:
         named = read_array_map(path_of(columns))
-    layout = replace(named, **{name: plain(value) for name, value in stated.items() if value is not None})
+    layout = replace(named, **{name: value for name, value in stated.items() if value is not None})
     times = Source({} if time is None else {"frame_time_s": _array(time)})
     if time is not None and layout.time_unit is None:
         layout = replace(layout, time_unit="s")  # whatever unit a file has
@@ -463,7 +460,7 @@ def _poses(poses: Any, stated: ArrayMap) -> Source:
 
 def _head(head: Any) -> Source:
     if isinstance(head, Mapping):
-        document = {"schema": _HEAD_SCHEMA, **to_plain(dict(head), digits=EXACT)}
+        document = {"schema": "tactile-bayes/head/1", **to_plain(dict(head), digits=EXACT)}
         return imports.head_source(head_geometry(document, path=Path("head")))
     return _source_of("head", head, HeadGeometry, imports.head_source)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, output_path, plain, table_of, takes
+from tactile_bayes.api.arguments import PathLike, output_path, table_of, takes
 from tactile_bayes.api.estimating import estimate_file
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import pooling_shape
@@ -95,7 +95,6 @@ def _refuse(typed: Collection[str], why: str, *names: str) -> None:
 
 
 def _files(**tables: Path | Sheet | None) -> dict[str, Path]:
-    """The tables that are files, by role."""
     return {role: table for role, table in tables.items() if isinstance(table, Path)}
 
 
@@ -438,10 +437,9 @@ def calibrate_size(
     UsageError
         When a keyword's value is out of range, or belongs to another form.
     """
-    learn_options = LearnOptions(**{name: plain(value) for name, value in options.items()})
     target = None if path is None else output_path(path, "JSON")
     base = None if correct is None else str(correct)
-    learned = learn(table_of(table, "table"), learn_options, options, correct=base, progress=progress)
+    learned = learn(table_of(table, "table"), LearnOptions(**options), options, correct=base, progress=progress)
     if target is not None:
         learned.write(target, force=force)
     return learned.calibration

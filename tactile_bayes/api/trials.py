@@ -196,7 +196,7 @@ def validate(
     BadDataError
         Naming the table, the line (1 is the header), the column, the value and the way out.
     """
-    own_settings = TrialSettings(**{name: plain(value) for name, value in settings.items()})
+    own_settings = TrialSettings(**settings)
     readings, sizes = table_of(trial, "trial"), table_of(excision, "excision")
     if columns is not None and isinstance(readings, Sheet) and isinstance(sizes, Sheet):
         raise UsageError("columns is for wide CSV files, not for DataFrames; rename their columns, or give files")
@@ -314,7 +314,7 @@ def plan(
     >>> tb.plan(patients=[24], maps=[3], trials=50).report.designs[0].patients
     24
     """
-    values = {name: plain(value) for name, value in options.items() if value is not None}
+    values = {name: value for name, value in options.items() if value is not None}
     for name in {"patients", "maps"} & set(values):
         values[name] = tuple(map(plain, list_of(name, values[name], "whole numbers")))
         if not values[name]:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from tactile_bayes.api.arguments import PathLike, TextResult, path_of, plain, required_path, takes
+from tactile_bayes.api.arguments import PathLike, TextResult, path_of, required_path, takes
 from tactile_bayes.api.estimates import settings_of
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import open_executor
@@ -109,7 +109,7 @@ def campaign(
     UsageError
         When settings contradict each other, or the folder is another's.
     """
-    ours = {name: plain(options.pop(name)) for name in names_of(CampaignOptions) if name in options}
+    ours = {name: options.pop(name) for name in names_of(CampaignOptions) if name in options}
     ours |= {name: path_of(ours[name]) for name in ("excision", "columns", "protocol") if name in ours}
     spread = {} if repeatability in (None, NONE) else {"repeatability": repeatability}
     return run_campaign(
