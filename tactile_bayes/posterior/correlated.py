@@ -157,7 +157,7 @@ def add_neighbour(
         if fit is not None:
             sign = -1.0 if extra == chosen_extra else 1.0
             x, y = change_in_sd(plain, fit.scene.converted(fit.mode, plain.scene))
-            test = replace(test, change_x_sd=sign * x, change_y_sd=sign * y, place=_place_text(fit))
+            test = replace(test, change_sigma_x_sd=sign * x, change_sigma_y_sd=sign * y, place=_place_text(fit))
         tests.append(test)
     chosen_fit = fits[chosen_extra][0] if chosen_extra else None
     updated = choice if chosen_fit is None else with_new_fit(choice, chosen_fit)

@@ -222,14 +222,14 @@ class Structure(Record):
     name: str
     """``"ellipse"`` (against round), ``"rotated"``, ``"tilt"``, ``"second lump"``, ``"rib"``, ``"departure"`` (from a
     Gaussian)."""
-    odds: float  #: Bayes factor of the scene with it against the scene without; an upper bound where `bound`.
+    odds: float  #: Bayes factor of the scene with it against the scene without.
     supported: bool  #: The odds exceed a threshold.
     used: bool  #: The draws have it.
-    bound: bool = False  #: The odds are an upper bound, from the best of a grid of templates.
-    change_x_sd: float | None = None
-    change_y_sd: float | None = None
-    """`change_x_sd`, `change_y_sd`: Change of the medians of ln sigma_x and ln sigma_y, in posterior SDs, under the
-    opposite decision; None where that was not fitted."""
+    odds_are_a_bound: bool = False  #: They are an upper bound, from the best of a grid of templates.
+    change_sigma_x_sd: float | None = None
+    change_sigma_y_sd: float | None = None
+    """`change_sigma_x_sd`, `change_sigma_y_sd`: Change of the medians of ln sigma_x and ln sigma_y, in posterior SDs,
+    under the opposite decision; None where that was not fitted."""
     place: str = ""  #: Its place or shape in words; empty for most.
 
 
@@ -382,7 +382,7 @@ def add_departure(choice: SceneChoice) -> SceneChoice:
             x, y = change_in_sd(refitted, fit.mode)
             middle, power = "flatter" if exponent > 0 else "sharper", 2 * (1 + exponent)
             likeness = f"({middle} in the middle, exponent about {power:.1f} for 2)"
-            test = replace(test, used=True, change_x_sd=x, change_y_sd=y, place=likeness)
+            test = replace(test, used=True, change_sigma_x_sd=x, change_sigma_y_sd=y, place=likeness)
             fit = refitted
     return replace(choice, fit=fit, structures=(*choice.structures, test))
 

@@ -204,13 +204,13 @@ def odds_text(one: Structure) -> str:
         return "below 0.01 to 1"
     if one.odds > 1000:
         return "above 1000 to 1"
-    return f"{'at most ' if one.bound else ''}{one.odds:.2g} to 1"
+    return f"{'at most ' if one.odds_are_a_bound else ''}{one.odds:.2g} to 1"
 
 
 def _width_changes(one: Structure, word: str) -> str:
-    if one.change_x_sd is None or one.change_y_sd is None:
+    if one.change_sigma_x_sd is None or one.change_sigma_y_sd is None:
         return ""
-    changes = {"sigma_x": one.change_x_sd, "sigma_y": one.change_y_sd}
+    changes = {"sigma_x": one.change_sigma_x_sd, "sigma_y": one.change_sigma_y_sd}
     parts = [f"{name} would change by {by:+.1f} SD" for name, by in changes.items() if abs(by) >= LEAST_CHANGE_SD]
     return f": {word} it {' and '.join(parts) or 'the widths would not change'}"
 
@@ -257,18 +257,8 @@ def scene_report(choice: SceneChoice) -> reports.SceneReport:
         shape=cast("reports.Shape", scene.shape),
         tilt=scene.tilt,
         beside=scene.extra or None,
-        structures=tuple(
-            reports.StructureReport(
-                *(structure.name, _if_finite(structure.odds), structure.bound, structure.supported, structure.used),
-                *(_if_finite(structure.change_x_sd), _if_finite(structure.change_y_sd), structure.place),
-            )
-            for structure in choice.structures
-        ),
+        structures=tuple(reports.StructureReport(**_finite(as_dict(one), 6)) for one in choice.structures),
     )
-
-
-def _if_finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
 
 
 # --- How large a lump would be if it were soft, hard, centred on the gland's surface or resting on it: data and text.
@@ -460,7 +450,7 @@ def estimate_report(
         position=None if place is None else place.as_position(probability),
         detected_probability=estimate.probability,
         variance_share=None if size is None else dict(size.variance_share),
-        scene=None if estimate.scene is None else rounded(scene_report(estimate.scene), 6),
+        scene=None if estimate.scene is None else scene_report(estimate.scene),
         prior_sensitivity=None if moved is None else reports.PriorSensitivity(WIDER, {**moved.median}, {**moved.ends}),
         diagnostics=_finite(diagnostics) | ({} if size is None else size_diagnostics(size)),
         candidates=tuple(reports.PassedOver(*one.centre_mm, one.fault) for one in estimate.candidates),
@@ -494,8 +484,8 @@ def size_diagnostics(size: SizePosterior) -> dict[str, Any]:
     return _finite({"invalid_draws": size.invalid, **size.figures})
 
 
-def _finite(values: Mapping[str, Any]) -> dict[str, Any]:
+def _finite(values: Mapping[str, Any], digits: int = 9) -> dict[str, Any]:
     return {
-        name: (rounded(value) if math.isfinite(value) else None) if isinstance(value, float) else value
+        name: (rounded(value, digits) if math.isfinite(value) else None) if isinstance(value, float) else value
         for name, value in values.items()
     }

@@ -224,9 +224,9 @@ def test_no_report_says_that_something_changed_by_nothing(folder: Path) -> None:
     for words in (["clear.nc"], ["two.nc"], ["clear.nc", "again.nc", "--pool"]):
         text = run_here("estimate", *words, "-v", cwd=folder).stdout
         assert not re.search(r"[-+]0\.0+ (of|SD)", text)
-    still = Structure("tilt", odds=0.1, bound=False, supported=False, used=False, change_x_sd=-0.04, change_y_sd=0.03)
+    still = Structure("tilt", 0.1, supported=False, used=False, change_sigma_x_sd=-0.04, change_sigma_y_sd=0.03)
     assert _width_changes(still, "with") == ": with it the widths would not change"
-    moved = replace(still, change_x_sd=-0.04, change_y_sd=0.3)
+    moved = replace(still, change_sigma_x_sd=-0.04, change_sigma_y_sd=0.3)
     assert _width_changes(moved, "with") == ": with it sigma_y would change by +0.3 SD"
     shifted = sensitivity_line(Sensitivity(median={"sigma_x_mm": -0.001}, ends={"sigma_x_mm": 0.02}, pareto_k=0.1))
     assert "-0.00" not in shifted

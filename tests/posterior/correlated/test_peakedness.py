@@ -83,9 +83,9 @@ def test_gaussians_are_left_alone() -> None:
 def test_the_widths_are_those_of_the_nearest_gaussian_either_way() -> None:
     for seed in range(3):
         found = answer(estimated(1.25, seed))
-        assert found.change_x_sd is not None
-        assert found.change_y_sd is not None
-        assert max(abs(found.change_x_sd), abs(found.change_y_sd)) < 1.0
+        assert found.change_sigma_x_sd is not None
+        assert found.change_sigma_y_sd is not None
+        assert max(abs(found.change_sigma_x_sd), abs(found.change_sigma_y_sd)) < 1.0
     # the formula's own width is 4.5, the nearest Gaussian's 4.35
     assert np.median(estimated(1.25).map_posterior.sigma_x_mm) < 4.5  # type: ignore[union-attr]
 
