@@ -237,21 +237,16 @@ def _common_fact(fact: str, maps: Sequence[SizeEstimate]) -> str:
     return values.pop() if len(values) == 1 else ""
 
 
-def _refuse_backwards(visits: Visits, comparing: CompareOptions) -> None:
-    """Raise `UsageError` where visits that are numbered in their scans come in another order, without their days."""
+def compare_estimates(
+    visits: Visits, settings: Settings, comparing: CompareOptions, *, names: Names, files: Files = ()
+) -> Comparison:
+    """Compare visits, maps estimated again where they are of another mass; see `compare_answers`."""
     codes = [_common_fact("visit", visit) for visit in visits]
     if comparing.days is None and all(map(str.isdecimal, codes)) and sorted(codes, key=int) != codes:
         listed = ", ".join(f"visit {number} is coded {code}" for number, code in enumerate(codes, 1))
         raise UsageError(
             f"in the scans {listed}; give visits in order of time, or their --dates if codes do not tell it"
         )
-
-
-def compare_estimates(
-    visits: Visits, settings: Settings, comparing: CompareOptions, *, names: Names, files: Files = ()
-) -> Comparison:
-    """Compare visits, maps estimated again where they are of another mass; see `compare_answers`."""
-    _refuse_backwards(visits, comparing)
     estimates = iter(reestimate_at_common_mass([one for visit in visits for one in visit]))
     by_visit = tuple(tuple(next(estimates) for _ in visit) for visit in visits)
     answers = [[one.answer for one in visit] for visit in by_visit]

@@ -32,9 +32,6 @@ from tactile_bayes.report.calibration import calibration_line, site_words
 from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
 from tactile_bayes.size.pooling import Calibration
 
-_UNRECORDED = (*PRIORS, "max_steps", "checkpoint")
-"""Settings that the provenance leaves out: the priors stand in the report, the others change how long it takes."""
-NO_CALIBRATION_ON_PAPER = "a size needs a calibration that fits this map"
 Notice = Callable[[str], None]
 WhyNone = tuple[str, str]
 """Reason for widths without a size where no calibration was named, and a remedy."""
@@ -133,7 +130,8 @@ def estimate_one(
     estimate = _with_place(estimate, tactile_map, scans, probability=settings.interval)
     if why_none is not None and estimate.status == "estimate":
         reason, advice = why_none
-        estimate = replace(estimate, reason=reason, advice=advice, on_paper=NO_CALIBRATION_ON_PAPER)
+        on_paper = "a size needs a calibration that fits this map"
+        estimate = replace(estimate, reason=reason, advice=advice, on_paper=on_paper)
     if estimate.code in NO_LUMP and tactile_map.covered.any():
         fat_mm = None if calibration is None else calibration.fat_mm
         smallest = smallest_lumps(tactile_map, fat_mm=fat_mm)
@@ -158,7 +156,8 @@ def estimate_one(
     named = settings.calibration_name or (f"{shipped} (shipped)" if calibration is not None else "none")
     fit = {"background": options.background, "fit_radius_mm": options.fit_radius_mm, "noise": options.noise}
     recorded = settings.recorded(size_calibration=named, **fit)
-    recorded = {name: value for name, value in recorded.items() if name not in _UNRECORDED}
+    for name in (*PRIORS, "max_steps", "checkpoint"):  # priors stand in the report, the others say how long it takes
+        del recorded[name]
     provenance = Provenance("estimate", recorded, digests, seed=settings.seed, scans=scans)
     return SizeEstimate(
         tactile_map=tactile_map, estimate=estimate, provenance=provenance, settings=settings, calibration=applied

@@ -27,7 +27,6 @@ from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.learn.site import FEWEST_MASSES, PRIOR_LOG_SD, PRIOR_MEDIAN, RepeatedExams, learn_repeatability
 from tactile_bayes.size.pooling import PROBABILITY, Repeatability, log_size_alone
 
-COMMAND: Final = "calibrate repeatability"
 _AGAIN: Final = "run the campaign again"
 
 
@@ -103,7 +102,7 @@ def learn_from_exams(
     ]
     settings = {"prior": {"median": PRIOR_MEDIAN, "log_sd": PRIOR_LOG_SD}}
     inputs = {f"draws_{i}": repeat.digest for i, repeat in enumerate(repeats, start=1)}
-    provenance = Provenance(COMMAND, settings, {"size_calibration": sizing.sha256, **inputs})
+    provenance = Provenance("calibrate repeatability", settings, {"size_calibration": sizing.sha256, **inputs})
     return size_json.RepeatabilityFile(
         schema="tactile-bayes/repeatability/1",
         research_use=RESEARCH_USE,

@@ -177,12 +177,10 @@ class EstimateFile(Record, eq=False):
 
     @property
     def sized(self) -> bool:
-        """True if any mass has a size."""
         return any(mass.largest is not None for mass in self.masses)
 
     @property
     def verdict_line(self) -> str:
-        """The verdict, as a sentence."""
         return f"Verdict: {self.report.verdict.replace('_', ' ')}."
 
     @property
@@ -337,7 +335,6 @@ class Moment(Record):
 
     @property
     def iso_date(self) -> str:
-        """``YYYY-MM-DD``."""
         return f"{self.date[:4]}-{self.date[4:6]}-{self.date[6:]}"
 
     @property
@@ -378,7 +375,6 @@ class Identity(IdentityOptions):
 
     @property
     def given(self) -> dict[str, str]:
-        """The parts that were given, by name."""
         return {name: value for name in names_of(self) if (value := getattr(self, name))}
 
     @property

@@ -18,8 +18,6 @@ CONFIDENCE_INTERVAL: Final = "http://hl7.org/fhir/StructureDefinition/quantity-c
 ABSENT: Final = "http://terminology.hl7.org/CodeSystem/data-absent-reason"
 _CATEGORY: Final = "http://terminology.hl7.org/CodeSystem/observation-category"
 _GENDERS: Final = {"F": "female", "M": "male", "O": "other"}
-_STATUS: Final = "preliminary"  #: Nobody has verified the program's result.
-_XHTML: Final = "http://www.w3.org/1999/xhtml"
 _IDENTIFIERS: Final = "http://terminology.hl7.org/CodeSystem/v2-0203"
 
 
@@ -65,7 +63,6 @@ class _Resources:
         return f"urn:uuid:{self.id(role)}"
 
     def patient(self) -> dict[str, Any]:
-        """The patient, with the parts of the identity that were given."""
         identity = self.identity
         resource: dict[str, Any] = {"resourceType": "Patient", "id": self.id("patient")}
         if identity.patient_id:
@@ -80,7 +77,6 @@ class _Resources:
         return resource
 
     def device(self) -> dict[str, Any]:
-        """The program."""
         return {
             "resourceType": "Device",
             "id": self.id("device"),
@@ -91,7 +87,7 @@ class _Resources:
 
     def _common(self) -> dict[str, Any]:
         """Fields that the report and the observations share."""
-        fields: dict[str, Any] = {"status": _STATUS}
+        fields: dict[str, Any] = {"status": "preliminary"}  # nobody has verified the program's result
         if self.patient_url:
             fields["subject"] = {"reference": self.patient_url}
         if self.identity.study:
@@ -139,7 +135,7 @@ class _Resources:
         return {
             "resourceType": "DiagnosticReport",
             "id": self.id("report"),
-            "text": {"status": "generated", "div": f'<div xmlns="{_XHTML}">{division}</div>'},
+            "text": {"status": "generated", "div": f'<div xmlns="http://www.w3.org/1999/xhtml">{division}</div>'},
             "identifier": [{"system": "urn:ietf:rfc:3986", "value": self.url("report")}],
             **({"basedOn": [order]} if number else {}),
             **self._common(),

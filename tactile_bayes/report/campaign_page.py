@@ -75,17 +75,14 @@ class MassEntry(Record, eq=False):
 
     @property
     def name(self) -> str:
-        """Patient and mass."""
         return f"{self.patient} {self.mass}"
 
     @property
     def last(self) -> VisitEntry:
-        """The last visit."""
         return self.visits[-1]
 
     @property
     def exams(self) -> list[ExamEntry]:
-        """Exams of all visits."""
         return [exam for visit in self.visits for exam in visit.exams]
 
     @property

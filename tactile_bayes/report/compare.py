@@ -329,7 +329,13 @@ def compare_text(report: CompareReport) -> str:
     lines += finding_lines(report.findings, "check")
     if report.status != "compared":
         return "\n".join([*lines, _refusal(report), RESEARCH_USE]) + "\n"
-    lines += [*_site_line(report), _model_line(report)]
+    known = [visit.fat_mm for visit in report.visits if visit.fat_mm is not None]
+    all_known = len(known) == len(report.visits)
+    depth = f"; fat under the head {', '.join(f'{one:.1f}' for one in known)} mm deep by visit" if all_known else ""
+    sd = report.between_map_sd
+    spread = "" if sd is None else f"exams of a visit differ by {spread_percent(sd)}"
+    lines += _site_line(report)
+    lines.append(f"Model: one body, whose hidden properties cancel in the change; {spread}{depth}.")
     if report.left_out:
         lines.append(f"Left out: {'; '.join(report.left_out)}.")
     return "\n".join([*lines, RESEARCH_USE]) + "\n"
@@ -445,12 +451,3 @@ def _site_line(report: CompareReport) -> list[str]:
     """The site's learned spread between exams, which intervals and smallest detectable change suppose; else none."""
     words = report.site_words
     return [f"{capitalised(words)}; the figures above are for such exams."] if words else []
-
-
-def _model_line(report: CompareReport) -> str:
-    sd = report.between_map_sd
-    spread = "" if sd is None else f"exams of a visit differ by {spread_percent(sd)}"
-    known = [visit.fat_mm for visit in report.visits if visit.fat_mm is not None]
-    all_known = len(known) == len(report.visits)
-    depth = f"; fat under the head {', '.join(f'{one:.1f}' for one in known)} mm deep by visit" if all_known else ""
-    return f"Model: one body, whose hidden properties cancel in the change; {spread}{depth}."

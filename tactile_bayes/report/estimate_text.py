@@ -335,15 +335,13 @@ def passed_over_lines(estimate: Estimate) -> list[str]:
 # --- An estimate in at most 12 lines: the size, what makes its interval wide, what would narrow it, its quality.
 
 WIDTHS = ("sigma_x_mm", "sigma_y_mm")
-MOST_CAUTIONS = 3
-MOST_CHECKS = 2
 MOST_MASSES = 3  #: Masses besides the reported one that have a line.
 
 
 def estimate_summary(estimate: Estimate, report: EstimateReport) -> str:
     """Report of one map in at most `MOST_LINES` lines; `estimate_text` gives the rest."""
-    body = finding_summary(report.findings, "caution", most=MOST_CAUTIONS)
-    checks = finding_summary(report.findings, "check", most=MOST_CHECKS)
+    body = finding_summary(report.findings, "caution", most=3)
+    checks = finding_summary(report.findings, "check", most=2)
     if estimate.status == "no_estimate":
         body += [*_no_estimate_lines(report), *_mass_lines(report.masses, room=MOST_MASSES), *checks]
     else:

@@ -92,7 +92,6 @@ class ShownExam(Record, eq=False):
 
     @property
     def main(self) -> ExamMap:
-        """The map that is drawn large."""
         return self.maps[self.main_number - 1]
 
     @property

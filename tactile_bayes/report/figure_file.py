@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 # --- Names for the titles of figures: what the scans say of the exam, else the file's name; never digests.
 
 _CODE: Final = re.compile(r"[A-Za-z0-9_.-]{1,32}")
-_TITLED: Final = ("subject", "side", "mass", "visit")
 
 
 def exam_title(name: str, scans: Sequence[Mapping[str, str]]) -> str:
@@ -33,7 +32,7 @@ def exam_title(name: str, scans: Sequence[Mapping[str, str]]) -> str:
     is named.
     """
     facts = []
-    for fact in _TITLED:
+    for fact in ("subject", "side", "mass", "visit"):
         codes = dict.fromkeys(code for scan in scans if _CODE.fullmatch(code := scan.get(fact, "")))
         words = f"{fact}{'s' * (len(codes) > 1)} " if fact in ("mass", "visit") else ""
         facts += [words + " and ".join(codes)] if codes else []

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 # --- Text report of a tactile map: its verdict in a few lines, or a table with units, then what was left out.
 
-_LISTED_TAXELS = 8
 # Leaving out more frames than this share for their pressure is worth a word about the window.
 _MUCH_GATED = 0.2
 _MOSTLY = 0.8  #: Share of these above which they were pressed too hard, or too lightly.
@@ -99,7 +98,6 @@ def map_summary(tactile_map: TactileMap, *, written: str) -> str:
 
 
 def _verdict_line(findings: Sequence[Finding], facts: Mapping[str, Any]) -> str:
-    """Verdict on the map with its main figures."""
     figures = [f"{facts['frames']} frames"] if "frames" in facts else []
     figures += [facts[name] for name in ("scans_used", "every") if name in facts]
     if "coverage" in facts:
@@ -175,7 +173,7 @@ def _map_facts(tactile_map: TactileMap) -> dict[str, Any]:
 def _notes(tactile_map: TactileMap) -> Iterator[str]:
     quality = tactile_map.quality
     if tactile_map.masked_taxels:
-        yield f"taxels left out: {first_of(tactile_map.masked_taxels, _LISTED_TAXELS, '; ')}"
+        yield f"taxels left out: {first_of(tactile_map.masked_taxels, 8, '; ')}"
     if quality.get("few_cells"):
         yield f"{quality['few_cells']:.0f} cells have fewer than {FEW_READINGS} readings: noisy, mostly at the rim"
     if quality.get("negative_readings"):
@@ -269,7 +267,6 @@ def map_figure(
 
 
 def _across_up(view: Orientation, x: Any, y: Any) -> tuple[Any, Any]:
-    """Values along x and y as those across and up the picture."""
     return (y, x) if view.swapped else (x, y)
 
 
@@ -363,14 +360,12 @@ def _explain(axes: Axes, tactile_map: TactileMap, places: Sequence[PassedOver]) 
 
 
 def _colour_bar(axes: Axes, image: Any, label: str, *, extend: Any = "neither") -> None:
-    """Draw a colour bar as high as the panel."""
     bar = axes.figure.colorbar(image, cax=axes.inset_axes((1.02, 0.0, 0.035, 1.0)), extend=extend)
     bar.set_label(label, fontsize=9)
     bar.ax.tick_params(labelsize=8)
 
 
 def _orient(axes: Axes, view: Orientation, tactile_map: TactileMap) -> None:
-    """Label the plane's axes and orient them."""
     axes.set_anchor("N")
     words = _AXIS_WORDS if tactile_map.recipe.source == "scan" else {"x": "x (mm)", "y": "y (mm)"}
     back = {view.right: "larger to the left", view.up: "larger downwards"}
@@ -428,7 +423,6 @@ def _draw_fit(axes: Axes, report: EstimateReport, view: Orientation) -> None:
 def _draw_ellipse(
     axes: Axes, centre: Any, size_mm: tuple[float, float], angle_deg: float, view: Orientation, **line: Any
 ) -> None:
-    """Draw an ellipse of the given diameters, outlined in black."""
     angle = -angle_deg if view.swapped else angle_deg
     ellipse = load_matplotlib().patches.Ellipse(
         centre, *_across_up(view, *size_mm), angle=angle, fill=False, edgecolor="white", **line
@@ -453,7 +447,6 @@ def _draw_masses(axes: Axes, report: EstimateReport, view: Orientation) -> None:
 
 
 def _draw_places(axes: Axes, places: Sequence[PassedOver], view: Orientation) -> None:
-    """Draw a numbered cross at each place where no lump was measured."""
     for number, place in enumerate(places, start=1):
         point = _across_up(view, place.x_mm, place.y_mm)
         axes.plot(*point, "x", color="white", markersize=6, markeredgewidth=1.4, path_effects=_outlined(3.0))
@@ -474,7 +467,6 @@ def _draw_scale_bar(axes: Axes) -> None:
 
 
 def _draw_notch(axes: Axes, view: Orientation) -> None:
-    """Draw an arrow towards the sternal notch."""
     if view.notch is None:
         return
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 # --- Pages from templates: every text is escaped, and all have one style sheet and one content policy.
 
 TEMPLATES: Final = Path(__file__).with_name("templates")
-_MOST_SCANS: Final = 6
 
 
 def page(kind: str, *, title: str, images: str = "data:", script_sha256: str = "", **values: Any) -> str:
@@ -50,7 +49,7 @@ def cut(text: str, longest: int = 400) -> str:
 
 def foot(scans: Iterable[Mapping[str, str]], more: str = "") -> str:
     """Last line of a page: the program, `more` of it, the first scans by their digests, and what sizes come from."""
-    digests = [scan["sha256"][:12] for scan in scans if scan.get("sha256")][:_MOST_SCANS]
+    digests = [scan["sha256"][:12] for scan in scans if scan.get("sha256")][:6]
     named_scans = [f"scan{'s' if len(digests) > 1 else ''} {', '.join(digests)}"] if digests else []
     made = "; ".join(filter(None, [f"tactile-bayes {__version__}", more, *named_scans]))
     return f"{made}. Sizes come from simulated bodies; no scan of a person has been used. {RESEARCH_USE}"

@@ -268,7 +268,8 @@ def _columns(measured: MeasuredScan, models: Sequence[ModelComparison]) -> Itera
     for beside, (title, rows) in zip(("measured", ""), _BUMPS.items(), strict=True):
         yield _cells(title, beside)
         for name, words in rows.items():
-            yield _cells(words, *(_figure_cell(one[name]) for one in every))
+            # a model without a bump in the map's plane, such as a cylinder, has none to show
+            yield _cells(words, *(f"{one[name]:.3f}" if np.isfinite(one[name]) else "none" for one in every))
 
 
 def _cells(words: str, beside: str, *models: str) -> str:
@@ -278,11 +279,6 @@ def _cells(words: str, beside: str, *models: str) -> str:
 def finite(value: float) -> float | None:
     """The number; null in a file for what is none."""
     return float(value) if np.isfinite(value) else None
-
-
-def _figure_cell(value: float) -> str:
-    """A model without a bump in the map's plane, such as a cylinder, has none to show."""
-    return f"{value:.3f}" if np.isfinite(value) else "none"
 
 
 def comparison_document(

@@ -21,8 +21,6 @@ from tactile_bayes.size.draws import EXTREMES, LEAST_PROBABILITY
 from tactile_bayes.size.pooling import DISAGREE, PooledEstimate, Repeatability
 from tactile_bayes.size.terms import UNLIKE_LEARNED, unknown_head
 
-MOST_NAMED = 4
-
 # --- The mass of each map that is pooled: by its place in the patient.
 #
 # A report is about the surest mass of its map, so of two maps of one breast each may report another one. With
@@ -195,7 +193,7 @@ def pooled_summary(report: PooledReport) -> str:
     lines = finding_summary(findings, "caution", most=2)
     sizes = [one.max_size_mm for one in report.maps if one.max_size_mm is not None]
     if sizes:
-        words = first_of([_size_words(size, with_ends=report.status == DISAGREE) for size in sizes], MOST_NAMED)
+        words = first_of([_size_words(size, with_ends=report.status == DISAGREE) for size in sizes], 4)
         alike = _alike(report) if report.status == DISAGREE else ""
         shown = f"A lump was found on {len(sizes)} of {len(report.maps)} maps"
         lines.append(f"{shown}, alone sized at {words} mm{alike}.")

@@ -120,19 +120,15 @@ def size_ruler(
     start, end = min(0.0, *(1.08 * q.low for _, q in rows)), max(0.0, *(1.08 * q.high for _, q in rows))
     scale, bottom = _LENGTH_MM / (end - start), _ROW_MM * len(rows) + 1.5
     parts = [line(f"M{-scale * start:.2f} 0V{bottom:g}", 0.25)] if start < 0.0 else []
-    for i, (words, q) in enumerate(rows):
-        parts += _bar(i, words, q, start, scale)
+    for row, (words, q) in enumerate(rows):
+        y, left, right = 4.0 + _ROW_MM * row, scale * (q.low - start), scale * (q.high - start)
+        half = 0.65 * len(words)
+        middle = min(max((left + right) / 2, half), _LENGTH_MM - half)
+        parts.append(text(middle, y - 1.7, words, more=' stroke="#fff" stroke-width="0.8" paint-order="stroke"'))
+        parts.append(line(f"M{left:.2f} {y:g}H{right:.2f}", round(1.6 / (1 + 0.6 * row), 2)))
+        parts.append(line(f"M{scale * (q.median - start):.2f} {y - 1:g}v2", 0.7))
     parts += _scale(start, end, bottom, unit)
     return drawing("ruler", label, (-4.0, -1.0, _LENGTH_MM + 8, bottom + 6), parts)
-
-
-def _bar(row: int, words: str, q: Quantity, start: float, scale: float) -> Iterator[str]:
-    y, left, right = 4.0 + _ROW_MM * row, scale * (q.low - start), scale * (q.high - start)
-    half = 0.65 * len(words)
-    middle = min(max((left + right) / 2, half), _LENGTH_MM - half)
-    yield text(middle, y - 1.7, words, more=' stroke="#fff" stroke-width="0.8" paint-order="stroke"')
-    yield line(f"M{left:.2f} {y:g}H{right:.2f}", round(1.6 / (1 + 0.6 * row), 2))
-    yield line(f"M{scale * (q.median - start):.2f} {y - 1:g}v2", 0.7)
 
 
 def _scale(start: float, end: float, y: float, unit: str) -> Iterator[str]:
@@ -213,7 +209,6 @@ class Frame(Record, eq=False):
 
     @property
     def view(self) -> Orientation:
-        """Which way up the map is drawn."""
         return orientation_of(self.tactile_map)
 
     @property
@@ -409,7 +404,6 @@ def _draw_mass(mass: ExamMass, exam: ExamMap, frame: Frame, *, small: bool) -> I
 
 
 def _ellipse(mass: ExamMass, times: float, frame: Frame) -> str:
-    """Path of the mass's ellipse, its diameters multiplied."""
     assert mass.axes_mm is not None
     along, across = mass.axes_mm
     around = ellipse_mm((times * along, times * across), mass.angle_deg) + np.reshape(mass.centre_mm, (2, 1))

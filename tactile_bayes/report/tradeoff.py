@@ -171,7 +171,6 @@ def settings_text(tradeoff: Tradeoff) -> str:
 
 
 def _label_width(tradeoff: Tradeoff) -> int:
-    """Columns of a setting's name."""
     return _COLUMNS - _NUMBERS - _COST * len(tradeoff.default.cpu_s)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import cycle
 from pathlib import Path
@@ -20,7 +20,6 @@ from tactile_bayes.report.figure_file import FORMATS, figure_file, finish, plain
 from tactile_bayes.report.pages import Growth, page
 from tactile_bayes.trial.figures import Figures
 from tactile_bayes.trial.method_comparison import MethodComparison
-from tactile_bayes.trial.next_mass import ModalityErrors
 from tactile_bayes.trial.planning import PlanReport
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes, Trial, mass_numbers
 from tactile_bayes.trial.summary import BINS, Calibration, ModalityReport, Prediction, TrialReport, prediction_of
@@ -35,30 +34,6 @@ _DOTS, _LINE, _SECOND, _GREY = "#1f3b73", "#c8641e", "#2a7f62", "0.45"
 _COLOURS = (_DOTS, _LINE, _SECOND)
 _PANEL_IN = 4.1
 _LEGEND: dict[str, Any] = {"frameon": True, "framealpha": 0.85}
-
-
-def sizes_figure(report: TrialReport, trial: Trial) -> str:
-    """Draw size against ex-vivo size, one panel per modality, as figure 10 of Wellman & Howe (1999).
-
-    Error bars: +- 1 SD of the ex-vivo size where the table gives it, +- 1 SD of a mass's replicates. Dashed: identity;
-    solid: line through zero. Hollow: not found, at size 0.
-    """
-    modalities = trial.sizes().values()
-    sds = {number: trial.ex_vivo_sd_mm.get(key) or 0.0 for key, number in mass_numbers(trial.ex_vivo_mm).items()}
-    ends = [end for one in modalities for end in (*one.ex_vivo_mm, *(one.size_mm + _replicate_sds(one)))]
-    reach = 1.06 * float(max(ends, default=1.0))
-    slopes = {name: one.slope_through_origin for name, one in report.modalities.items()}
-    return _svg([partial(_draw_sizes, modality, sds, slopes[modality.name], reach) for modality in modalities])
-
-
-def differences_figure(report: TrialReport, trial: Trial) -> str:
-    """Draw Bland-Altman plots: difference from the ex-vivo size against the mean, with limits and intervals.
-
-    All panels have the same axes, so that modalities can be compared by eye.
-    """
-    detected = [size.only_detected() for size in trial.sizes().values()]
-    methods = {name: one.method_comparison for name, one in report.modalities.items()}
-    return _svg([partial(_draw_differences, one, methods[one.name]) for one in detected], alike=True)
 
 
 def _svg(panels: Sequence[Callable[[Axes], None]], *, alike: bool = False) -> str:
@@ -82,6 +57,11 @@ def _replicate_sds(sizes: ModalitySizes) -> FloatArray:
 
 
 def _draw_sizes(sizes: ModalitySizes, sds: Mapping[int, float], slope: float | None, reach: float, axes: Axes) -> None:
+    """Size against ex-vivo size, as figure 10 of Wellman & Howe (1999).
+
+    Error bars: +- 1 SD of the ex-vivo size where the table gives it, +- 1 SD of a mass's replicates. Dashed: identity;
+    solid: line through zero. Hollow: not found, at size 0.
+    """
     detected = sizes.only_detected()
     axes.plot([0, reach], [0, reach], linestyle="--", color=_GREY, linewidth=1, label="identity")
     if slope is not None:
@@ -101,6 +81,7 @@ def _draw_sizes(sizes: ModalitySizes, sds: Mapping[int, float], slope: float | N
 
 
 def _draw_differences(detected: ModalitySizes, methods: MethodComparison, axes: Axes) -> None:
+    """Bland-Altman plot: difference from the ex-vivo size against the mean, with limits and intervals."""
     mean, off = (detected.ex_vivo_mm + detected.size_mm) / 2, detected.size_mm - detected.ex_vivo_mm
     axes.plot(mean, off, "o", markersize=4, color=_DOTS)
     axes.axhline(0, color=_GREY, linestyle="--", linewidth=1)
@@ -189,6 +170,11 @@ def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence
 
     `growth` is of masses with several visits, beside the trial. The template puts figures into words by `report.trial`.
     """
+    sizes = [(one, report.modalities[one.name]) for one in trial.sizes().values()]
+    sds = {number: trial.ex_vivo_sd_mm.get(key) or 0.0 for key, number in mass_numbers(trial.ex_vivo_mm).items()}
+    ends = [end for one, _ in sizes for end in (*one.ex_vivo_mm, *(one.size_mm + _replicate_sds(one)))]
+    reach = 1.06 * float(max(ends, default=1.0))
+    differences = [partial(_draw_differences, one.only_detected(), of.method_comparison) for one, of in sizes]
     return page(
         "trial",
         title="Sizes against excision",
@@ -196,14 +182,13 @@ def trial_html(report: TrialReport, trial: Trial, *, text: str, growth: Sequence
         trial=trial,
         say=trial_words,
         masses=_masses(trial),
-        sizes_svg=sizes_figure(report, trial),
-        differences_svg=differences_figure(report, trial),
+        sizes_svg=_svg([partial(_draw_sizes, one, sds, of.slope_through_origin, reach) for one, of in sizes]),
+        differences_svg=_svg(differences, alike=True),
         calibrations=list(_calibrations(report, trial)),
         growth=growth,
         text=text,
         cells=_cells,
         of_variances=_variance_cells,
-        middles=_median_cells,
         dumps=json.dumps,
     )
 
@@ -249,7 +234,3 @@ def _variance_cells(report: ModalityReport) -> list[str]:
     parts = report.replicates.variance_components
     variances = (None, None, None) if parts is None else (parts.mass, parts.reader, parts.map)
     return [trial_words.number(None if variance is None else 100 * variance**0.5, ".0f") for variance in variances]
-
-
-def _median_cells(one: ModalityErrors, names: Iterable[str]) -> list[str]:
-    return [getattr(one, name).shown(".3g") for name in names]
