@@ -12,16 +12,8 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.exports import exam
 from tactile_bayes.exports.dicom import VALUES, dicom_files
-from tactile_bayes.exports.exam import (
-    EstimateFile,
-    Identity,
-    MapFile,
-    check_pairs,
-    import_extra,
-    lps_from_plane,
-    lps_point,
-)
 from tactile_bayes.exports.fhir import bundle_json
 from tactile_bayes.exports.redcap import dictionary_csv, records_csv
 from tactile_bayes.files.atomic import Format, check_suffix, refuse_existing, same_file, unwritable, write_all
@@ -31,14 +23,14 @@ from tactile_bayes.presets import RESEARCH_USE
 # --- Maps as NRRD, the format of 3D Slicer: one slice in the patient's frame.
 
 
-def nrrd_bytes(source: MapFile) -> bytes:
+def nrrd_bytes(source: exam.MapFile) -> bytes:
     """A map as the bytes of a NRRD file: float32 values (nx, ny, 1), NaN where there are none.
 
     The axes are the plane's, in ``left-posterior-superior`` and mm; the slice is as thick as a cell is wide.
     """
-    nrrd = import_extra("nrrd")
+    nrrd = exam.import_extra("nrrd")
     one = source.tactile_map
-    transform = lps_from_plane(one)
+    transform = exam.lps_from_plane(one)
     if transform is None:
         fault = "has no landmarks, so its place in the patient is not known"
         way_out = "3D Slicer takes maps of scans in which sternal notch and xiphoid were touched"
@@ -49,7 +41,7 @@ def nrrd_bytes(source: MapFile) -> bytes:
         "kinds": ["domain", "domain", "domain"],
         "space units": ["mm", "mm", "mm"],
         "space directions": transform[:3, :3].T * one.recipe.cell_mm,
-        "space origin": lps_point(transform, (float(one.x_mm[0]), float(one.y_mm[0]))),
+        "space origin": exam.lps_point(transform, (float(one.x_mm[0]), float(one.y_mm[0]))),
         "encoding": "gzip",
         "content": "tactile map",
         "tactile_bayes_values": one.recipe.value_words.encode("ascii", "replace").decode(),
@@ -136,7 +128,7 @@ def _make_folder(folder: Path, names: set[str]) -> Path | None:
 ExportFormat = Literal["dicom", "fhir", "nrrd", "csv"]
 FORMATS: Final[tuple[ExportFormat, ...]] = get_args(ExportFormat)
 IDENTITY_FIELDS: Final[dict[ExportFormat, tuple[str, ...]]] = {
-    "dicom": names_of(Identity),
+    "dicom": names_of(exam.Identity),
     "fhir": ("patient_id", "patient_name", "birth_date", "sex", "issuer", "accession", "study_date"),
     "nrrd": (),
     "csv": ("patient_id", "study_date"),
@@ -159,7 +151,11 @@ def _option(name: str) -> str:
 
 
 def export(
-    files: Sequence[MapFile | Sequence[EstimateFile]], *, to: ExportFormat, identity: Identity, id_from_scan: bool
+    files: Sequence[exam.MapFile | Sequence[exam.EstimateFile]],
+    *,
+    to: ExportFormat,
+    identity: exam.Identity,
+    id_from_scan: bool,
 ) -> Exported:
     """Export maps and estimates.
 
@@ -167,10 +163,10 @@ def export(
     `identity` that the format does not hold are left out. With `id_from_scan` the scans' subject code is the patient ID
     where none is given.
     """
-    maps = [file for file in files if isinstance(file, MapFile)]
-    estimates = [one for several in files if not isinstance(several, MapFile) for one in several]
+    maps = [file for file in files if isinstance(file, exam.MapFile)]
+    estimates = [one for several in files if not isinstance(several, exam.MapFile) for one in several]
     path_of = dict[str, Path]()
-    inputs: list[MapFile | EstimateFile] = [*maps, *estimates]
+    inputs: list[exam.MapFile | exam.EstimateFile] = [*maps, *estimates]
     for one in inputs:
         if one.digest in path_of:
             other = path_of[one.digest]
@@ -181,7 +177,7 @@ def export(
     for estimate in estimates:
         if estimate.maps and (other := of_maps.setdefault(frozenset(estimate.maps), estimate.path)) != estimate.path:
             raise UsageError(f"{other} and {estimate.path} are estimates of one exam; give one of them")
-    check_pairs(maps, estimates)
+    exam.check_pairs(maps, estimates)
     dropped = {name: "" for name in identity.given if name not in IDENTITY_FIELDS[to]}
     identity = replace(identity, **dropped)
     if to == "nrrd":
@@ -214,14 +210,14 @@ def export(
     return {"": bundle_json(_one_estimate(estimates, to), identity).encode()}, tuple(notes)
 
 
-def _one_estimate(estimates: Sequence[EstimateFile], to: ExportFormat) -> EstimateFile:
+def _one_estimate(estimates: Sequence[exam.EstimateFile], to: ExportFormat) -> exam.EstimateFile:
     if len(estimates) > 1:
         where = f"{estimates[0].path} holds" if len({one.path for one in estimates}) == 1 else "the files hold"
         raise UsageError(f"{where} {len(estimates)} estimates; {to} takes one exam at a time (csv takes several)")
     return estimates[0]
 
 
-def _dicom(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity: Identity) -> Exported:
+def _dicom(maps: Sequence[exam.MapFile], estimates: Sequence[exam.EstimateFile], identity: exam.Identity) -> Exported:
     if not maps:
         raise UsageError(f"a DICOM report refers to its map; give it too: export MAP.nc {estimates[0].path} --to dicom")
     estimate = _one_estimate(estimates, "dicom") if estimates else None
@@ -237,7 +233,7 @@ def _dicom(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], identity:
     return files, tuple(notes)
 
 
-def _refuse_maps(maps: Sequence[MapFile], estimates: Sequence[EstimateFile], to: ExportFormat) -> None:
+def _refuse_maps(maps: Sequence[exam.MapFile], estimates: Sequence[exam.EstimateFile], to: ExportFormat) -> None:
     if maps and not estimates:
         one = maps[0].path
         way_out = f"give what `tactile-bayes estimate {one} --json` prints"

@@ -16,15 +16,7 @@ from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import PATIENT_WORDS, Orientation, TactileMap, orientation_of
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report import svg
-from tactile_bayes.report.compare import (
-    CompareReport,
-    Visit,
-    change_sentences,
-    compare_summary,
-    rate_sentences,
-    verdict_sentence,
-)
+from tactile_bayes.report import compare, svg
 from tactile_bayes.report.estimate_text import spread_percent
 from tactile_bayes.report.figure_file import exam_title, figure_file
 from tactile_bayes.report.map import draw_cells, draw_edges, ellipse_of
@@ -60,7 +52,7 @@ class LaidMap(Record, eq=False):
 
 
 def on_common_axes(
-    report: CompareReport, visits: Sequence[Sequence[DrawnMap]], *, middle: bool = False
+    report: compare.CompareReport, visits: Sequence[Sequence[DrawnMap]], *, middle: bool = False
 ) -> tuple[list[LaidMap], Orientation]:
     """The maps of each visit, and their axes: the patient's where all maps have landmarks, else the maps' own.
 
@@ -153,7 +145,7 @@ class Course(Record):
     visits: tuple[str, ...] = ()  #: A code for each.
     dates: tuple[str, ...] = ()  #: Likewise.
 
-    def of(self, visit: Visit) -> str:
+    def of(self, visit: compare.Visit) -> str:
         """A visit in words: its number, by which sentences and findings name it, its code, and its date or its day."""
         index = visit.visit - 1
         day = "" if visit.day is None or not index else f"day {visit.day:g}"
@@ -169,7 +161,7 @@ class Course(Record):
 
 
 def growth_page(
-    compared: VisitComparison, report: CompareReport, visits: Sequence[Sequence[DrawnMap]], course: Course
+    compared: VisitComparison, report: compare.CompareReport, visits: Sequence[Sequence[DrawnMap]], course: Course
 ) -> str:
     """Full HTML page of a comparison; equal comparisons give equal text."""
     laid, view = on_common_axes(report, visits, middle=True)
@@ -182,7 +174,7 @@ def growth_page(
         title=cut(course.title, 60) or TITLE,
         facts=[(name, text) for name, text in facts if text],
         research_use=RESEARCH_USE,
-        headline=verdict_sentence(replace(report, advice=compared.on_paper or report.advice)),
+        headline=compare.verdict_sentence(replace(report, advice=compared.on_paper or report.advice)),
         findings=finding_lines(report.findings, paper=True),
         maps=[_picture(laid[i], view, limits, course, report.visits[i]) for i in shown],
         left_out=len(laid) - len(shown),
@@ -193,8 +185,8 @@ def growth_page(
         another=compared.another,
         spread=None if report.between_map_sd is None else spread_percent(report.between_map_sd),
         change=svg.size_ruler(changes, unit="%", label="Change of the largest diameter in percent"),
-        sentences=change_sentences(report),
-        rates=rate_sentences(report),
+        sentences=compare.change_sentences(report),
+        rates=compare.rate_sentences(report),
         report=report,
         course=course,
         foot=foot(report.provenance.get("scans", ())),
@@ -202,7 +194,7 @@ def growth_page(
 
 
 def _picture(
-    laid: LaidMap, view: Orientation, limits: tuple[float, float], course: Course, visit: Visit
+    laid: LaidMap, view: Orientation, limits: tuple[float, float], course: Course, visit: compare.Visit
 ) -> tuple[str, str, str]:
     """Inline SVG of a visit's map with its ring, sides and scale bar, the visit in words, and its size."""
     side, q = _SCALE * (2 * HALF_MM + STEP_MM), visit.max_size_mm
@@ -217,7 +209,7 @@ def _picture(
     return drawn, course.of(visit), unsized if q is None else f"{q.median:.1f} mm"
 
 
-def _changes(report: CompareReport, course: Course) -> Iterator[tuple[str, Quantity]]:
+def _changes(report: compare.CompareReport, course: Course) -> Iterator[tuple[str, Quantity]]:
     """The change to the last visit, the same if exams differ as patients' do, and those to earlier ones."""
     for change in reversed(report.changes):
         yield course.of(report.visits[change.later - 1]), change.percent
@@ -235,7 +227,7 @@ _ROOM_MM: Final = (17.0, 8.0)
 """Visits nearer than the first have their dates in two rows, nearer than the second none, and no numbers."""
 
 
-def _chart(compared: VisitComparison, report: CompareReport, course: Course) -> str:
+def _chart(compared: VisitComparison, report: compare.CompareReport, course: Course) -> str:
     """Largest diameter with its interval at each visit, and the trend where there is one; empty without sizes."""
     joint, another, (width, height) = compared.joint, compared.another, _BOX_MM
     if joint is None:
@@ -302,7 +294,7 @@ def _mark(
 
 def draw_comparison(
     compared: VisitComparison,
-    report: CompareReport,
+    report: compare.CompareReport,
     visits: Sequence[Sequence[DrawnMap]],
     path: Path | None,
     *,
@@ -326,7 +318,7 @@ def draw_comparison(
         _draw_change(figure.add_subplot(grid[1, 0]), compared)
         words_axes = figure.add_subplot(grid[1, 1:])
         words_axes.set_axis_off()
-        lines = [part for line in compare_summary(report).splitlines()[:-1] for part in textwrap.wrap(line, 96)]
+        lines = [part for line in compare.compare_summary(report).splitlines()[:-1] for part in textwrap.wrap(line, 96)]
         text = "\n".join(line for line in lines if not line.startswith("More ("))
         words_axes.text(0.0, 1.0, text, va="top", fontsize=8.5, transform=words_axes.transAxes)
     return figure
