@@ -11,7 +11,7 @@ from tactile_bayes.api.arguments import PathLike, TextResult, door, path_of, req
 from tactile_bayes.declarations import as_dict
 from tactile_bayes.errors import UsageError, check_choice
 from tactile_bayes.files.posterior_nc import PosteriorDraws, read_posterior
-from tactile_bayes.findings import finding_lines
+from tactile_bayes.findings import counted, finding_lines
 from tactile_bayes.inference.ensemble import convergence
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_figures import corner_figure, rank_figure, trace_figure
@@ -54,7 +54,7 @@ class Diagnosis(TextResult, eq=False):
         posterior, chains = self.posterior, self.chains
         number = next(iter(posterior.draws.values())).size
         lines = [*finding_lines(posterior.findings)]
-        lines.append(f"method {posterior.method}: {number} draws in {chains} chain{'s' if chains > 1 else ''}")
+        lines.append(f"method {posterior.method}: {number} draws in {counted(chains, 'chain')}")
         if chains == 1:
             shape = posterior.diagnostics.get("pareto_k")
             lines += [] if shape is None else [f"Pareto shape of the weights {shape:.2f} (trusted up to 0.7)"]

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from tactile_bayes import __version__
 from tactile_bayes.api.trials import analyse, load_trial, read_excision, settings_by
 from tactile_bayes.campaigns.exams import MassPlace, masses_with_visits, unnamed_masses, visit_dates, visits_by_mass
 from tactile_bayes.campaigns.run import FEW, Campaign
@@ -441,7 +440,7 @@ def index_html(
         tables = f"{layout.DONE} and {layout.FAILURES}"
         lines.append(f"Here are the {len(shown)} to be looked at first; all are in {tables}.")
     lines += [repeatability_words(campaign)] if campaign.repeatability else []
-    return campaign_html(shown, lines=lines, links=links, version=__version__)
+    return campaign_html(shown, lines=lines, links=links)
 
 
 def _visit_entry(

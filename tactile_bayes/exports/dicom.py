@@ -274,24 +274,6 @@ def parametric_map(source: exam.MapFile, transform: FloatArray, *, study: Study,
     dataset.SeriesDescription = f"Tactile map. {RESEARCH_USE}"
     dataset.FrameOfReferenceUID = frame_of_reference(source)
     dataset.PositionReferenceIndicator = "XIPHOID"
-    _add_content(dataset, source, values)
-    dataset.SharedFunctionalGroupsSequence = [_shared_groups(source, values, directions)]
-    # one dimension, the place in a stack of one frame
-    organization = study.uid("dimension", source.digest)
-    pointers = {
-        "DimensionIndexPointer": pydicom.tag.Tag("InStackPositionNumber"),
-        "FunctionalGroupPointer": pydicom.tag.Tag("FrameContentSequence"),
-    }
-    dataset.DimensionOrganizationSequence = [item(DimensionOrganizationUID=organization)]
-    dataset.DimensionIndexSequence = [item(DimensionOrganizationUID=organization, **pointers)]
-    content = item(StackID="1", InStackPositionNumber=1, DimensionIndexValues=[1])
-    position = item(ImagePositionPatient=[_decimal(value) for value in corner_mm])
-    frame = item(FrameContentSequence=[content], PlanePositionSequence=[position])
-    dataset.PerFrameFunctionalGroupsSequence = [frame]
-    return dataset
-
-
-def _add_content(dataset: Any, source: exam.MapFile, values: FloatArray) -> None:
     dataset.SamplesPerPixel = 1
     dataset.PhotometricInterpretation = "MONOCHROME2"
     dataset.NumberOfFrames = 1
@@ -309,6 +291,20 @@ def _add_content(dataset: Any, source: exam.MapFile, values: FloatArray) -> None
     dataset.AcquisitionContextSequence = []
     comments = [RESEARCH_USE, *finding_lines(source.tactile_map.findings, paper=True)]
     dataset.ImageComments = f"{' '.join(comments)} SHA-256 of the map: {source.digest}"
+    dataset.SharedFunctionalGroupsSequence = [_shared_groups(source, values, directions)]
+    # one dimension, the place in a stack of one frame
+    organization = study.uid("dimension", source.digest)
+    pointers = {
+        "DimensionIndexPointer": pydicom.tag.Tag("InStackPositionNumber"),
+        "FunctionalGroupPointer": pydicom.tag.Tag("FrameContentSequence"),
+    }
+    dataset.DimensionOrganizationSequence = [item(DimensionOrganizationUID=organization)]
+    dataset.DimensionIndexSequence = [item(DimensionOrganizationUID=organization, **pointers)]
+    content = item(StackID="1", InStackPositionNumber=1, DimensionIndexValues=[1])
+    position = item(ImagePositionPatient=[_decimal(value) for value in corner_mm])
+    frame = item(FrameContentSequence=[content], PlanePositionSequence=[position])
+    dataset.PerFrameFunctionalGroupsSequence = [frame]
+    return dataset
 
 
 def _shared_groups(source: exam.MapFile, values: FloatArray, directions: FloatArray) -> Any:

@@ -232,9 +232,9 @@ def read_exam(path: Path) -> MapFile | list[EstimateFile]:
 
 def shared_facts(scans: Iterable[Mapping[str, str]]) -> dict[str, str]:
     """Facts of the exam on which all scans agree."""
-    facts_by_scan = [{(name, scan[name]) for name in EXAM_FACTS if name in scan} for scan in scans]
-    shared = dict(set.intersection(*facts_by_scan)) if facts_by_scan else {}
-    return {name: shared[name] for name in EXAM_FACTS if name in shared}
+    first, *others = [*scans] or [{}]
+    alike = (name for name in EXAM_FACTS if name in first and all(scan.get(name) == first[name] for scan in others))
+    return {name: first[name] for name in alike}
 
 
 def parse_estimate(document: object, path: Path) -> EstimateFile:

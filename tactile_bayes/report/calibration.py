@@ -38,8 +38,7 @@ def site_words(site: SiteShift, log_width: float | None = None) -> str:
 def site_calibration_text(calibration: BodyCalibration) -> str:
     """Text of a site's correction: cautions, shift, slope, and the scatter that it leaves."""
     site = calibration.site
-    if site is None:
-        raise ValueError("the calibration has no correction")
+    assert site is not None
     (shift, slope), fit = site.mean, site.fit
     shift_sd, slope_sd = (float(site.covariance[i, i]) ** 0.5 for i in range(2))
     lines = [f"CAUTION: {text}" for text in site.cautions] + [

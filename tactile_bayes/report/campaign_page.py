@@ -12,7 +12,6 @@ from urllib.parse import quote
 from tactile_bayes.declarations import Record, field
 from tactile_bayes.findings import SEVERITIES, Finding, finding_lines
 from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.pages import TEMPLATES, Growth, page
 from tactile_bayes.report.svg import THUMB_ENDS, THUMB_SCALE, colour_steps
 
@@ -144,7 +143,7 @@ def worst(rows: Iterable[MassEntry], most: int) -> list[MassEntry]:
     return heapq.nsmallest(most, rows, key=lambda row: (row.badness, row.name))
 
 
-def campaign_html(rows: Sequence[MassEntry], *, lines: Sequence[str], links: Mapping[str, str], version: str) -> str:
+def campaign_html(rows: Sequence[MassEntry], *, lines: Sequence[str], links: Mapping[str, str]) -> str:
     """Full page; nothing is loaded but thumbnails beside it, and the only script is its filter and its order.
 
     `rows` are in the order in which they are shown, `lines` the summary in sentences, `links` the files beside the page
@@ -158,7 +157,6 @@ def campaign_html(rows: Sequence[MassEntry], *, lines: Sequence[str], links: Map
         images="'self' file:" if apart else "data:",
         script_sha256=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
         script=script,
-        research_use=RESEARCH_USE,
         lines=lines,
         order=WORST_FIRST,
         beside=links,
@@ -167,5 +165,4 @@ def campaign_html(rows: Sequence[MassEntry], *, lines: Sequence[str], links: Map
         growing=any(row.growth is not None for row in rows),
         scale=THUMB_SCALE,
         colours=colour_steps(THUMB_ENDS, "of the level beside the lump; all maps", more=True),
-        version=version,
     )

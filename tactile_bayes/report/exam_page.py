@@ -7,7 +7,7 @@ from typing import Any, Final
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.posterior.verdict import SHARE_WITH_LUMP, chance_text
-from tactile_bayes.presets import INTERVAL, RESEARCH_USE
+from tactile_bayes.presets import INTERVAL
 from tactile_bayes.report import exam_words, svg
 from tactile_bayes.report.estimate_document import size_words
 from tactile_bayes.report.estimate_text import spread_percent, width_lines
@@ -18,7 +18,6 @@ from tactile_bayes.report.pages import cut, foot, page
 
 TITLE: Final = "Tactile exam"
 MOST_REPEATS: Final = 5
-MOST_MASSES: Final = 4
 _FINDINGS: Final = ((2, 320), (1, 220))  #: Findings and letters of each, and on a crowded page.
 _PICTURE_MM: Final = (108.0, 96.0)
 _LOWER_MM: Final = 54.0
@@ -47,7 +46,6 @@ def exam_page(exam: ShownExam) -> str:
         title=cut(exam.labels.title, 60) or TITLE,
         crowded=crowded,
         facts=list(exam_words.facts(exam)),
-        research_use=RESEARCH_USE,
         headline=headline(exam),
         findings=findings,
         longest_finding=longest,
@@ -64,7 +62,6 @@ def exam_page(exam: ShownExam) -> str:
         nothing=[] if size else list(exam_words.nothing_sentences(exam)),
         narrowing=width_lines(exam.report.leading.variance_share or {}, paper=True),
         masses=[exam_words.mass_row(mass) for mass in masses],
-        most_masses=MOST_MASSES,
         maps=len(exam.maps),
         repeats=list(zip(svg.small_pictures(shown, room_mm=_REPEAT_MM), alone, strict=True)) if shown else [],
         of_map=f" (map {exam.main_number})" if several else "",

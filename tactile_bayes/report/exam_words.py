@@ -13,7 +13,7 @@ import numpy as np
 from tactile_bayes.declarations import Record, replace, set_fields
 from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, UsageError
 from tactile_bayes.files.reports import EstimateReport, MassReport, Place, Point, PooledReport, centre_of
-from tactile_bayes.findings import capitalised, first_of
+from tactile_bayes.findings import capitalised, counted, first_of
 from tactile_bayes.geometry import apply
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.clock import ClockPosition, clock_position, clock_text
@@ -291,7 +291,7 @@ def quality_rows(exam: ShownExam) -> Iterator[tuple[str, str]]:
         yield from _scan_rows(exam.main.tactile_map)
     days = [scan["array_calibration_days"] for scan in exam.scans if "array_calibration_days" in scan]
     known = [int(text) for text in days if re.fullmatch(r"-?[0-9]{1,6}", text)]
-    age = f"{max(known)} day{'s' if max(known) != 1 else ''} old at the exam" if known else "age not stated in the scan"
+    age = f"{counted(max(known), 'day')} old at the exam" if known else "age not stated in the scan"
     yield "sensor calibration", age
     calibration = exam.main.report.origin.settings.get("size_calibration")
     if calibration:

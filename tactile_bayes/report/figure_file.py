@@ -34,7 +34,7 @@ def exam_title(name: str, scans: Sequence[Mapping[str, str]]) -> str:
     facts = []
     for fact in ("subject", "side", "mass", "visit"):
         codes = dict.fromkeys(code for scan in scans if _CODE.fullmatch(code := scan.get(fact, "")))
-        words = f"{fact}{'s' * (len(codes) > 1)} " if fact in ("mass", "visit") else ""
+        words = f"{fact}{'s' if len(codes) > 1 else ''} " if fact in ("mass", "visit") else ""
         facts += [words + " and ".join(codes)] if codes else []
     plain = name.replace("$", r"\$")
     if not facts:

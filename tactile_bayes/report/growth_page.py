@@ -15,7 +15,6 @@ from tactile_bayes.findings import finding_lines
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import PATIENT_WORDS, Orientation, TactileMap, orientation_of
-from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report import compare, svg
 from tactile_bayes.report.estimate_text import spread_percent
 from tactile_bayes.report.figure_file import exam_title, figure_file
@@ -173,7 +172,6 @@ def growth_page(
         "growth",
         title=cut(course.title, 60) or TITLE,
         facts=[(name, text) for name, text in facts if text],
-        research_use=RESEARCH_USE,
         headline=compare.verdict_sentence(replace(report, advice=compared.on_paper or report.advice)),
         findings=finding_lines(report.findings, paper=True),
         maps=[_picture(laid[i], view, limits, course, report.visits[i]) for i in shown],

@@ -66,34 +66,30 @@ def verdict(test: sbc.RankTest) -> str:
 
 def sbc_text(document: dict[str, Any]) -> str:
     """Full text report, ending with the research-use line."""
-    return "\n".join([*_lines(document), RESEARCH_USE]) + "\n"
-
-
-def _lines(document: dict[str, Any]) -> Iterator[str]:
     speed, others, tests = document["maps_per_s"], document["elsewhere"], document["parameters"]
+    lines = ["No map gave an estimate: there is nothing to rank; give more --maps"]
     if tests:
-        yield from _conclusion(tests, document["p_together"])
-    else:
-        yield "No map gave an estimate: there is nothing to rank; give more --maps"
+        lines = [*_conclusion(tests, document["p_together"])]
     made = f"method {document['method']}, {document['field_cosines']} cosines, seed {document['seed']}"
     rate = "" if speed is None else f", {speed:.3g} maps/s"
-    yield f"{document['maps']} maps from the model's own prior, {made}{rate}"
     why = ", ".join(f"{code} {number}" for code, number in document["abstained"].items())
     abstained = f"{document['maps'] - document['ranked'] - others['number']}{f' ({why})' if why else ''}"
-    yield f"no estimate on {abstained}: left out, ranks are conditional on detection"
     sure = f"FAILS, the draws keep to one place (p = {others['chance']:.1g})" if others["too_many"] else "ok"
-    yield f"another rise was measured on {others['number']}, announced {others['announced']:.1f}: {sure}; left out"
-    if not tests:
-        return
-    drawn = ", ".join(f"{name} {number}" for name, number in document["drawn_by"].items())
-    yield f"ranks among {sbc.DRAWS} draws, drawn by: {drawn}"
-    yield ""
-    yield f"{'parameter':<11}{'chi2 p':>7}{'ECDF p':>8}  {'50 % holds':<16}{'90 % holds':<16}verdict"
-    for test in tests:
-        held = "".join(f"{100 * c['covered']:.1f} +- {100 * c['error']:.1f} %".ljust(16) for c in test["coverage"])
-        fault = test["verdict"].removeprefix("FAILS: ").removeprefix("ranks are ")
-        yield f"{test['name']:<11}{test['chi2_p']:>7.3f}{test['ecdf_p']:>8.3f}  {held}{fault}"
-    yield "+- is one binomial standard error of a calibrated interval."
+    lines += [
+        f"{document['maps']} maps from the model's own prior, {made}{rate}",
+        f"no estimate on {abstained}: left out, ranks are conditional on detection",
+        f"another rise was measured on {others['number']}, announced {others['announced']:.1f}: {sure}; left out",
+    ]
+    if tests:
+        drawn = ", ".join(f"{name} {number}" for name, number in document["drawn_by"].items())
+        head = f"{'parameter':<11}{'chi2 p':>7}{'ECDF p':>8}  {'50 % holds':<16}{'90 % holds':<16}verdict"
+        lines += [f"ranks among {sbc.DRAWS} draws, drawn by: {drawn}", "", head]
+        for test in tests:
+            held = "".join(f"{100 * c['covered']:.1f} +- {100 * c['error']:.1f} %".ljust(16) for c in test["coverage"])
+            fault = test["verdict"].removeprefix("FAILS: ").removeprefix("ranks are ")
+            lines.append(f"{test['name']:<11}{test['chi2_p']:>7.3f}{test['ecdf_p']:>8.3f}  {held}{fault}")
+        lines.append("+- is one binomial standard error of a calibrated interval.")
+    return "\n".join([*lines, RESEARCH_USE]) + "\n"
 
 
 _FEW: Final = 50  #: Maps below which the conclusion says that they are few.

@@ -37,8 +37,8 @@ def page(kind: str, *, title: str, images: str = "data:", script_sha256: str = "
     `images` is where its pictures may come from; `script_sha256` is of the one script that may run, in base 64.
     """
     scripts = f"; script-src 'sha256-{script_sha256}'" if script_sha256 else ""
-    template = _environment().get_template(f"{kind}.html")
-    return template.render(kind=kind, title=title, images=images, scripts=scripts, **values)
+    of_all = {"kind": kind, "title": title, "research_use": RESEARCH_USE, "version": __version__}
+    return _environment().get_template(f"{kind}.html").render(**of_all, images=images, scripts=scripts, **values)
 
 
 def cut(text: str, longest: int = 400) -> str:
@@ -153,14 +153,13 @@ class PageFiles(Record):
 
 # --- Printing of a page to PDF, by an installed Chromium or by WeasyPrint.
 
-Printer = Callable[[str], bytes]
 BROWSERS: Final = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 PATIENCE_S: Final = 120
 # What a browser writes of the time: noughts stand there instead, as many, for places in a PDF are counted in bytes.
 _TIMES: Final = re.compile(rb"/(CreationDate|ModDate) ?\(D:[0-9+Z'-]*\)")
 
 
-def find_printer() -> Printer:
+def find_printer() -> Callable[[str], bytes]:
     """Function that turns HTML into PDF: an installed browser's, else WeasyPrint's."""
     browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
     if browser is not None:

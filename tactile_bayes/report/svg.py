@@ -272,23 +272,22 @@ def thumbnail_svg(exam: ExamMap, *, label: str) -> str:
     A map that has no room at that scale is drawn smaller, as its scale bar shows. Of several masses the reported one
     alone has its ellipse.
     """
-    exam = replace(exam, masses=exam.masses[:1])
-    width, height = Frame(_map_of(exam), 1.0).size_mm
-    scale = min(THUMB_SCALE, _THUMB_ROOM_MM / max(width, height))
-    drawn = exam_picture(exam, Frame(_map_of(exam), scale), label=label, small=True, limits=_shared_limits(exam))
-    first = '<svg xmlns="http://www.w3.org/2000/svg" font-family="sans-serif"'
-    return drawn.replace("<svg", first, 1).replace("<image ", '<image style="image-rendering:pixelated" ')
-
-
-def _shared_limits(exam: ExamMap) -> tuple[float, float]:
-    """Values at the ends of the colours of thumbnails: the same shares of the level beside the lump for every map."""
     tactile_map, report = _map_of(exam), exam.report
+    scale = min(THUMB_SCALE, _THUMB_ROOM_MM / max(Frame(tactile_map, 1.0).size_mm))
     values = tactile_map.mean[tactile_map.covered]
     level = float(np.median(values)) if values.size else 1.0
     if report.background is not None and report.max_size_mm is not None:
         level = report.background.median
     low, high = sorted(level * end for end in THUMB_ENDS)
-    return low, max(high, low + 1e-9)
+    drawn = exam_picture(
+        replace(exam, masses=exam.masses[:1]),
+        Frame(tactile_map, scale),
+        label=label,
+        small=True,
+        limits=(low, max(high, low + 1e-9)),
+    )
+    first = '<svg xmlns="http://www.w3.org/2000/svg" font-family="sans-serif"'
+    return drawn.replace("<svg", first, 1).replace("<image ", '<image style="image-rendering:pixelated" ')
 
 
 def small_pictures(maps: Sequence[ExamMap], *, room_mm: tuple[float, float]) -> list[str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from tactile_bayes.declarations import Meta, Record
+from tactile_bayes.findings import counted
 from tactile_bayes.posterior.verdict import LIKELY, chance_text
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import SOURCES
@@ -208,7 +209,7 @@ def _number(answer: SizeAnswer) -> str:
 
 
 def _pooled(one: PooledRow, tradeoff: Tradeoff) -> list[str]:
-    name = f"  {one.maps} map{'s' if one.maps > 1 else ''}"
+    name = f"  {counted(one.maps, 'map')}"
     line = f"{name:<{_label_width(tradeoff)}}{one.cpu_s:>{_COST}.3f}{_number(one.answer)}"
     if one.answer.reported is None:
         return [line]

@@ -54,7 +54,7 @@ def plan_text(plan: PlanReport) -> str:
 def needed_sentence(one: Needed) -> str:
     """Number of patients needed for a target."""
     aim = "power" if one.aim == "power" else "an interval of the tactile error of factor"
-    maps = f"{one.maps} map{'s' if one.maps > 1 else ''} of each mass"
+    maps = f"{counted(one.maps, 'map')} of each mass"
     ends = one.patients_interval
     range_words = "" if ends is None else f" (by the simulation's own error {ends[0]:.0f} to {ends[1]:.0f})"
     least = " (the least that a plan may have)" if one.patients == MIN_PATIENTS else range_words
@@ -90,11 +90,9 @@ def method_lines(report: TrialReport) -> Iterator[str]:
     for name, one in report.modalities.items():
         lines = list(_modality_lines(name, one))
         yield from lines or [f"{name}: no lines or limits: too few masses were found, or their sizes do not differ"]
-    growing = growing_line(report)
-    if growing:
+    if growing := growing_line(report):
         yield growing
-    for pair in report.paired_comparisons:
-        yield _pair_line(pair)
+    yield from map(_pair_line, report.paired_comparisons)
 
 
 def _modality_lines(name: str, report: ModalityReport) -> Iterator[str]:

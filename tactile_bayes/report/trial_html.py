@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.special import ndtr
 
+from tactile_bayes.findings import counted
 from tactile_bayes.options import Aim
 from tactile_bayes.report import trial as trial_words
 from tactile_bayes.report.figure_file import FORMATS, figure_file, finish, plain_matplotlib
@@ -144,7 +145,7 @@ def plan_figure(plan: PlanReport, path: Path, *, force: bool = False) -> None:
 def _draw_plan(axes: Axes, plan: PlanReport, aim: Aim) -> None:
     for maps, mark, colour in zip(sorted({one.maps for one in plan.designs}), cycle("os^Dv"), cycle(_COLOURS)):
         designs = [design for design in plan.designs if design.maps == maps]
-        patients, label = [one.patients for one in designs], f"{maps} map{'s' if maps > 1 else ''} of each mass"
+        patients, label = [one.patients for one in designs], f"{counted(maps, 'map')} of each mass"
         if aim == "power":
             level = np.array([one.power for one in designs])
             ends = np.array([one.power_interval for one in designs])

@@ -62,7 +62,7 @@ class Tags(HTMLParser):
 
 
 def page_of(*rows: MassEntry) -> str:
-    return campaign_html(rows, lines=["3 exams."], links={"trial.csv": "trial.csv"}, version="1")
+    return campaign_html(rows, lines=["3 exams."], links={"trial.csv": "trial.csv"})
 
 
 def told(text: str) -> tuple[Finding, ...]:

@@ -204,7 +204,7 @@ def campaign_card(made: Made) -> str:
     size = Quantity(median=15.0, mean=15.0, sd=1.0, low=13.0, high=17.0, probability=0.95, kind="eti")
     exam = ExamEntry("visit 1, exam 1", size=size, findings=made.findings)
     rows = [MassEntry("a", "1", (VisitEntry("1", (exam,), size),))]
-    return words_of(campaign_html(rows, lines=(), links={}, version="1"))
+    return words_of(campaign_html(rows, lines=(), links={}))
 
 
 def drawn(made: Made) -> Any:

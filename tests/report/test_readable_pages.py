@@ -80,7 +80,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     ]
     rows = [MassEntry("P1", "1", (VisitEntry("1", tuple(exams), size, 1),))]
     found = {path.stem: path.read_text() for path in folder.glob("*.html")}
-    return found | {"campaign": campaign_html(rows, lines=["1 mass."], links={"a": "a.csv"}, version="1")}
+    return found | {"campaign": campaign_html(rows, lines=["1 mass."], links={"a": "a.csv"})}
 
 
 @pytest.mark.long
