@@ -348,11 +348,8 @@ def _value_mapping(source: exam.MapFile) -> Any:
 
 def _decimal(value: float) -> str:
     """A number as DICOM's decimal string of at most 16 characters."""
-    for digits in range(12, 5, -1):
-        text = f"{value + 0.0:.{digits}g}"
-        if len(text) <= 16:
-            return text
-    return f"{value:.5g}"
+    texts = (f"{value + 0.0:.{digits}g}" for digits in range(12, 5, -1))
+    return next(text for text in texts if len(text) <= 16)
 
 
 # --- An estimate as a DICOM Comprehensive 3D SR by TID 1500: one measurement group per mass.

@@ -218,9 +218,7 @@ def _width_changes(one: Structure, word: str) -> str:
 def sensitivity_line(sensitivity: Sensitivity) -> str:
     """Sensitivity of the result to the prior of the widths."""
     names = {"max_size_mm": "the largest size", "sigma_x_mm": "sigma_x", "sigma_y_mm": "sigma_y"}
-    name = next((name for name in names if name in sensitivity.median), None)
-    if name is None:
-        return ""
+    name = next(name for name in names if name in sensitivity.median)
     median, ends = sensitivity.median[name], sensitivity.ends[name]
     if max(abs(median), abs(ends)) < LEAST_SHIFT_SD:
         return f"A width prior twice as wide would move {names[name]} by less than {LEAST_SHIFT_SD:g} SD."

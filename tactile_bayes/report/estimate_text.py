@@ -186,8 +186,8 @@ def estimate_text(estimate: Estimate, report: EstimateReport) -> str:
         lines += estimate_document.scene_lines(estimate.scene)
         if beside := " and ".join(str(mass.number) for mass in estimate_document.other_masses(report.masses)):
             lines.append(f"These odds are of this window alone: mass {beside} of the map is above.")
-    if estimate.sensitivity is not None and (by_prior := estimate_document.sensitivity_line(estimate.sensitivity)):
-        lines.append(by_prior)
+    if estimate.sensitivity is not None:
+        lines.append(estimate_document.sensitivity_line(estimate.sensitivity))
     lines += [*finding_lines(report.findings, "check"), *passed_over_lines(estimate)]
     lines += [f"Left out: {'; '.join(report.left_out)}."] if report.left_out else []
     lines.append(estimate_document.prior_line(from_plain(BumpPrior, report.prior), field=estimate.scene is not None))

@@ -58,7 +58,7 @@ def exam_page(exam: ShownExam) -> str:
         of_mass=f" of mass {exam.main.masses[0].number}" if len(masses) > 1 else "",
         place=_place(exam) if masses else None,
         size=size
-        and {"ruler": svg.size_ruler(_intervals(exam, size)), "sentences": list(exam_words.size_sentences(exam))},
+        and {"ruler": svg.size_ruler(_intervals(exam, size)), "sentences": list(exam_words.size_sentences(exam, size))},
         nothing=[] if size else list(exam_words.nothing_sentences(exam)),
         narrowing=width_lines(exam.report.leading.variance_share or {}, paper=True),
         masses=[exam_words.mass_row(mass) for mass in masses],

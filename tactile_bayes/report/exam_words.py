@@ -182,12 +182,9 @@ def reason_on_paper(report: EstimateReport) -> str:
     return "no lump found: what rises is long like a rib, not round like a lump" if rib else report.reason
 
 
-def size_sentences(exam: ShownExam) -> Iterator[str]:
-    """The largest size with both intervals and the smallest size."""
-    report, size = exam.report, exam.largest
-    if size is None:
-        return
-    share = share_words(size)
+def size_sentences(exam: ShownExam, size: Quantity) -> Iterator[str]:
+    """The largest size with both intervals and the smallest size; `size`: the largest."""
+    report, share = exam.report, share_words(size)
     yield f"The largest diameter is about {size.median:.1f} mm (the middle of its probable values)."
     yield f"With a probability of {share} it lies between {size.low:.1f} and {size.high:.1f} mm{_supposed(exam)}."
     alike, spread = report.max_size_mm, report.figures.get("between_map_sd")

@@ -58,10 +58,9 @@ def verdict(test: sbc.RankTest) -> str:
     if test.inside:
         return "ok"
     off = (test.mean_rank - 0.5) * np.sqrt(12.0 * test.n)
-    faults = ["too narrow"] * (test.spread > NARROW) + ["too wide"] * (test.spread < 1.0 / NARROW)
-    if abs(off) > SHIFT:
-        faults.append("too low" if off > 0 else "too high")
-    return "FAILS: " + (", ".join(faults) or "ranks are not uniform")
+    narrow, wide = test.spread > NARROW, test.spread < 1.0 / NARROW
+    faults = {"too narrow": narrow, "too wide": wide, "too low": off > SHIFT, "too high": off < -SHIFT}
+    return "FAILS: " + (", ".join(words for words, found in faults.items() if found) or "ranks are not uniform")
 
 
 def sbc_text(document: dict[str, Any]) -> str:
