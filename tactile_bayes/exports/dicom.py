@@ -364,9 +364,7 @@ def structured_report(
     """The estimate as a structured report, preliminary and unverified.
 
     A size is the median; the ends of its interval, with its probability, are properties of that measurement. A mass
-    without a size is a group with a finding and the reason, and no number.
-
-    `maps` are those that the estimate was made from, `evidence` the DICOM objects of the maps.
+    without a size is a group with a finding and the reason, and no number. `evidence`: DICOM objects of the maps.
     """
     sr, codes_of = exam.import_extra("highdicom").sr, exam.import_extra("pydicom").sr.codedict.codes
     program = sr.DeviceObserverIdentifyingAttributes(

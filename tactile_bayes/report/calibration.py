@@ -123,11 +123,18 @@ def body_calibration_text(calibration: BodyCalibration) -> str:
     fit, held = defaultdict(lambda: float("nan"), {"bodies": 0.0, "maps": 0.0} | dict(calibration.fit)), ""
     if "left_out_held_percent" in fit:
         held = f", {fit['left_out_held_percent']:.0f} % in their {100 * HELD_OUT_PROBABILITY:g} % interval"
+    others = []
+    if source := calibration.spread.other_source:
+        others.append(
+            f"bodies of another origin: SD of ln d {calibration.other_sd:.3f} more (below {fit['other_sd_most']:.3f} "
+            f"with 95 % probability), by {source}: mean absolute error {fit['other_mae_percent']:.1f} %, bias "
+            f"{fit['other_bias_percent']:+.1f} %, SD of standardised errors {fit['other_standard_sd']:.2f}"
+        )
     lines = [
         *_eq6_lines(calibration),
         f"between bodies, SD of ln d {fit['body_sd']:.3f} (median; it changes with amplitude, width and depth), "
         f"between exams of a body {fit['exam_sd']:.3f}",
-        *_other_lines(calibration),
+        *others,
         unknowns_text(calibration.unknowns),
         f"{fit['bodies']:.0f} bodies, {fit['maps']:.0f} maps; cross-validated by body: mean absolute error "
         f"{fit['left_out_mae_percent']:.1f} %, bias {fit['left_out_bias_percent']:+.1f} %{held}",
@@ -159,18 +166,6 @@ def _eq6_lines(calibration: BodyCalibration) -> list[str]:
         count = len(calibration.residual.points)
         lines.append(f"what Eq 6 leaves: a Gaussian process in ln a, ln sigma and ln of the depth, of {count} points")
     return lines
-
-
-def _other_lines(calibration: BodyCalibration) -> list[str]:
-    """Departure of bodies of another origin; none where it is unknown."""
-    fit, source = calibration.fit, calibration.spread.other_source
-    if not source:
-        return []
-    return [
-        f"bodies of another origin: SD of ln d {calibration.other_sd:.3f} more (below {fit['other_sd_most']:.3f} with "
-        f"95 % probability), by {source}: mean absolute error {fit['other_mae_percent']:.1f} %, bias "
-        f"{fit['other_bias_percent']:+.1f} %, SD of standardised errors {fit['other_standard_sd']:.2f}"
-    ]
 
 
 def constants_text(constants: Mapping[str, float]) -> str:

@@ -93,10 +93,7 @@ class MassEntry(Record, eq=False):
 
     @property
     def remarks(self) -> Iterator[tuple[str, str]]:
-        """Severity and text of each finding, once; those not of all exams name theirs.
-
-        Findings of the comparison follow those of the exams.
-        """
+        """Severity and text of each finding, once, those of the comparison last; those not of all exams name theirs."""
         every = self.exams
         known = {finding.text for exam in every for finding in exam.findings}
         compared = [] if self.growth is None else [one for one in self.growth.findings if one.text not in known]
@@ -144,10 +141,9 @@ def worst(rows: Iterable[MassEntry], most: int) -> list[MassEntry]:
 
 
 def campaign_html(rows: Sequence[MassEntry], *, lines: Sequence[str], links: Mapping[str, str]) -> str:
-    """Full page; nothing is loaded but thumbnails beside it, and the only script is its filter and its order.
+    """Full page of the rows in their order; only thumbnails beside it are loaded, and its one script filters and sorts.
 
-    `rows` are in the order in which they are shown, `lines` the summary in sentences, `links` the files beside the page
-    by the words of their links.
+    `lines`: the summary in sentences; `links`: files beside the page by the words of their links.
     """
     script = "\n" + (TEMPLATES / "campaign.js").read_text(encoding="utf-8")
     apart = any(isinstance(exam.thumbnail, str) for row in rows for exam in row.exams)

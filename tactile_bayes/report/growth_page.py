@@ -238,7 +238,14 @@ def _chart(compared: VisitComparison, report: compare.CompareReport, course: Cou
     wide = [] if another is None else [another.size_mm(i, q.probability) for i, q in enumerate(sizes)]
     top = 1.08 * max(q.high for q in (*sizes, *wide))
     scale = (height - _ABOVE_MM - _BELOW_MM) / top
-    parts = [*_size_axis(top, scale)]
+    floor, right = _up(0.0, scale), width - _RIGHT_MM
+    parts = [svg.line(f"M{_LEFT_MM} {_ABOVE_MM}V{floor:.2f}H{right}", 0.25)]
+    step = next((one for one in svg.STEPS if top / one <= 6), svg.STEPS[-1])
+    for tick in range(0, int(top) + 1, step):
+        y = _up(tick, scale)
+        parts.append(svg.line(f"M{_LEFT_MM} {y:.2f}h-1", 0.25))
+        parts.append(svg.text(_LEFT_MM - 1.6, y + 0.9, f"{tick}", anchor="end"))
+    parts.append(svg.text(_LEFT_MM + 1, _ABOVE_MM + 1, "mm", anchor="start"))
     if report.trend is not None:
         trend = straight_line(*joint.moments, times)
         on_line = np.exp(trend.level + trend.per_day * (np.array(times) - np.mean(times)))
@@ -256,18 +263,6 @@ def _chart(compared: VisitComparison, report: compare.CompareReport, course: Cou
 def _up(size_mm: float, scale: float) -> float:
     """Place of a size on the chart, from its top."""
     return _BOX_MM[1] - _BELOW_MM - scale * size_mm
-
-
-def _size_axis(top_mm: float, scale: float) -> Iterator[str]:
-    floor = _up(0.0, scale)
-    right = _BOX_MM[0] - _RIGHT_MM
-    yield svg.line(f"M{_LEFT_MM} {_ABOVE_MM}V{floor:.2f}H{right}", 0.25)
-    step = next((one for one in svg.STEPS if top_mm / one <= 6), svg.STEPS[-1])
-    for tick in range(0, int(top_mm) + 1, step):
-        y = _up(tick, scale)
-        yield svg.line(f"M{_LEFT_MM} {y:.2f}h-1", 0.25)
-        yield svg.text(_LEFT_MM - 1.6, y + 0.9, f"{tick}", anchor="end")
-    yield svg.text(_LEFT_MM + 1, _ABOVE_MM + 1, "mm", anchor="start")
 
 
 def _mark(

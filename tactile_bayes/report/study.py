@@ -133,21 +133,17 @@ def study_figures(
     with _panels(paths[2], _caption("Figure 7", settings, seat), force=force) as panels:
         _draw_figure_7(*panels, of_seat, settings, seat)
     figure_8(of_seat, paths[3], force=force)
-    if isinstance(settings, StudySettings):
-        _four_lumps(settings, paths[4], seat=seat, force=force)
+    if isinstance(settings, StudySettings):  # both models for the phantoms of section 2.3: its curves "for four lumps"
+        foot = _caption("Dotted: Eq 3", settings, seat)
+        with figure_file(paths[4], size_in=(10.0, 7.6), foot=foot, force=force) as four:
+            for axes, (d, h) in zip(four.subplots(2, 2).ravel(), PHANTOMS.values(), strict=True):
+                frames = scene_frames(TableScene("", d, h, seat), settings)
+                theirs, ours = (frame.as_taxels(HEAD_PITCH_MM) for frame in frames)
+                share = 100 * mean_squared_difference(ours.pressure_kpa, theirs.pressure_kpa)
+                _draw_frames(axes, theirs, ours)
+                title = f"d {d:g} mm, h/d {h:g}; MSD of all frames {share:.1f} %"
+                finish(axes, title, _ON_HEAD, "pressure (kPa)", headroom=0.15)
     return lookalikes
-
-
-def _four_lumps(settings: StudySettings, path: Path, *, seat: float, force: bool) -> None:
-    """Both models frame by frame for the phantoms of section 2.3: its curves "for four lumps"."""
-    with figure_file(path, size_in=(10.0, 7.6), foot=_caption("Dotted: Eq 3", settings, seat), force=force) as four:
-        for axes, (d, h) in zip(four.subplots(2, 2).ravel(), PHANTOMS.values(), strict=True):
-            frames = scene_frames(TableScene("", d, h, seat), settings)
-            theirs, ours = (frame.as_taxels(HEAD_PITCH_MM) for frame in frames)
-            share = 100 * mean_squared_difference(ours.pressure_kpa, theirs.pressure_kpa)
-            _draw_frames(axes, theirs, ours)
-            title = f"d {d:g} mm, h/d {h:g}; MSD of all frames {share:.1f} %"
-            finish(axes, title, _ON_HEAD, "pressure (kPa)", headroom=0.15)
 
 
 def lookalikes_text(lookalikes: Lookalikes | None) -> str:
@@ -358,10 +354,7 @@ def _draw_printed_eq6(left: Axes, right: Axes, hard: Sequence[StudyRow], axis: s
 def eq6_figure(
     calibration: SizeCalibration, lumps: SizeTable, path: Path, *, title: str = "", force: bool = False
 ) -> None:
-    """Draw width change against amplitude, diameter against corrected width, and the plane of amplitude and width.
-
-    Rows of `lumps` without a positive amplitude take no part.
-    """
+    """Draw width change against amplitude, diameter against corrected width, and the plane of both, of rising lumps."""
     rising = lumps.amplitude > 0
     d_mm, amplitude = lumps.d_mm[rising], lumps.amplitude[rising]
     axes = [(calibration.x, lumps.sigma_x_mm, lumps.width_change_x)]

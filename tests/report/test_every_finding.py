@@ -271,8 +271,8 @@ PRINTERS = {
     # behind the outputs above
     "actions/estimate", "api/maps", "api/sized", "exports/dicom",
     "exports/fhir", "exports/run", "exports/redcap", "files/posterior_nc",
-    "report/campaign_page", "report/growth_page", "report/compare", "report/estimate_document",
-    "report/estimate_figures", "report/estimate_text", "report/exam_page", "report/map",
+    "report/growth_page", "report/compare", "report/estimate_document",
+    "report/estimate_figures", "report/estimate_text", "report/map",
     "report/pages", "report/pooled",
     # of draws, not of a size; names of files that were written
     "actions/pages", "actions/show", "actions/campaign", "actions/live_view", "actions/record",
