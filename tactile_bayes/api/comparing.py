@@ -9,15 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import PathLike, TextResult, door, list_of, path_of, plain, required_path, takes
+from tactile_bayes.api import pooled
+from tactile_bayes.api.arguments import PathLike, TextResult, door, list_of, output_path, path_of, plain, takes
 from tactile_bayes.api.estimates import estimate_each, settings_of
-from tactile_bayes.api.pooled import (
-    common_calibration,
-    patient_place,
-    reestimate_at_common_mass,
-    refuse_repeated_maps,
-    without_calibration,
-)
 from tactile_bayes.api.settings import Settings, days_from_first, refuse_checkpoint
 from tactile_bayes.api.sized import Answer, SizeEstimate, size_priors
 from tactile_bayes.declarations import as_dict, replace
@@ -150,7 +144,7 @@ class Comparison(TextResult, eq=False):
         self, path: PathLike, *, pdf: PathLike | None = None, title: str = "", name: str = "", force: bool = False
     ) -> None:
         """Write one page of the mass over time as HTML, as ``compare -o`` does, and with `pdf` also print it."""
-        files = PageFiles(required_path(path, "the path"), path_of(pdf), force)
+        files = PageFiles(output_path(path, "HTML"), path_of(pdf), force)
         files.check()
         PageLabels(title, name)
         files.write(self.page_text(title=title, name=name))
@@ -203,7 +197,7 @@ def compare_answers(
     answers = list(chain.from_iterable(visits))
     all_names = list(chain.from_iterable(names))
     inputs = {f"visit_{v}_map_{i}": path for v, maps in enumerate(files, 1) for i, path in enumerate(maps, 1)}
-    calibration, named, digests = common_calibration(answers, settings, names=all_names, inputs=inputs)
+    calibration, named, digests = pooled.common_calibration(answers, settings, names=all_names, inputs=inputs)
     for index, earlier in repeated_scans([_scans([one]) for one in answers]).items():  # they are no two exams
         raise UsageError(f"{all_names[index]} and {all_names[earlier]} are of one scan; give one map of each scan")
     by_number = dict(zip(numbers or map(str, range(1, len(visits) + 1)), visits, strict=True))
@@ -247,7 +241,7 @@ def compare_estimates(
         raise UsageError(
             f"in the scans {listed}; give visits in order of time, or their --dates if codes do not tell it"
         )
-    estimates = iter(reestimate_at_common_mass([one for visit in visits for one in visit]))
+    estimates = iter(pooled.reestimate_at_common_mass([one for visit in visits for one in visit]))
     by_visit = tuple(tuple(next(estimates) for _ in visit) for visit in visits)
     answers = [[one.answer for one in visit] for visit in by_visit]
     return replace(compare_answers(answers, settings, comparing, names=names, files=files), visits=by_visit)
@@ -265,10 +259,11 @@ def _compared(
         return VisitComparison("not_one_mass", "; ".join(contradicted), advice)
     if missing:
         return VisitComparison("no_estimate", "; ".join(missing), "scan the mass again, or leave that visit out")
-    if why := without_calibration([one.report for maps in visits.values() for one in maps]):
+    if why := pooled.without_calibration([one.report for maps in visits.values() for one in maps]):
         return VisitComparison("no_estimate", why, "compare maps that have a size each")
     map_places = [
-        [place for answer in maps if (place := patient_place(answer.report)) is not None] for maps in shown.values()
+        [place for answer in maps if (place := pooled.patient_place(answer.report)) is not None]
+        for maps in shown.values()
     ]
     places = [PatientPlace.mean_of(of_visit) for of_visit in map_places]
     shifts = tuple(
@@ -427,7 +422,7 @@ def compare(
         estimate_each(one if isinstance(one, Sequence) and not isinstance(one, str) else [one], settings)
         for one in (first, second, *more)
     ]
-    refuse_repeated_maps(list(chain.from_iterable(visits)), way_out="give each map once, at its own visit")
+    pooled.refuse_repeated_maps(list(chain.from_iterable(visits)), way_out="give each map once, at its own visit")
     names = [[one.name or f"visit {v} map {i}" for i, one in enumerate(visit, 1)] for v, visit in enumerate(visits, 1)]
     comparison = compare_estimates(visits, own_settings, comparing, names=names)
     return replace(comparison, dates=tuple(map(str, visit_dates or ())))

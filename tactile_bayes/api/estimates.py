@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from tactile_bayes.api.arguments import PathLike, list_of, path_of, plain, required_path, takes
+from tactile_bayes.api.arguments import PathLike, list_of, output_path, path_of, plain, takes
 from tactile_bayes.api.estimating import Notice, estimate_file, estimate_one
 from tactile_bayes.api.maps import Map, map_of
 from tactile_bayes.api.pooled import PooledSize, pool_estimates, refuse_repeated_maps
@@ -266,7 +266,7 @@ def exam_report(
     BadDataError
         When a file is damaged or of another kind, or the maps are of different exams.
     """
-    page, labels = PageFiles(required_path(path, "the path"), path_of(pdf), force), PageLabels(title, name, day)
+    page, labels = PageFiles(output_path(path, "HTML"), path_of(pdf), force), PageLabels(title, name, day)
     page.check()
     sources = as_list(files)
     if not sources:

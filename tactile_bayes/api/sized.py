@@ -11,15 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.api.arguments import (
-    PathLike,
-    dataframe,
-    door,
-    options_as_keywords,
-    output_path,
-    path_of,
-    required_path,
-)
+from tactile_bayes.api.arguments import PathLike, dataframe, door, options_as_keywords, output_path, path_of
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import EXIT_DONE, EXIT_NO_ESTIMATE, BadDataError, UsageError
@@ -274,7 +266,7 @@ class SizedExam(SizeResult, eq=False, dict=True, kw_only=True):
         """Write one page of the exam as HTML, repeat maps on it, and with `pdf` also print it; see `exam_report`."""
         from tactile_bayes.report.exam_page import exam_page  # a plain estimate has no page
 
-        page, labels = PageFiles(required_path(path, "the path"), path_of(pdf), force), PageLabels(title, name, day)
+        page, labels = PageFiles(output_path(path, "HTML"), path_of(pdf), force), PageLabels(title, name, day)
         page.check()
         page.write(exam_page(replace(self.exam(), labels=labels)))
 
