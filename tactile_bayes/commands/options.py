@@ -186,10 +186,11 @@ class FiniteRange(click.FloatRange):
             if math.isfinite(number):
                 return number
         text, share = str(value), ""
-        with contextlib.suppress(ValueError):
-            part = float(text.removesuffix("%").strip()) / 100
-            if self.max is not None and self.max <= 1 and self.min is not None and self.min <= part <= self.max:
-                share = f"; for {text.removesuffix('%').strip()} % give {part:g}"
+        with contextlib.suppress(ValueError, click.BadParameter):
+            percent = text.removesuffix("%").strip()
+            part = super().convert(float(percent) / 100, param, ctx)
+            if (percent != text or part > 0.01) and self.max is not None and self.max <= 1:
+                share = f"; for {percent} % give {part:g}"
         words = number_words(self.min, self.max, ("min", "max") if self.min_open or self.max_open else ())
         return self.fail(f"{text!r} is not {words}{share}", param, ctx)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, check_number
-from tactile_bayes.findings import Finding, by_severity, finding
+from tactile_bayes.findings import Finding, by_severity, counted, finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, Plane, apply, inverse, patient_from_plane
 from tactile_bayes.mapping import accumulate, latency, select
 from tactile_bayes.mapping.arrangement import check_arrangement
@@ -326,7 +326,17 @@ def _select(scans: list[Scan], settings: MapOptions, late_ms: float, gap_ms: flo
         select.select_frames(scan, pressure_window_kpa=window, latency_ms=late_ms, max_pose_gap_ms=gap_ms)
         for scan in scans
     ]
-    select.refuse_without_frames(selections, pressure_window_kpa=window)
+    try:
+        select.refuse_without_frames(selections, pressure_window_kpa=window)
+    except BadDataError as error:
+        count = sum(map(len, (scan.frames for scan in scans)))
+        if settings.every > 1 and count < select.LEAST_FRAMES:
+            what = f"one frame of every {settings.every} leaves {counted(count, 'frame')}, none of which can be used"
+            raise BadDataError(what, way_out="give a smaller --every") from None
+        if late_ms and not any(part.poses.known.any() for part in selections):
+            what = f"{error.what} less a latency of {late_ms:g} ms"
+            raise BadDataError(what, way_out=f"give another --latency-ms, or {error.way_out}") from None
+        raise
     return selections
 
 

@@ -141,6 +141,9 @@ def test_refusals_name_the_way_out() -> None:
     exact = plan("--precision", 2, "--tactile-bias", 0, "--mass-sd", 0, "--map-sd", 0).exception
     assert "do not scatter, so their interval has no width; change the errors assumed" in str(exact)
     assert "for 90 % give 0.9" in plan("--power", "90%").output
+    assert "for 4 % give 0.04" in plan("--other-miss", "4").output
+    for no_percent in ("-0.1", "1.5%%", "nan", "400"):
+        assert "% give" not in plan("--other-miss", no_percent).output
 
 
 def test_python_plans_as_the_command_does(tmp_path: Path) -> None:

@@ -343,6 +343,18 @@ def test_scans_without_a_map_are_refused_in_one_line(make, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"every": 100, "pressure_window_kpa": (50.0, 60.0)}, "every 100 leaves 2 frames, .*; give a smaller --every"),
+        ({"latency_ms": -9000.0}, "less a latency of -9000 ms; give another --latency-ms, or check that both run on"),
+    ],
+)
+def test_an_option_that_leaves_no_frame_is_named(options, message):
+    with pytest.raises(BadDataError, match=message):
+        build_map(stroke_scan(), **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
         ({"cell_mm": 0.0}, "cell_mm is 0.0; give a number from 0.01 to 50"),
         ({"cell_mm": float("nan")}, "cell_mm is nan"),
         ({"cell_mm": "2"}, "cell_mm is '2'; give a number"),
