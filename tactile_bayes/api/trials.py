@@ -147,6 +147,11 @@ def load_trial(trial: Path | Sheet, excision: Path | Sheet, columns: Path | None
         from tactile_bayes.files.estimate_json import fill_from_posteriors  # h5py and the estimates' declarations
 
         columns_filled, posteriors = fill_from_posteriors(table)
+    extents = zip(sizes.columns["ex_vivo_mm"], sizes.columns["ex_vivo_second_mm"], strict=True)
+    for row, (largest_mm, across_mm) in enumerate(extents):
+        if across_mm is not None and across_mm > largest_mm:
+            problem = f"is {across_mm:g}, above ex_vivo_mm {largest_mm:g}, which is the largest extent"
+            raise sizes.error(row, "ex_vivo_second_mm", problem, way_out="exchange or correct them")
     keys = list(zip(sizes.columns["patient"], sizes.columns["mass"], strict=True))
     readings = readings_from_columns(columns_filled, fault=table.error)
     excised_on = dict(zip(keys, sizes.columns["date"], strict=True))

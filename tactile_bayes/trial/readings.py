@@ -220,8 +220,11 @@ UNITS = {"cm": 10.0, "inches": 25.4, "m": 1000.0}
 NEAR = 1.6  #: A median ratio this near to a unit's factor is doubted: no modality is wrong sixfold in the median.
 
 
+LEAST_COPIED = 5  #: Fewest masses whose sizes are doubted where all are those after excision.
+
+
 def unit_doubts(sizes: Mapping[str, ModalitySizes], ex_vivo_mm: FloatArray) -> list[str]:
-    """One sentence for each column that seems to be in another unit than mm; empty if none does.
+    """One sentence for each column that seems to be in another unit than mm, or a copy; empty if none does.
 
     `ex_vivo_mm` is of all excised masses.
     """
@@ -243,6 +246,8 @@ def unit_doubts(sizes: Mapping[str, ModalitySizes], ex_vivo_mm: FloatArray) -> l
                 some = f"{near.sum()} of {len(near)} {name} sizes about {words.format(factor)} the ex-vivo size"
                 of_some.append(f"{some}: is the {wrong} size there in {unit}?")
         doubts += in_median or of_some
+        if len(ratios) >= LEAST_COPIED and np.all(ratios == 1):
+            doubts.append(f"all {len(ratios)} {name} sizes are the ex-vivo sizes: were they copied from there?")
     return doubts
 
 

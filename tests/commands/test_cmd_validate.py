@@ -160,6 +160,9 @@ def test_faults_between_tables_name_file_line_and_way_out(tmp_path: Path) -> Non
     assert str(error).startswith(f"{trial}: line 3, column patient + mass: 'P9' + '1' has no size in {ex}")
     trial, ex = small(tmp_path, "P1,1,cbe,1,,detected\n")
     assert "line 2, column size_mm: is blank while status is detected" in str(refusal(trial, "--excision", ex))
+    ex.write_text("patient,mass,ex_vivo_mm,ex_vivo_second_mm\nP1,1,10,10\nP2,1,12,20\n")
+    exchanged = "line 3, column ex_vivo_second_mm: is 20, above ex_vivo_mm 12, which is the largest extent; exchange"
+    assert exchanged in str(refusal(trial, "--excision", ex))
 
 
 def test_an_existing_output_is_kept_without_force(tmp_path: Path) -> None:

@@ -78,9 +78,15 @@ def sizes(ratio: float, n: int = 12) -> ModalitySizes:
 
 @pytest.mark.parametrize(
     ("ratio", "words"),
-    [(0.09, "cbe sizes in cm"), (11.0, "ex-vivo sizes in cm"), (0.04, "cbe sizes in inches"), (24.0, "in inches")],
+    [
+        (0.09, "cbe sizes in cm"),
+        (11.0, "ex-vivo sizes in cm"),
+        (0.04, "cbe sizes in inches"),
+        (24.0, "in inches"),
+        (1.0, "all 12 cbe sizes are the ex-vivo sizes: were they copied from there?"),
+    ],
 )
-def test_a_median_ratio_near_a_unit_is_doubted(ratio: float, words: str) -> None:
+def test_a_median_ratio_near_a_unit_and_a_copied_column_are_doubted(ratio: float, words: str) -> None:
     one = sizes(ratio)
     assert any(words in doubt for doubt in unit_doubts({"cbe": one}, one.ex_vivo_mm))
 
@@ -93,7 +99,7 @@ def test_some_sizes_in_another_unit_are_doubted() -> None:
     assert doubts == ["2 of 12 cbe sizes about 1/10 of the ex-vivo size: is the cbe size there in cm?"]
 
 
-@pytest.mark.parametrize("ratio", [0.4, 1.0, 3.0])
+@pytest.mark.parametrize("ratio", [0.4, 1.01, 3.0])
 def test_other_ratios_are_not_doubted(ratio: float) -> None:
     one = sizes(ratio)
     assert unit_doubts({"cbe": one}, one.ex_vivo_mm) == []
