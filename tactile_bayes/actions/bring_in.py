@@ -25,7 +25,7 @@ from tactile_bayes.findings import LEADS, finding_lines
 from tactile_bayes.mapping.arrangement import check_scan, corrected
 from tactile_bayes.mapping.plausibility import MOST_SPAN_MM
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.scan import describe_scan
+from tactile_bayes.report.map import describe_scan
 from tactile_bayes.scans import Scan
 from tactile_bayes.shell import progress_bar
 

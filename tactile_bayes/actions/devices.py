@@ -37,7 +37,7 @@ from tactile_bayes.hardware.reading import ask_for_priority
 from tactile_bayes.hardware.readings import Follower, PoseReading, ToolReading
 from tactile_bayes.hardware.serial_trackers import TRACKERS, open_tracker, probe
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.scan import describe_scan
+from tactile_bayes.report.map import describe_scan
 from tactile_bayes.scans import Scan
 from tactile_bayes.shell import own_process
 

@@ -23,7 +23,7 @@ from tactile_bayes.forward.scene import Head, Scene
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.options import PopulationOptions
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.scan import describe_scan
+from tactile_bayes.report.map import describe_scan
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.studies.population import BodiesFile, ExamRow, Population
 

@@ -91,8 +91,7 @@ class Comparison(TextResult, eq=False):
         change = self._change
         if change is None:
             return None
-        percent = 100.0 * np.expm1(change.log_ratio)
-        return Draws(np.atleast_2d(percent), "%", self.probability, change.replicates)
+        return Draws(np.atleast_2d(100.0 * np.expm1(change.log_ratio)), "%", self.probability, change.replicates)
 
     @property
     def sizes_mm(self) -> tuple[Draws, ...]:

@@ -33,8 +33,7 @@ from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
 from tactile_bayes.size.pooling import Calibration
 
 Notice = Callable[[str], None]
-WhyNone = tuple[str, str]
-"""Reason for widths without a size where no calibration was named, and a remedy."""
+WhyNone = tuple[str, str]  #: Reason for widths without a size where no calibration was named, and a remedy.
 
 
 _LEAST_SQUARES: WhyNone = (
@@ -133,8 +132,7 @@ def estimate_one(
         on_paper = "a size needs a calibration that fits this map"
         estimate = replace(estimate, reason=reason, advice=advice, on_paper=on_paper)
     if estimate.code in NO_LUMP and tactile_map.covered.any():
-        fat_mm = None if calibration is None else calibration.fat_mm
-        smallest = smallest_lumps(tactile_map, fat_mm=fat_mm)
+        smallest = smallest_lumps(tactile_map, fat_mm=None if calibration is None else calibration.fat_mm)
         hidden = shows_no_lump(smallest)
         fields = {"smallest": smallest} if hidden is None else as_dict(hidden) | {"weighed": None}
         estimate = replace(estimate, **fields)
@@ -146,8 +144,7 @@ def estimate_one(
         sigma_mm = mean_width_mm(*posterior.medians[1:])
         if isinstance(applied, BodyCalibration) and applied.site is not None:
             by += f" ({site_words(applied.site, math.log(sigma_mm))})"
-        words = calibration_line(by, applied, sigma_mm=sigma_mm)
-        diagnostics = {**estimate.diagnostics, "size_calibration": words}
+        diagnostics = {**estimate.diagnostics, "size_calibration": calibration_line(by, applied, sigma_mm=sigma_mm)}
         if settings.repeatability is not None:
             diagnostics["repeatability"] = settings.repeatability.words()
         if "convergence" in diagnostics:  # the longest comes last
@@ -180,8 +177,7 @@ def _with_place(
         for number, one in enumerate(estimate.masses, start=1)
         if (size := one.estimate.size) is not None
     ]
-    touching = estimate_document.touching_findings(sized)
-    return replace(estimate, findings=by_severity((*side, *others, *touching)))
+    return replace(estimate, findings=by_severity((*side, *others, *estimate_document.touching_findings(sized))))
 
 
 def named_calibration(settings: Settings, normalise: str) -> tuple[Path | None, Calibration | None]:

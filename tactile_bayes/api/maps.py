@@ -116,8 +116,7 @@ class Map(Record, eq=False):
         UsageError
             When the file exists and `force` is false.
         """
-        made = {"called_from": "Python", **as_dict(self.tactile_map.recipe)}
-        provenance = Provenance("map", made, scans=self.scans)
+        provenance = Provenance("map", {"called_from": "Python", **as_dict(self.tactile_map.recipe)}, scans=self.scans)
         write_map(output_path(path, "netCDF"), self.tactile_map, provenance=provenance, force=force)
 
     def __repr__(self) -> str:

@@ -235,8 +235,7 @@ def rows_of_one_way(rows: Table, normalise: str | None) -> tuple[Normalise, dict
     chosen = normalise or present[0]
     if normalise is None and len(present) > 1:
         what = f"its maps were normalised in several ways ({', '.join(present)})"
-        way_out = f"learn from the rows of one way: --normalise {chosen}"
-        raise BadDataError(what, way_out=way_out, path=str(rows.path))
+        raise BadDataError(what, way_out=f"learn from the rows of one way: --normalise {chosen}", path=str(rows.path))
     if chosen not in present:
         what = f"none of its maps were made with --normalise {chosen}"
         raise BadDataError(what, way_out=f"give --normalise {present[0]}", path=str(rows.path))

@@ -78,8 +78,7 @@ class TrialResult(TextResult, eq=False):
         self, path: Path, *, growth: Sequence[Growth] = (), pdf: Path | None = None, force: bool = False
     ) -> None:
         """Write the page of ``validate --html`` and ``--pdf``, with the growth of masses that have several visits."""
-        page = trial_html(self.report, self.trial, text=self.text, growth=growth)
-        PageFiles(path, pdf, force).write(page)
+        PageFiles(path, pdf, force).write(trial_html(self.report, self.trial, text=self.text, growth=growth))
 
     def to_dataframe(self) -> pandas.DataFrame:
         """One row for each modality and figure: value, and the ends of its interval (NaN where it has none)."""
@@ -336,8 +335,7 @@ def planned(values: Mapping[str, Any], pilot: Pilot | None, progress: Progress) 
     aims = options.targets
     if aims and "patients" in values:
         raise UsageError("--power and --precision find the number of patients; leave out --patients")
-    by_default = as_dict(PlanErrors(**stated))
-    errors = by_default if pilot is None else pilot.errors(options.against, stated)
+    errors = as_dict(PlanErrors(**stated)) if pilot is None else pilot.errors(options.against, stated)
     files = {} if pilot is None else pilot.trial.files
     inputs = hash_inputs(pilot=files.get("trial"), excision=files.get("excision"))
     unstated: planning.ErrorSource = "default" if pilot is None else "pilot"

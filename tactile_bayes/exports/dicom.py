@@ -189,7 +189,6 @@ def map_picture(source: exam.MapFile, estimate: exam.EstimateFile | None) -> NDA
 def secondary_capture(source: exam.MapFile, estimate: exam.EstimateFile | None, *, study: Study, number: int) -> Any:
     """The figure as a Secondary Capture in red, green and blue; `number` is that of the instance in its series."""
     highdicom = exam.import_extra("highdicom")
-    digest = "" if estimate is None else estimate.digest
     dataset = highdicom.sc.SCImage(
         pixel_array=map_picture(source, estimate),
         photometric_interpretation="RGB",
@@ -199,7 +198,7 @@ def secondary_capture(source: exam.MapFile, estimate: exam.EstimateFile | None, 
         study_instance_uid=study.study_uid,
         series_instance_uid=study.uid("series of pictures"),
         series_number=2,
-        sop_instance_uid=study.uid("picture", source.digest, digest),
+        sop_instance_uid=study.uid("picture", source.digest, "" if estimate is None else estimate.digest),
         instance_number=number,
         manufacturer=MANUFACTURER,
         transfer_syntax_uid=EXPLICIT_LITTLE_ENDIAN,
@@ -517,6 +516,5 @@ def dicom_files(
     for suffix, number, one in numbered:
         objects[f"picture{suffix}.dcm"] = secondary_capture(one, estimate, study=study, number=number)
     if estimate is not None:
-        evidence = list(objects.values())
-        objects["report.dcm"] = structured_report(estimate, maps, evidence=evidence, study=study)
+        objects["report.dcm"] = structured_report(estimate, maps, evidence=list(objects.values()), study=study)
     return {name: dicom_bytes(dataset) for name, dataset in objects.items()}

@@ -243,11 +243,10 @@ def parse_estimate(document: object, path: Path) -> EstimateFile:
     if not isinstance(document, dict) or not isinstance(schema, str) or schema not in REPORTS:
         raise BadDataError(f"is {reading.schema_kind(schema) or 'no estimate'}", way_out=_WAY_OUT, path=str(path))
     report = checked_report(document, REPORTS[schema], path=path)
-    text = json.dumps(document, sort_keys=True)
     return EstimateFile(
         path,
         schema.split("/")[1],
-        hashlib.sha256(text.encode()).hexdigest(),
+        hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest(),
         report,
         masses_of(report),
         tuple(one.sha256 for one in report.origin.inputs if one.role.startswith("map")),

@@ -178,8 +178,7 @@ def export(
         if estimate.maps and (other := of_maps.setdefault(frozenset(estimate.maps), estimate.path)) != estimate.path:
             raise UsageError(f"{other} and {estimate.path} are estimates of one exam; give one of them")
     exam.check_pairs(maps, estimates)
-    dropped = {name: "" for name in identity.given if name not in IDENTITY_FIELDS[to]}
-    identity = replace(identity, **dropped)
+    identity = replace(identity, **{name: "" for name in identity.given if name not in IDENTITY_FIELDS[to]})
     if to == "nrrd":
         if id_from_scan:
             raise UsageError("nrrd files hold no patient; leave out --patient-id-from-scan")

@@ -353,8 +353,7 @@ class EstimateReport(Report, kw_only=True):
     prior_sensitivity: PriorSensitivity | None = None
     diagnostics: dict[str, Any]
     candidates: tuple[PassedOver, ...]
-    other_rises: tuple[OtherRise, ...] = ()
-    """The masses besides the reported one, as rises; mm on the map."""
+    other_rises: tuple[OtherRise, ...] = ()  #: The masses besides the reported one, as rises; mm on the map.
     masses: tuple[MassReport, ...]
     """All masses of the map, the surest first. The top-level fields are those of the reported one: the surest, or that
     of the place that was given.

@@ -141,8 +141,7 @@ class Follower:
 
     def __init__(self, tool: str | None = None, reference: str | None = None, *, inverse: bool = False) -> None:
         self.tool, self.reference = tool, reference
-        self.other_tools: Counter[str] = Counter()
-        """Number of readings of tools that are not followed."""
+        self.other_tools: Counter[str] = Counter()  #: Number of readings of tools that are not followed.
         self._inverse = inverse
         self._waiting: tuple[PoseReading, int] | None = None  # a pose of the tool, with its arrival
         self._latest: tuple[PoseReading, int] | None = None  # the reference's latest pose, with its arrival

@@ -88,8 +88,7 @@ SMOOTHING_MM = 3.0
 RIM_MM, RIM_SHARE = 6.0, 0.6
 """A place is at the map's rim where less than this share of the disc of this radius about it is covered."""
 FEW_READINGS = 0.1  #: A cell with a smaller share of the median count is left out of the fit.
-CACHED_MAPS = 4
-"""Maps whose results are cached: the map, its levelled one, and both without the measured lump."""
+CACHED_MAPS = 4  #: Maps whose results are cached: the map, its levelled one, and both without the measured lump.
 
 
 class PoseNoise(Record):
@@ -292,8 +291,7 @@ def _gaussian_smoothed(array: FloatArray, width_cells: float) -> FloatArray:
 
 BLOCK, LEAST_BLOCK = 64, 4
 """Parameter vectors predicted at a time, so that intermediate arrays stay in a processor's cache; and the least."""
-BLOCK_VALUES = 512 * 1024
-"""Cells times vectors in a block: for more than 8192 cells a block has fewer vectors."""
+BLOCK_VALUES = 512 * 1024  #: Cells times vectors in a block: for more than 8192 cells a block has fewer vectors.
 
 
 def block_size(cells: int) -> int:

@@ -407,8 +407,7 @@ def _overlap_roots(axis_mm: FloatArray, side_mm: float) -> FloatArray:
 
 # --- Estimation under correlated errors: detection, scene and draws from a least-squares fit.
 
-LEAST_VARIANCE = 1e-12
-"""Directions with a smaller variance of tracker position error, over the largest, are left out."""
+LEAST_VARIANCE = 1e-12  #: Directions with a smaller variance of tracker position error, over the largest, are left out.
 
 
 class CorrelatedAssessment(Record, eq=False):

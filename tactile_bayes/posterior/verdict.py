@@ -117,8 +117,7 @@ in 800 simulated exams were enclosed so."""
 LEAST_SEEN = 0.25  #: Least share of a sector's breadth that must be covered for it to reach as far.
 LEAST_READ = 0.25
 """Least share of the map's median count in the cells of a bump: 134 lumps had 1.8 and more, a spot of noise 0.16."""
-COARSEST_MM = 4.0
-"""Largest cells that can show a lump of 10 mm close to the skin, whose sigma is 2 mm."""
+COARSEST_MM = 4.0  #: Largest cells that can show a lump of 10 mm close to the skin, whose sigma is 2 mm.
 HOPELESS = 2.0
 """Factor beyond a limit of the widths at the mode that decides without draws: chains for a stripe took 30 s."""
 MOST_PRIOR_SHARE = 0.5
@@ -354,8 +353,7 @@ DEPTHS_IN_FAT: Final = (0.5, 0.75, 1.0)
 """Depths of the lump's centre below the skin, over that of the fat: in it, and on its lower edge. In the gland a lump
 that is no stiffer does not show."""
 SIZES_MM: Final = np.arange(4.0, 30.5, 0.5)
-LEAST_DEPTH_RATIO: Final = 0.56
-"""Least simulated depth of a ball's centre, over its diameter."""
+LEAST_DEPTH_RATIO: Final = 0.56  #: Least simulated depth of a ball's centre, over its diameter.
 USUAL_FAT_MM: Final = 15.0  #: Depth of fat where it is unknown.
 LOG_AMPLITUDE: Final = (-2.61, 3.393, -3.27, 1.003, 0.251, -0.049, -0.983)
 LOG_SIGMA: Final = (1.865, -0.168, 0.988, -0.155)

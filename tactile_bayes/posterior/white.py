@@ -101,8 +101,7 @@ class Target(Record, eq=False):
 # --- Least-squares fit of a bump: candidates, window, weights, error model.
 
 START_WIDTHS_MM = (5.0, 2.0, 10.0)
-CLEAR_SHARE = 0.8
-"""Share of a window's sum of squares that a bump explains for no other minimum to be sought."""
+CLEAR_SHARE = 0.8  #: Share of a window's sum of squares that a bump explains for no other minimum to be sought.
 LEAST_COVERED_SHARE = 0.6
 LEAST_WIDTH_IN_CELLS = 0.5
 WIDEST_IN_RADII = 0.75

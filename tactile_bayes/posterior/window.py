@@ -156,8 +156,7 @@ class Window:
         self._along, self._frequency_y = cosine_profiles(self.y_mm, cosines=cosines)
         by_row = self.weight.T[:, :, None] * self._across[:, None, :]
         self._weighted_across = by_row.reshape(len(self.x_mm), -1)
-        self.middle = float(np.mean(cells.x_mm)), float(np.mean(cells.y_mm))
-        """Mean of the cells' centres, in mm."""
+        self.middle = float(np.mean(cells.x_mm)), float(np.mean(cells.y_mm))  #: Mean of the cells' centres, in mm.
         self._fields: dict[float, Whitening] = {}
         self._gram: FloatArray | None = None
 
@@ -363,8 +362,7 @@ class Inner(Record, eq=False):
 
     plain: FloatArray  #: (m, h, c + 1) array: With the fixed columns and the data.
     square: FloatArray  #: (m, h) array: With themselves.
-    low: FloatArray
-    """(m, k) array: Projections on the field's directions; empty where no `product` is needed."""
+    low: FloatArray  #: (m, k) array: Projections on the field's directions; empty where no `product` is needed.
 
     @classmethod
     def of(cls, projected: Projected, columns: FieldColumns) -> Inner:

@@ -29,8 +29,7 @@ def site_words(site: SiteShift, log_width: float | None = None) -> str:
 
     `log_width`: ln of the mean width in mm of the map in question; that of the phantoms where left out.
     """
-    p = site.phantoms_log_width if log_width is None else log_width
-    middle, low, high = site.percent(p)
+    middle, low, high = site.percent(site.phantoms_log_width if log_width is None else log_width)
     by = f"{site.phantoms} phantoms of this site"
     return f"{site.base}, corrected by {by}: {round(middle):+d} % ({100 * INTERVAL:g} %: {round(low)} to {round(high)})"
 

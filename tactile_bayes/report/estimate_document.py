@@ -186,8 +186,7 @@ def scene_lines(choice: SceneChoice) -> list[str]:
 
 def scene_line(choice: SceneChoice) -> str:
     """Scene of the fit window in one line: structures supported, and those not needed."""
-    named = _named_structures(choice)
-    names = [SHAPE_WORDS[choice.supported], *(STRUCTURE_WORDS[one.name] for one in named)]
+    names = [SHAPE_WORDS[choice.supported], *(STRUCTURE_WORDS[one.name] for one in _named_structures(choice))]
     near = f" within {choice.fit.target.problem.radius_mm:g} mm"
     out = [STRUCTURE_WORDS[one.name].replace(" in this window", near) for one in choice.structures if not one.used]
     return f"The map supports {' and '.join(names)}" + (f"; not needed: {', '.join(out)}." if out else ".")

@@ -92,5 +92,4 @@ def _intervals(exam: ShownExam, size: Quantity) -> list[tuple[str, Quantity]]:
     if another is None or narrow_size is None:
         return [("this exam" if exam.pooled is None else "these exams", size)]
     narrow = "exams alike" if alike is None else f"if exams differ by {spread_percent(alike)}"
-    patients = f"as exams of patients differ, {100 * another.between_map_sd:.0f} %"
-    return [(patients, size), (narrow, narrow_size)]
+    return [(f"as exams of patients differ, {100 * another.between_map_sd:.0f} %", size), (narrow, narrow_size)]

@@ -218,8 +218,7 @@ def _supposed(exam: ShownExam) -> str:
     words = f"; exams of a lump are taken to differ by {spread_percent(spread)}"
     if at_site:
         return f"{words}, by these maps and this site's other exams"
-    stated = report.origin.settings.get("between_map_sd")
-    if stated is not None:
+    if report.origin.settings.get("between_map_sd") is not None:
         return f"{words}, as was stated"
     if exam.pooled is not None:
         return f"{words}, learned from these maps"

@@ -113,8 +113,7 @@ def _values_at(tactile_map: TactileMap, x_mm: FloatArray, y_mm: FloatArray) -> F
     ny, nx = tactile_map.mean.shape
     inside = (column >= 0) & (column < nx) & (row >= 0) & (row < ny)
     filled = np.where(tactile_map.covered & ~tactile_map.few, tactile_map.mean, np.nan)
-    values = filled[np.clip(row, 0, ny - 1), np.clip(column, 0, nx - 1)]
-    return np.where(inside, values, np.nan)
+    return np.where(inside, filled[np.clip(row, 0, ny - 1), np.clip(column, 0, nx - 1)], np.nan)
 
 
 def _drawn_visits(laid: Sequence[LaidMap]) -> list[int]:

@@ -269,9 +269,8 @@ def tables_document(by_head: ByHead, phantoms: ByHead, *, seat: float) -> dict[s
 
 def _case_document(one: model_comparison.Agreement) -> dict[str, Any]:
     """Figures of a lump, with the bumps fitted to both models' lines."""
-    fits = {"elastic": one.elastic, "empirical": one.empirical}
     bumps = {
         name: {"amplitude": fit.amplitude, "sigma_mm": fit.widths_mm[0], "rms": fit.rms, "resolved": fit.resolved}
-        for name, fit in fits.items()
+        for name, fit in {"elastic": one.elastic, "empirical": one.empirical}.items()
     }
     return as_dict(one) | bumps

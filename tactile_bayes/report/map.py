@@ -1,4 +1,4 @@
-"""A map in words and as a picture."""
+"""A scan in a few lines, and a map in words and as a picture."""
 
 from __future__ import annotations
 
@@ -11,19 +11,45 @@ import numpy as np
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding, finding_lines, first_of, verdict
+from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.accumulate import LEAST_SHARE
 from tactile_bayes.mapping.map import FEW_READINGS, Orientation, TactileMap, advise_cell, orientation_of, skewed
 from tactile_bayes.mapping.plausibility import WHY_NOT
 from tactile_bayes.mapping.profile import SPAN_MM
-from tactile_bayes.mapping.select import CONTACT_KPA
+from tactile_bayes.mapping.select import CONTACT_KPA, intervals, missing_records
 from tactile_bayes.presets import CELL_PER_SIGMA, RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file, load_matplotlib
+from tactile_bayes.scans import Scan
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from tactile_bayes.files.reports import EstimateReport, MassReport, PassedOver
+
+
+# --- A scan in a few lines.
+
+
+def describe_scan(scan: Scan) -> list[str]:
+    """Summary of a scan in a few lines."""
+    times, poses = scan.frames.time_s, scan.poses
+    span = float(times[-1] - times[0]) if len(times) else 0.0
+    saturated = int((scan.frames.counts >= scan.element_calibration.saturation_count).sum())
+    duplicates = int((np.diff(poses.time_s) == 0).sum())
+    marks = [] if scan.landmarks is None else [name.replace("_", " ") for name in scan.landmarks.points()]
+    return [
+        f"{len(times)} frames of {scan.head.shape[0]} x {scan.head.shape[1]} taxels in {span:.3f} s, {_rate(times)}",
+        f"{len(poses)} poses, {_rate(poses.time_s)}",
+        f"dropped frames {missing_records(times)}, dropped poses {missing_records(poses.time_s)}, "
+        f"duplicate pose stamps {duplicates}, saturated readings {saturated}",
+        f"landmarks: {' and '.join(', '.join(marks).rsplit(', ', 1)) or 'not touched'}",
+    ]
+
+
+def _rate(times: FloatArray) -> str:
+    steps, usual = intervals([times])
+    return f"{1 / usual:.1f} Hz" if len(steps) else "no rate"
 
 
 # --- Text report of a tactile map: its verdict in a few lines, or a table with units, then what was left out.
@@ -313,8 +339,7 @@ def _draw_values(axes: Axes, tactile_map: TactileMap, view: Orientation, report:
 
 
 def _draw_coverage(axes: Axes, tactile_map: TactileMap, view: Orientation) -> None:
-    counts = np.ma.masked_equal(tactile_map.count, 0)
-    image = _draw_map(axes, counts, tactile_map, view, cmap="cividis", vmin=0)
+    image = _draw_map(axes, np.ma.masked_equal(tactile_map.count, 0), tactile_map, view, cmap="cividis", vmin=0)
     known = tactile_map.counts_known
     if known:
         _colour_bar(axes, image, "readings per cell")
@@ -355,8 +380,7 @@ def _explain(axes: Axes, tactile_map: TactileMap, places: Sequence[PassedOver]) 
     if not tactile_map.few.any():
         return
     sample = load_matplotlib().patches.Patch(facecolor="0.35", edgecolor="white", hatch="////", linewidth=0)
-    label = f"fewer than {FEW_READINGS} readings: noisy"
-    axes.legend([sample], [label], fontsize=8, frameon=False, **_BELOW)
+    axes.legend([sample], [f"fewer than {FEW_READINGS} readings: noisy"], fontsize=8, frameon=False, **_BELOW)
 
 
 def _colour_bar(axes: Axes, image: Any, label: str, *, extend: Any = "neither") -> None:
@@ -437,8 +461,7 @@ def _draw_masses(axes: Axes, report: EstimateReport, view: Orientation) -> None:
         centre, (size_mm, angle_deg) = _across_up(view, *mass.centre_mm.median), ellipse_of(mass)
         above = max(size_mm or (0.0, 0.0)) / 2.0
         top = centre[1] + (above if axes.get_ylim()[1] > axes.get_ylim()[0] else -above)
-        words = f"mass {mass.number}"
-        axes.annotate(words, (centre[0], top), xytext=(0, 4), path_effects=_outlined(2.5), **_ABOVE)
+        axes.annotate(f"mass {mass.number}", (centre[0], top), xytext=(0, 4), path_effects=_outlined(2.5), **_ABOVE)
         if report.centre_mm is not None and mass.reported:
             continue
         axes.plot(*centre, "+", color="white", markersize=7, markeredgewidth=1.4, path_effects=_outlined(3.0))

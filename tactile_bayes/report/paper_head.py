@@ -203,8 +203,7 @@ def _draw_shares(axes: Axes, one: Uniformity, tissue: HomogeneousTissue, limit: 
     """Pressure over its mean for each modulus (colour) and each mean pressure (line)."""
     for colour, modulus, shares in zip(_MODULUS_COLOURS, tissue.moduli_kpa, one.share, strict=True):
         for line, pressure, share in zip(("-", "--", ":"), tissue.pressures_kpa, shares, strict=True):
-            text = f"{modulus:g} kPa under {pressure:g} kPa"
-            axes.plot(one.s_mm, share, line, color=colour, label=text)
+            axes.plot(one.s_mm, share, line, color=colour, label=f"{modulus:g} kPa under {pressure:g} kPa")
     axes.axhspan(1 - limit, 1 + limit, color="0.88", zorder=0)
     axes.set_ylim(0.0, 2.6)
     title = f"{title}: {_arc(one.head)}, shoulders {one.head.shoulder_mm:g} mm"

@@ -212,8 +212,7 @@ def pooled_summary(report: PooledReport) -> str:
         ]
         lines.append(f"Quality: {'; '.join(filter(None, parts))}.")
         if len(lines) < estimate_text.MOST_LINES - 2:
-            places = estimate_text.size_decimals(_sizes(report))
-            lines += supposed_line(report.supposing, largest.median, places=places)
+            lines += supposed_line(report.supposing, largest.median, places=estimate_text.size_decimals(_sizes(report)))
     return "\n".join([*lines, estimate_text.MORE, RESEARCH_USE]) + "\n"
 
 

@@ -198,8 +198,7 @@ def _draw_figure_5(
         left.plot(frame.s_mm, frame.at(0.0), color=colour, label=f"fat {fat:g} mm")
         if fat == _FITTED_FAT_MM and isinstance(settings, StudySettings):
             model = settings.empirical(1.0, layers, frame)
-            text = f"Eq 1 fitted to taxels, fat {fat:g} mm"
-            left.plot(frame.s_mm, model.homogeneous(frame.s_mm), "k:", label=text)
+            left.plot(frame.s_mm, model.homogeneous(frame.s_mm), "k:", label=f"Eq 1 fitted to taxels, fat {fat:g} mm")
     where, far, title = "position across the head (mm)", "middle of the head", "over the ball, middle of the head"
     cases = zip(COLOURS, ("-", "-", "-"), _BALLS, strict=False)
     if flat:
@@ -287,8 +286,7 @@ def _draw_figure_7(left: Axes, right: Axes, rows: Sequence[StudyRow], settings: 
         x, value = (made.x_mm, made.mean) if flat else _section(made, "x")
         both = " x ".join(f"{width:.{2 if flat else 1}f}" for width in bump.widths_mm if width is not None)
         near = np.abs(x) <= 20.0
-        text = f"E2/E1 {ratio:g}: a {bump.amplitude:.3f}, sigma {both} mm"
-        left.plot(x[near], value[near], color=colour, label=text)
+        left.plot(x[near], value[near], color=colour, label=f"E2/E1 {ratio:g}: a {bump.amplitude:.3f}, sigma {both} mm")
     level = [row for row in rows if abs(row.depth_ratio - 1.0) < 1e-9 and row.detectable]
     for i, diameter in enumerate(dict.fromkeys(row.d_mm for row in hard_cases(level))):
         of_size = [row for row in level if row.d_mm == diameter]
@@ -297,15 +295,13 @@ def _draw_figure_7(left: Axes, right: Axes, rows: Sequence[StudyRow], settings: 
             sigma = widths(of_size, axis=axis)
             points = sorted(zip(ratios, sigma / sigma[ratios.index(HARD_RATIO)], strict=True))
             looks: dict[str, Any] = {"marker": MARKS[i % 6], "color": COLOURS[i % 6]}
-            label = f"d {diameter:g} mm" if axis == "x" else None
-            right.plot(*zip(*points, strict=True), line, label=label, **looks)
+            right.plot(*zip(*points, strict=True), line, label=f"d {diameter:g} mm" if axis == "x" else None, **looks)
     right.axhspan(0.95, 1.05, color="0.9", zorder=0)
     right.set_xscale("log")
     shown = "maps" if flat else "across the head"
     finish(left, f"(a) {shown}, d {d:g} mm, h/d {h:g}", _ON_SKIN, _SHARE, headroom=0.4)
     which = "; full across, dashed along" if len(_axes_of(rows)) > 1 else ""
-    title = f"(b) width, h/d 1{which}; grey: 5 %"
-    finish(right, title, "stiffness ratio E2/E1", f"sigma / sigma at {HARD_RATIO:g}")
+    finish(right, f"(b) width, h/d 1{which}; grey: 5 %", "stiffness ratio E2/E1", f"sigma / sigma at {HARD_RATIO:g}")
 
 
 def _axes_of(rows: Sequence[StudyRow]) -> dict[str, str]:

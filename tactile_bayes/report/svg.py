@@ -390,8 +390,7 @@ def _draw_mass(mass: ExamMass, exam: ExamMap, frame: Frame, *, small: bool) -> I
     if mass.axes_mm is not None and mass.largest is not None:
         ends = {"low": mass.largest.low, "high": mass.largest.high}
         for end, size in () if small else ends.items():
-            outline = _ellipse(mass, size / mass.largest.median, frame)
-            yield stroked(outline, 0.3, kind=f"size-{end}", dash="1.2 0.9")
+            yield stroked(_ellipse(mass, size / mass.largest.median, frame), 0.3, kind=f"size-{end}", dash="1.2 0.9")
         yield stroked(_ellipse(mass, 1.0, frame), 0.3 if small else 0.55, kind="size")
     yield stroked(f"M{x - arm:.2f} {y:.2f}h{2 * arm:g}M{x:.2f} {y - arm:.2f}v{2 * arm:g}", 0.25 * arm, kind="centre")
     if not small and len(exam.masses) > 1:
@@ -421,8 +420,7 @@ def _landmarks(exam: ExamMap, frame: Frame) -> Iterator[str]:
         x, y = width - 8.0, height - 4.0
         tip = (x + 7 * right, y - 7 * up)
         head = [(tip[0] - 2.2 * (right * c - up * s), tip[1] + 2.2 * (up * c + right * s)) for c, s in _BARBS]
-        ends = [(x, y), *head]
-        yield stroked("".join(through([end, tip]) for end in ends), 0.5, kind="notch")
+        yield stroked("".join(through([end, tip]) for end in [(x, y), *head]), 0.5, kind="notch")
         yield outlined_text(x, y - 9.0, "to notch", size=3.0)
 
 

@@ -349,7 +349,6 @@ def _free_place(x: float, y: float, wide: float, occupied: list[Box], *, right: 
     for step in (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6):
         low = y - 4.5 + step * _LINE
         box = (begin, low, begin + wide, low + _LINE)
-        covers = ((x0 < box[2] and box[0] < x1 and y0 < box[3] and low < y1) for x0, y0, x1, y1 in occupied)
-        if not any(covers):
+        if not any(x0 < box[2] and box[0] < x1 and y0 < box[3] and low < y1 for x0, y0, x1, y1 in occupied):
             break
     return box

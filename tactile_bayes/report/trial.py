@@ -221,8 +221,7 @@ def comparison_sentences(report: TrialReport) -> list[str]:
     """A sentence for each modality that the tactile one is compared with; for every pair where it has no reading."""
     pairs = report.paired_comparisons
     led = [pair for pair in pairs if REFERENCE in (pair.first, pair.second)] or pairs
-    percent = f"{100 * report.interval_probability:g} %"
-    return [_comparison_sentence(pair, percent) for pair in led]
+    return [_comparison_sentence(pair, f"{100 * report.interval_probability:g} %") for pair in led]
 
 
 def _comparison_sentence(pair: PairedComparison, percent: str) -> str:

@@ -89,8 +89,7 @@ def _draw_differences(detected: ModalitySizes, methods: MethodComparison, axes: 
     one = methods.limits.get("mm")
     if one is not None:
         axes.axhline(one.bias, color=_LINE, linewidth=1.5, label=f"bias {one.bias:.1f}")
-        sides = ((one.low, methods.limit_low_mm_interval), (one.high, methods.limit_high_mm_interval))
-        for value, ends in sides:
+        for value, ends in ((one.low, methods.limit_low_mm_interval), (one.high, methods.limit_high_mm_interval)):
             axes.axhline(value, color=_SECOND, linewidth=1.2, label=f"limit {value:.1f}")
             if ends is not None:
                 axes.axhspan(*ends, color=_SECOND, alpha=0.13, linewidth=0)
@@ -136,8 +135,7 @@ def _draw_coverage(calibration: Calibration, axes: Axes) -> None:
 def plan_figure(plan: PlanReport, path: Path, *, force: bool = False) -> None:
     """Draw the designs of a plan by their number of maps, and the patients that reach each target."""
     aims: list[Aim] = list(dict.fromkeys(one.aim for one in plan.needed)) or ["power"]
-    size_in = (_PANEL_IN * 1.4 * len(aims), _PANEL_IN)
-    with figure_file(path, size_in=size_in, foot=None, force=force) as figure:
+    with figure_file(path, size_in=(_PANEL_IN * 1.4 * len(aims), _PANEL_IN), foot=None, force=force) as figure:
         for aim, axes in zip(aims, figure.subplots(1, len(aims), squeeze=False)[0], strict=True):
             _draw_plan(axes, plan, aim)
 
@@ -148,8 +146,7 @@ def _draw_plan(axes: Axes, plan: PlanReport, aim: Aim) -> None:
         patients, label = [one.patients for one in designs], f"{counted(maps, 'map')} of each mass"
         if aim == "power":
             level = np.array([one.power for one in designs])
-            ends = np.array([one.power_interval for one in designs])
-            reach = np.abs(ends - level[:, None]).T
+            reach = np.abs(np.array([one.power_interval for one in designs]) - level[:, None]).T
             axes.errorbar(patients, level, yerr=reach, marker=mark, color=colour, markersize=4, capsize=2, label=label)
         else:
             widths = [one.tactile_width_ratio or np.nan for one in designs]
@@ -159,8 +156,7 @@ def _draw_plan(axes: Axes, plan: PlanReport, aim: Aim) -> None:
         axes.annotate(f"{one.patients}", (one.patients, one.target), xytext=(4, -12), textcoords="offset points")
         axes.plot([one.patients], [one.target], marker="x", color="black", markersize=8)
     up = "power" if aim == "power" else "interval of the tactile error, upper over lower end"
-    where = "lower right" if aim == "power" else "upper right"
-    finish(axes, "", "patients, one mass each", up, loc=where, **_LEGEND)
+    finish(axes, "", "patients, one mass each", up, loc="lower right" if aim == "power" else "upper right", **_LEGEND)
 
 
 # --- Trial report as one self-contained page: tables, figures, settings, hashes; no script, no network.

@@ -58,8 +58,7 @@ class ShapeDraws(Record, eq=False):
     q: FloatArray
     r: FloatArray
     turn_rad: float = 0.0  #: From the axes that the maps of a mass share to this map's.
-    profile: tuple[float, ...] | None = None
-    """`presets.HEAD_PROFILE` of the map; None where it has none."""
+    profile: tuple[float, ...] | None = None  #: `presets.HEAD_PROFILE` of the map; None where it has none.
     labels: Labels | None = None
     oblique: tuple[float, float] | None = None
     irregular: bool = False  #: Like the two above as of `BumpDraws`.

@@ -143,8 +143,7 @@ SHARED_BODY: Final = SharedBody(0.11, 0.48)
 """Learned from simulated visits, see record 0132: ``python -m validation visits law``."""
 SHARED_WITHOUT_DEPTH: Final = SharedBody(0.19, 0.39)
 """Without a depth of fat: most of B is then that depth, which stays as the lump grows."""
-STRANGERS: Final = SharedBody(1.0, 1.0)
-"""Nothing shared: visits as independent estimates."""
+STRANGERS: Final = SharedBody(1.0, 1.0)  #: Nothing shared: visits as independent estimates.
 
 
 class AmplitudeLaw(Record):

@@ -315,8 +315,7 @@ _Result = TypeVar("_Result")
 _Fit = Callable[[FloatArray, FloatArray], lines.Line]
 Unit = Literal["mm", "log_ratio"]
 Against = Literal["on_ex_vivo", "on_mean"]
-_Refitted = Ends | None | UnsetType
-"""An interval that is left out for more than `MOST_REFITTED` masses."""
+_Refitted = Ends | None | UnsetType  #: An interval that is left out for more than `MOST_REFITTED` masses.
 _LimitMm = Annotated[float, described("Limit of agreement in mm for single readings; the interval is over patients.")]
 _LimitLog = Annotated[
     float, described("Limit of agreement in ln(size / ex vivo) for single readings; the interval is over patients.")

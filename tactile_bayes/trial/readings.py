@@ -274,8 +274,7 @@ class OtherVisits(Record):
     earlier: int = 0
     later: int = 0
     """`earlier`, `later`: Readings at visits before the last one, and after the excision."""
-    only_there: Mapping[str, int] = field(default_factory=dict)
-    """Masses read at other visits alone, by modality."""
+    only_there: Mapping[str, int] = field(default_factory=dict)  #: Masses read at other visits alone, by modality.
 
     def lines(self) -> list[str]:
         """Text of what is left out, a line each; empty where nothing is."""
