@@ -198,7 +198,10 @@ def drawn_quantities(draws: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
 
 
 def trace_figure(draws: Mapping[str, FloatArray], path: Path | None, *, title: str = "", force: bool = False) -> Figure:
-    """Draw the density of each quantity of `LABELS` by chain, and its (chain, draw) draws in their order."""
+    """Draw the density of each quantity by chain, and its draws in their order; see `figure_file` for the file.
+
+    `draws` are (chain, draw) arrays by name; those of `LABELS` are drawn.
+    """
     shown = drawn_quantities(draws)
     with figure_file(path, size_in=(9.0, 1.25 * len(shown) + 1.0), force=force) as figure:
         figure.suptitle(title or "Traces", fontsize=11)

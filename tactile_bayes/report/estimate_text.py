@@ -135,7 +135,10 @@ NARROWED_ON_PAPER = {
 
 
 def width_lines(variance_share: Mapping[str, float], *, paper: bool = False) -> list[str]:
-    """Sources of the largest size's variance, of which each has its percent, largest first, and ways to narrow it."""
+    """Sources of a size's variance, largest first, and ways to narrow the interval.
+
+    `variance_share`: percent of the variance of the largest size, by source.
+    """
     sources, narrowed = (ON_PAPER, NARROWED_BY | NARROWED_ON_PAPER) if paper else (SOURCES, NARROWED_BY)
     ranked = sorted(variance_share.items(), key=lambda pair: -pair[1])
     parts = [f"{share:.0f} % {sources.get(name, name)}" for name, share in ranked if share >= 0.5]

@@ -350,7 +350,10 @@ def _draw_printed_eq6(left: Axes, right: Axes, hard: Sequence[StudyRow], axis: s
 def eq6_figure(
     calibration: SizeCalibration, lumps: SizeTable, path: Path, *, title: str = "", force: bool = False
 ) -> None:
-    """Draw width change against amplitude, diameter against corrected width, and the plane of both, of rising lumps."""
+    """Draw width change against amplitude, diameter against corrected width, and the plane of amplitude and width.
+
+    Rows of `lumps` without a positive amplitude take no part.
+    """
     rising = lumps.amplitude > 0
     d_mm, amplitude = lumps.d_mm[rising], lumps.amplitude[rising]
     axes = [(calibration.x, lumps.sigma_x_mm, lumps.width_change_x)]

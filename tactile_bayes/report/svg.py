@@ -111,7 +111,10 @@ STEPS: Final = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 def size_ruler(
     rows: Sequence[tuple[str, Quantity]], *, unit: str = "mm", label: str = "Intervals of the largest diameter"
 ) -> str:
-    """A bar for each interval with its median, the first the thickest, on a scale that holds 0; empty without any."""
+    """A bar for each interval with its median, the first the thickest, above a scale that holds 0; empty without rows.
+
+    A row is what an interval supposes, and the interval.
+    """
     if not rows:
         return ""
     start, end = min(0.0, *(1.08 * q.low for _, q in rows)), max(0.0, *(1.08 * q.high for _, q in rows))

@@ -267,7 +267,10 @@ _LEAST_MM = 1e-3  #: Smaller distances are drawn here: below rounding of what an
 
 
 def draw_tradeoffs(by_title: Mapping[str, Tradeoff], path: Path, *, force: bool = False) -> None:
-    """Draw every setting as a point, with the frontier and the lines that say what matters; each by its title."""
+    """Draw every setting as a point, with the frontier and the lines that say what matters; trade-offs by their titles.
+
+    Without a reference there is no distance: then the probability of a lump is drawn.
+    """
     with figure_file(path, size_in=(10.0, 6.0 * len(by_title)), force=force) as figure:
         parts: Any = [figure] if len(by_title) == 1 else figure.subfigures(len(by_title), 1)
         for part, (title, tradeoff) in zip(parts, by_title.items(), strict=True):
