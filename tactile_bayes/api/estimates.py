@@ -349,7 +349,7 @@ def export(
         if not isinstance(value, str):
             raise UsageError(f"{name} is {value!r}; give a text")
     refuse_unsupported(to, identity)
-    sources = as_list(files)
+    sources = [] if files is None else as_list(files)
     if to in ("fhir", "csv") and any(isinstance(one, Map) for one in sources):
         raise UsageError(f"{to} files hold sizes, and a map has none; give its estimate alone")
     outputs = Outputs(path_of(path), path_of(dictionary), to=to, force=force)

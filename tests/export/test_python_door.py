@@ -103,9 +103,10 @@ def test_an_impossible_export_is_refused(folder: Path) -> None:
 def test_the_dictionary_is_the_command_lines_alone_and_with_records(folder: Path) -> None:
     exported(folder, "--to", "csv", "--dictionary", "dict.csv")
     wanted = (folder / "dict.csv").read_bytes()
-    done = tb.export(to="csv", dictionary=folder / "alone.csv")
-    assert (done.paths, done.notes) == ((folder / "alone.csv",), ())
-    assert (folder / "alone.csv").read_bytes() == wanted
+    for given in ({}, {"files": None}):
+        done = tb.export(**given, to="csv", dictionary=folder / "alone.csv", force=True)
+        assert (done.paths, done.notes) == ((folder / "alone.csv",), ())
+        assert (folder / "alone.csv").read_bytes() == wanted
     done = tb.export("map.json", "records.csv", to="csv", dictionary="both.csv", patient_id="P1")
     assert [path.name for path in done.paths] == ["records.csv", "both.csv"]
     assert (folder / "both.csv").read_bytes() == wanted
