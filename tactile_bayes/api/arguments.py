@@ -54,7 +54,7 @@ def _keyword_for(match: re.Match[str]) -> str:
         return name
     if value.lstrip("-")[0] in "0123456789.":
         return f"{name}={value}"
-    chosen = name in _CHOICES and value not in ("or", "is", "out")
+    chosen = name in _CHOICES and value not in ("or", "is", "out", "says")
     return f'{name}="{value}"' if chosen else f"{name} {value}"
 
 

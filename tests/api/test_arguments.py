@@ -204,6 +204,7 @@ def test_a_keyword_that_is_none_is_answered_with_the_one_meant(call: Callable[[]
         ("try --method ensemble", 'try method="ensemble"'),
         ("give their unit: --unit kPa", 'give their unit: unit="kPa"'),
         ("leave it or --unit out", "leave it or unit out"),
+        ("its normalise is mean, not gain as --normalise says", "its normalise is mean, not gain as normalise says"),
         ("a larger max_steps in --settings FILE.toml", "a larger max_steps"),
         ("make it again: `tactile-bayes estimate m.nc --json`", "make it again: `tactile-bayes estimate m.nc --json`"),
     ],
