@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 _Given = ParamSpec("_Given")
 _Returned = TypeVar("_Returned")
 _SETTINGS_FILE: Final = re.compile(r" in --settings FILE\.toml|--settings FILE\.toml ")
-_OPTION: Final = re.compile(r"(?<![\w-])--([a-z]+(?:-[a-z]+)*)(?: (-?[\d.]+|[a-z]+[A-Z]?[a-z]*\d*(?:-[a-z]+)*))?")
+_VALUE: Final = r"-?[\d.]+|[a-z]+[A-Z]?[a-z]*\d*(?:-[a-z]+)*(?:\.[a-z]+)?"
+_OPTION: Final = re.compile(rf"(?<![\w-])--([a-z]+(?:-[a-z]+)*)(?: ({_VALUE}))?")
 _CHOICES: Final = (
     *("method", "normalise", "fidelity", "noise", "background", "scene", "form", "fit", "to", "size_calibration"),
     *("level", "unit", "units", "length_unit", "time_unit", "pose_time_unit", "pose_layout"),

@@ -141,7 +141,7 @@ CALLS: dict[str, tuple[Callable[..., Any], str]] = {
         lambda _: tb.export([tb.demo_map(), tb.demo_map()], "x.nrrd", to="nrrd"),
         "item 2 holds what item 1 holds; give each once",
     ),
-    "nothing to export": (lambda _: tb.export(None, "x.json", to="fhir"), "files is None; give a list"),
+    "nothing to export": (lambda _: tb.export(None, "x.json", to="fhir"), "no file was given to export; give a map"),
     "an ID of no text": (lambda one: tb.export(one, "x.json", to="fhir", patient_id=3), "patient_id is 3"),  # type: ignore[arg-type]
     "an exam of no date": (lambda one: tb.export(one, "x", to="dicom"), "give study_date YYYY-MM-DD"),
     "a mapping for DataFrames": (
@@ -204,6 +204,7 @@ def test_a_keyword_that_is_none_is_answered_with_the_one_meant(call: Callable[[]
         ("try --method ensemble", 'try method="ensemble"'),
         ("give their unit: --unit kPa", 'give their unit: unit="kPa"'),
         ("leave it or --unit out", "leave it or unit out"),
+        ("and give --size-calibration size.json.", 'and give size_calibration="size.json".'),
         ("its normalise is mean, not gain as --normalise says", "its normalise is mean, not gain as normalise says"),
         ("a larger max_steps in --settings FILE.toml", "a larger max_steps"),
         ("make it again: `tactile-bayes estimate m.nc --json`", "make it again: `tactile-bayes estimate m.nc --json`"),
