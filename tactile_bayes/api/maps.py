@@ -58,21 +58,11 @@ _DEMO = Path(__file__).resolve().parents[1] / "demo" / "scan.mcap"
 
 
 class Map(Record, eq=False):
-    """A tactile map: mean normalised pressure in square cells of the best-fit plane.
+    """A tactile map: mean normalised pressure in square cells of the best-fit plane."""
 
-    Parameters
-    ----------
-    tactile_map
-        Arrays, recipe and quality, see `tactile_bayes.mapping.TactileMap`.
-    path
-        The file that it was read from; None for a map that is in none.
-    scans
-        The scans that it was made from, as `Provenance.scans` has them.
-    """
-
-    tactile_map: TactileMap
-    path: Path | None = None
-    scans: tuple[dict[str, str], ...] = ()
+    tactile_map: TactileMap  #: Arrays, recipe and quality.
+    path: Path | None = None  #: The file that it was read from; None for a map that is in none.
+    scans: tuple[dict[str, str], ...] = ()  #: The scans that it was made from, as `Provenance.scans` has them.
 
     @property
     def mean(self) -> FloatArray:

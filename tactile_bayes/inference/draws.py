@@ -211,19 +211,6 @@ class SolutionCache:
 class Draws(Record, eq=False):
     """Posterior draws of one quantity.
 
-    Parameters
-    ----------
-    values : (chain, draw) array
-        NaN where a draw has no value.
-    unit
-        Such as ``"mm"``; empty for a ratio.
-    probability
-        Of the interval that is shown where none is asked for.
-    replicates : (chain * draw,) array
-        Label of the independent replicate of each draw; their spread is the Monte-Carlo error.
-    effective_draws
-        How many independent draws they are worth, where there are no replicates.
-
     Examples
     --------
     >>> import tactile_bayes as tb
@@ -233,11 +220,12 @@ class Draws(Record, eq=False):
     True
     """
 
-    values: FloatArray
-    unit: str = ""
-    probability: float = INTERVAL
+    values: FloatArray  #: (chain, draw) array; NaN where a draw has no value.
+    unit: str = ""  #: Such as ``"mm"``; empty for a ratio.
+    probability: float = INTERVAL  #: Of the interval that is shown where none is asked for.
     replicates: Labels | None = None
-    effective_draws: float | None = None
+    """(chain * draw,) label of the independent replicate of each draw; their spread is the Monte-Carlo error."""
+    effective_draws: float | None = None  #: How many independent draws they are worth, where there are no replicates.
 
     def summary(self, probability: float | None = None) -> Quantity:
         """Median, mean, SD, equal-tailed interval and its Monte-Carlo error, as the command line prints them.
