@@ -46,13 +46,10 @@ _FROM_FILES: Final = (
 
 
 class TrialResult(TextResult, eq=False):
-    """How each modality's sizes compare with excision.
+    """How each modality's sizes compare with excision."""
 
-    `report` is what the file of ``validate --json`` holds, and `trial` what it was made from.
-    """
-
-    report: TrialReport
-    trial: Trial
+    report: TrialReport  #: What the file of ``validate --json`` holds.
+    trial: Trial  #: What it was made from.
 
     @property
     def document(self) -> dict[str, Any]:
@@ -212,9 +209,9 @@ _ERRORS = names_of(PlanErrors)
 
 
 class TrialPlan(TextResult, eq=False):
-    """Power and widths of intervals of planned trials; `report` is what the file of ``plan -o`` holds."""
+    """Power and widths of intervals of planned trials."""
 
-    report: planning.PlanReport
+    report: planning.PlanReport  #: What the file of ``plan -o`` holds.
     doubts: tuple[str, ...] = ()  #: What speaks against the pilot's tables.
 
     @property
