@@ -54,8 +54,7 @@ class TrialResult(TextResult, eq=False):
     @property
     def document(self) -> dict[str, Any]:
         """The document that ``validate --json`` prints."""
-        document: dict[str, Any] = to_plain(self.report, digits=DIGITS)
-        return document
+        return dict(to_plain(self.report, digits=DIGITS))
 
     @property
     def text(self) -> str:
@@ -217,8 +216,7 @@ class TrialPlan(TextResult, eq=False):
     @property
     def document(self) -> dict[str, Any]:
         """The document that ``plan --json`` prints."""
-        document: dict[str, Any] = to_plain(self.report, digits=EXACT)
-        return document
+        return dict(to_plain(self.report, digits=EXACT))
 
     @property
     def text(self) -> str:

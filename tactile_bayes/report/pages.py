@@ -203,5 +203,4 @@ def _by_browser(browser: str, text: str) -> bytes:
 def _by_weasyprint(text: str) -> bytes:
     from weasyprint import HTML
 
-    document: bytes = HTML(string=text).write_pdf()
-    return document
+    return bytes(HTML(string=text).write_pdf())
