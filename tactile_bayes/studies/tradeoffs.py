@@ -168,6 +168,12 @@ def measure_forward(case: LumpCase, model: str, rule: SizeRule, *, share: float,
     notes = [f"Sizes by {rule.source}, which itself leaves {left}."]
     if outside := rule.outside(*amplitude_and_widths(answer)):
         notes.append(f"The map is none of the calibration's: {', '.join(outside)}.")
+    size = answer.quantities.get(SIZE)
+    if size is not None and not size.low <= case.d_mm <= size.high:
+        notes.append(
+            f"The lump of {case.d_mm:g} mm lies outside that interval, as its body is not the calibration's average: "
+            "compare settings with each other, not sizes with the lump."
+        )
     return replace(tradeoff, tolerance_mm=float(f"{share * answer.reported.median:.3g}"), notes=tuple(notes))
 
 

@@ -239,6 +239,9 @@ def test_the_advice_names_the_cheapest_that_is_enough() -> None:
     assert "What moves the ends more than 0.075 mm: fineness 1 0.8 mm; head without rim 6.3 mm." in text
     assert "Sizes by a rule, which itself leaves 12 % (SD of ln d)" in text
     assert text.count("the interval is what the calibration leaves") == 2
+    assert "lies outside that interval" not in text
+    far = by_model(rule=replace(RULE, largest=lambda _a, x, _y: 2 * x))
+    assert "The lump of 15 mm lies outside that interval, as its body is not the calib" in tradeoff_text(far)
     strict = by_model(share=1e-9)
     assert strict[SOLID].cheapest_sufficient() is None
     assert "no setting has its interval ends within" in tradeoff_text(strict)
