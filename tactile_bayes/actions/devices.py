@@ -55,6 +55,8 @@ def emulate_action(
             "an NDI tracker sends nothing by itself: --drop, --corrupt, --stall, --disconnect and --once have nothing "
             "to act on; leave them out, or emulate another protocol"
         )
+    if protocol == "igtlink" and "tracker" in roles and tcp is None:
+        raise UsageError("OpenIGTLink is spoken over a network; give --tcp 127.0.0.1:0")
     shared = stage if kind == "both" else None
     devices = [_device(role, loaded, protocol, faults, path=scan, shared=shared) for role in roles]
     emulators = [
@@ -77,7 +79,8 @@ def emulate_action(
             for other in others:
                 other.start()
             emulators[0].run(once=once)
-            if not once:  # its cable was pulled, as asked: the other may send nothing, and would wait for that for good
+            # its cable was pulled, as asked, or its host has ended: the other may wait for its own host for good
+            if not once or emulators[0].device.stopped:
                 for one in emulators[1:]:
                     one.unplugged = True
             for other in others:

@@ -45,7 +45,9 @@ def record_command() -> None:
     "Default: a pseudo-terminal.",
 )
 @click.option(
-    "--once", is_flag=True, help="End when the scan has been sent and read. Default: wait for the next start."
+    "--once",
+    is_flag=True,
+    help="End when the scan has been sent and read, or its recording has stopped. Default: wait for the next start.",
 )
 @options.SPEED
 @options.record_options(FaultOptions, "drop", "corrupt", "stall", "disconnect_s", show_default=False)

@@ -479,14 +479,14 @@ class Emulator:
         self._hold_at = time.monotonic() + _SETTLE_S
 
     def run(self, *, once: bool = False) -> None:
-        """Serve until the link breaks, or, with `once`, until a scan has been sent and read."""
+        """Serve until the link breaks, or, with `once`, until a scan has been sent and read, or was stopped."""
         while not self.unplugged:
             self._step()
-            if once and self._finished_at and not self._waiting:
-                waited = time.monotonic() - self._finished_at > LINGER_S
-                if self.device.end_sent or self.device.stopped or waited:
-                    self.link.finish(LINGER_S)
-                    self.unplugged = True
+            stopped = self.device.starts > 0 and self.device.stopped  # the host reads no more
+            all_sent = self.device.end_sent or time.monotonic() - self._finished_at > LINGER_S
+            if once and (stopped or (self._finished_at and not self._waiting and all_sent)):
+                self.link.finish(0.0 if stopped else LINGER_S)
+                self.unplugged = True
 
     def _step(self) -> None:
         writable = [self.link] if self._waiting else []

@@ -15,6 +15,7 @@ import pytest
 from emulated_devices import serving, short_scan
 
 from tactile_bayes.actions.devices import _link, emulate_action
+from tactile_bayes.errors import UsageError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.hardware import head
@@ -25,7 +26,7 @@ from tactile_bayes.hardware.readings import EndReading, FrameReading, PoseReadin
 from tactile_bayes.hardware.serial_trackers import TRACKERS
 
 SCAN = short_scan(0.2)
-START = encode_command(head.START, every=1)
+START, STOP = encode_command(head.START, every=1), encode_command(head.STOP)
 
 
 def read_until(port: Port, parser, done) -> list:
@@ -105,6 +106,30 @@ def test_once_ends_when_a_slow_host_has_read_the_last_frame(link_of):
     port.close()
     thread.join(10.0)
     assert not thread.is_alive()
+
+
+def test_once_ends_when_its_host_stops_before_the_end():
+    """`emulate both --once` waited for ever once `record` had stopped."""
+    link = PtyLink()
+    emulator = Emulator(EmulatedHead(SCAN), link, faults=Faults(), rng=np.random.default_rng(1))
+    thread = threading.Thread(target=lambda: emulator.run(once=True), daemon=True)
+    thread.start()
+    port = Port(link.url, baud=9600, role="head")
+    for command in (STOP, START, STOP):  # the first STOP is asked before the head is known
+        assert thread.is_alive()
+        port.write(command)
+        time.sleep(0.05)
+    port.close()
+    thread.join(5.0)
+    assert not thread.is_alive()
+
+
+def test_an_emulated_network_tracker_needs_a_network_port(tmp_path):
+    """On a pseudo-terminal it sent nothing, and `record` advised to start its stream."""
+    write_scan(tmp_path / "scan.mcap", SCAN, provenance=Provenance("test", {}))
+    given = {"scan": tmp_path / "scan.mcap", "once": True, "speed": 1.0, "seed": 1}
+    with pytest.raises(UsageError, match="network; give --tcp 127"):
+        emulate_action(kind="both", protocol="igtlink", tcp=None, **given)
 
 
 def test_a_tracker_waits_for_the_head_with_its_first_pose(monkeypatch):
