@@ -157,6 +157,15 @@ def _check_times(time_s: FloatArray, *, name: str) -> FloatArray:
 _LEVER_MM: Final = (1.0, 1000.0)  #: From the tracker's sensor to the head, where they are two things.
 
 
+def check_pitch(surface_mm: FloatArray, pitch_mm: float) -> None:
+    """Raise `BadDataError` for taxels whose distance is not the pitch."""
+    for axis, direction in ((0, "across"), (1, "along")):
+        spacing = np.linalg.norm(np.diff(surface_mm, axis=axis), axis=-1)
+        if spacing.size and not 0.8 * pitch_mm <= (apart := float(np.median(spacing))) <= 1.25 * pitch_mm:
+            what = f"the taxels lie {apart:.4g} mm apart {direction} the head, pitch_mm is {pitch_mm:.4g}"
+            raise BadDataError(what, way_out="give both in mm, for the same head")
+
+
 class HeadGeometry(Record, eq=False):
     """Positions of the taxels, and how the tracker is mounted."""
 

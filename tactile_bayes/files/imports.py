@@ -27,7 +27,15 @@ from tactile_bayes.findings import LEADS, finding
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.select import LEAST_FRAMES, unit_question
 from tactile_bayes.presets import KPA_PER_UNIT, MM_PER_UNIT, PRESSURE_RANGE_KPA, PRESSURE_WINDOW_KPA
-from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import (
+    ElementCalibration,
+    HeadGeometry,
+    Landmarks,
+    PressureFrames,
+    Scan,
+    TrackerPoses,
+    check_pitch,
+)
 
 # No value of a scan is larger, seconds since 1970 included; the squares of damaged ones would overflow.
 _LARGEST: Final = 1e12
@@ -508,12 +516,7 @@ def _check_units(arrays: Arrays, *, calibrated: bool) -> None:
         what = f"gain_kpa_per_count gives {full_scale:.4g} kPa at 4095 counts"
         raise BadDataError(what, way_out="looks like Pa or MPa, give kPa")
     _check_clocks(arrays)
-    pitch_mm = float(arrays["pitch_mm"])
-    for axis in (one for one in (0, 1) if surface.shape[one] > 1):
-        spacing = float(np.median(np.linalg.norm(np.diff(surface, axis=axis), axis=-1)))
-        if not 0.8 * pitch_mm <= spacing <= 1.25 * pitch_mm:
-            what = f"head_surface_mm has elements {spacing:.4g} mm apart along axis {axis}, pitch_mm is {pitch_mm:.4g}"
-            raise BadDataError(what, way_out="give both in mm, for the same head")
+    check_pitch(surface, float(arrays["pitch_mm"]))
 
 
 def _check_clocks(arrays: Arrays) -> None:

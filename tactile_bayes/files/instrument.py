@@ -18,7 +18,7 @@ from tactile_bayes.files.reading import TOML_BYTES, read_text
 from tactile_bayes.forward import scene as scenes
 from tactile_bayes.forward.tissue import DepthRatio, Height, Rib, SceneBody, Seat, SolidLump, Stiffness
 from tactile_bayes.geometry import Matrix
-from tactile_bayes.scans import ElementCalibration, HeadGeometry, HeadShape, Landmarks
+from tactile_bayes.scans import ElementCalibration, HeadGeometry, HeadShape, Landmarks, check_pitch
 
 
 def head_document(head: HeadGeometry) -> dict[str, Any]:
@@ -96,6 +96,7 @@ def head_geometry(document: object, *, path: Path) -> HeadGeometry:
         if file.scanhead_from_tracker is None:
             raise BadDataError("lacks scanhead_from_tracker", way_out="add the transform from the sensor to the head")
         surface = _head_of(file).surface_mm() if file.surface_mm is None else np.array(file.surface_mm)
+        check_pitch(surface, file.pitch_mm)
         day = "" if file.checked_on is None else file.checked_on.isoformat()
         return HeadGeometry(surface, file.pitch_mm, np.array(file.scanhead_from_tracker), day)
 

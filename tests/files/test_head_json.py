@@ -58,6 +58,9 @@ def test_record_reads_the_same_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.surface_mm, np.array(of_surface(20.0)["surface_mm"]), atol=1e-12)
     with pytest.raises(BadDataError, match="lacks scanhead_from_tracker"):
         read_head_geometry(written(tmp_path, ARC))
+    contradicts = {**of_surface(20.0), "pitch_mm": 1.95, "scanhead_from_tracker": LEVER}
+    with pytest.raises(BadDataError, match=r"lie 1.5\d* mm apart across the head, pitch_mm is 1.95"):
+        read_head_geometry(written(tmp_path, contradicts))
     metres = [[*row[:3], row[3] or 0.055] for row in np.eye(4).tolist()]
     with pytest.raises(BadDataError, match=r"puts the tracker's sensor 0\.\d+ mm from the head; looks like metres"):
         read_head_geometry(written(tmp_path, {**ARC, "scanhead_from_tracker": metres}))

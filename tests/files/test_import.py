@@ -79,7 +79,7 @@ FAULTS: list[tuple[str, Callable[[Arrays], object], str]] = [
     ("object", put("offset_kpa", lambda o: o.astype(object)), "offset_kpa holds Python objects"),
     ("not rigid", put("array_from_tracker", lambda t: 1.1 * t), "array_from_tracker is not a rigid"),
     ("mirrored", put("array_from_tracker", lambda t: t @ np.diag([1, 1, -1.0, 1])), "array_from_tracker is not"),
-    ("pitch", put("pitch_mm", lambda _: 2.5), "head_surface_mm has elements 1.5.*pitch_mm is 2.5"),
+    ("pitch", put("pitch_mm", lambda _: 2.5), "taxels lie 1.5.*pitch_mm is 2.5"),
     ("head in m", put("head_surface_mm", lambda s: s / 1000), "head_surface_mm.*metres or inches, give mm"),
     ("head in inches", put("head_surface_mm", lambda s: s / 25.4), "head_surface_mm.*metres or inches, give mm"),
     ("path in m", put("position_mm", lambda p: p / 1000), "position_mm.*metres or inches, give mm"),

@@ -93,8 +93,9 @@ def in_inches(one: Scan) -> Scan:
     return replace(one, head=head)
 
 
-def pitch_in_inches(one: Scan) -> Scan:
-    return replace(one, head=HeadGeometry(one.head.surface_mm, one.head.pitch_mm / 25.4, np.eye(4)))
+def other_pitch(ratio: float) -> Callable[[Scan], Scan]:
+    """The pitch contradicts the taxels' places, which make the map."""
+    return lambda one: replace(one, head=HeadGeometry(one.head.surface_mm, one.head.pitch_mm * ratio, np.eye(4)))
 
 
 UNLIKE: dict[str, tuple[Callable[[Scan], Scan], str]] = {
@@ -126,7 +127,8 @@ UNLIKE: dict[str, tuple[Callable[[Scan], Scan], str]] = {
     "times in ms": (timed(1000.0), "frames come at 0.1 Hz"),
     "times in ks": (timed(1e-3), "frames come at 1e+05 Hz"),
     "array in inches": (in_inches, "no scan head is"),
-    "pitch in inches": (pitch_in_inches, "times as far apart as the pitch says"),
+    "pitch in inches": (other_pitch(1 / 25.4), "times as far apart as the pitch says"),
+    "another head's pitch": (other_pitch(0.8), "1.25 times as far apart as the pitch says"),
 }
 
 
