@@ -62,6 +62,7 @@ def describe_damage(error: Exception) -> str:
 # --- All records of an MCAP file, finished or not: intact chunks are kept and losses reported.
 
 _RECORD: Final = struct.Struct("<BQ")  # opcode, length
+_LONGEST: Final = 2**32  #: No record is longer; one that is longer than its file was cut off.
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _CHECKSUM: Final = struct.Struct("<I")
 # a schema or channel is an object each: it counts so many bytes, however short it is written
@@ -212,19 +213,21 @@ def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:
         start = stream.tell()
         head = stream.read(_RECORD.size)
         opcode, length = _RECORD.unpack(head) if len(head) == _RECORD.size else (1, 0)
-        if opcode == 0 or length > size:
+        if opcode == 0 or length > max(size, _LONGEST):
             if records.all_data:
                 records.add_loss("the end of the file is damaged; all messages are there", damaged=False)
             else:
                 records.add_loss(f"unreadable from byte {start} of {size} on (no record begins there)")
             return
-        body = stream.read(length)
+        body = stream.read(min(length, size))
         complete = len(head) == _RECORD.size and len(body) == length
         if complete and opcode == Opcode.DATA_END:
             _end_data(records, body, checksum)
         if complete and opcode == Opcode.FOOTER:
             complete = records.finished = stream.read(len(MCAP_MAGIC)) == MCAP_MAGIC
             if complete:
+                if (end := stream.tell()) < size and stream.read(len(MCAP_MAGIC)) == MCAP_MAGIC:
+                    records.add_loss(f"another file was joined to it at byte {end} of {size}: it is not read")
                 return
         if not complete:
             loss = f"cut off at byte {size}: everything after {records.last_ns / 1e9:.3f} s is lost"

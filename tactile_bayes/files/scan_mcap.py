@@ -241,8 +241,10 @@ def read_scan_report(path: Path) -> ScanFile:
         check_session(session, path=path)
         frames = _frames(records, head)
         if not len(frames) and not records.finished:
-            way_out = "copy it again from where it was recorded: this copy holds no frame"
-            raise BadDataError("was cut off before its first complete frame", way_out=way_out)
+            what = (
+                f"is damaged ({records.lost[0]})" if records.damaged else "was cut off before its first complete frame"
+            )
+            raise BadDataError(what, way_out="copy it again from where it was recorded: this copy holds no frame")
         messages = records.messages("/pose", schema="foxglove.PoseInFrame")
         places = _pose_table(messages)
         poses = scans.TrackerPoses(message_times(messages, topic="/pose"), places[:, :3], places[:, 3:])

@@ -173,7 +173,7 @@ def test_a_file_cut_anywhere_gives_a_prefix_or_one_line(scan: Scan, whole: Path,
         np.testing.assert_array_equal(file.scan.frames.counts, scan.frames.counts[:n])
         np.testing.assert_array_equal(file.scan.frames.time_s, scan.frames.time_s[:n])
     assert kept == sorted(kept)
-    assert all(str(cut) in line and "\n" not in line for line in told)
+    assert all(str(cut) in line and "\n" not in line and "damaged" not in line for line in told)
     assert kept[0] == 0
     assert kept[-1] == len(scan.frames)
     assert len(set(kept)) > 3
@@ -201,6 +201,26 @@ def test_a_changed_byte_in_a_chunk_is_reported(scan: Scan, whole: Path, tmp_path
     assert np.isin(file.scan.frames.time_s, scan.frames.time_s).all()
     with pytest.raises(BadDataError, match="is damaged"):
         read_scan(bad)
+
+
+def test_of_two_files_joined_the_second_is_lost_with_a_word(scan: Scan, whole: Path, tmp_path: Path) -> None:
+    """The second exam was left out, and the file called whole."""
+    joined = tmp_path / "joined.mcap"
+    joined.write_bytes(2 * whole.read_bytes())
+    file = read_scan_report(joined)
+    assert_same(file.scan, replace(scan, findings=file.scan.findings))
+    assert (file.complete, file.damaged) == (False, True)
+    assert "another file was joined to it" in file.lost[0]
+
+
+def test_a_file_whose_first_chunk_is_damaged_was_not_cut_off(whole: Path, tmp_path: Path) -> None:
+    data = bytearray(whole.read_bytes())
+    for place in chunk_offsets(whole):
+        data[place] ^= 0x41
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(data[:-100])
+    with pytest.raises(BadDataError, match=r"is damaged .chunk 1.*holds no frame"):
+        read_scan_report(bad)
 
 
 def test_a_changed_byte_anywhere_is_never_silent(whole: Path, tmp_path: Path) -> None:
