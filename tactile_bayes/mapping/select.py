@@ -194,6 +194,7 @@ def _with_frames(scan: Scan, chosen: slice) -> Scan:
 # --- Overlap in time of a scan's poses and frames, and cautions where it is poor.
 
 TOLERATED_S: Final = 0.1  #: Shorter mismatches and gaps cost a few frames at most.
+_SAME_S: Final = 0.05  #: Times agree that differ by less.
 _LONG_INTERVALS: Final = 5.0  #: Multiple of the mean interval above which frames are missing.
 
 
@@ -316,7 +317,8 @@ _USUAL_LEVER_MM: Final = (10.0, 300.0)  #: From the face of a head that a hand h
 
 def scan_findings(scan: Scan) -> tuple[Finding, ...]:
     """Findings of a scan's recorder, and on its times and poses; what the recorder noted too is given once."""
-    noted = with_times(scan.findings, Span.of(scan.frames.time_s), Span.of(scan.poses.time_s))
+    frames, poses = Span.of(scan.frames.time_s), Span.of(scan.poses.time_s)
+    noted = (*with_times(scan.findings, frames, poses), *_clock_steps(frames, poses))
     jumps = Jumps.of(scan.poses)
     remedy = "set the tracker's hemisphere to the patient's side, and scan again" if jumps.crossed else ""
     jumped = [finding("poses_jump", text, remedy, remedy) for text in jumps.cautions()]
@@ -327,6 +329,19 @@ def scan_findings(scan: Scan) -> tuple[Finding, ...]:
         return (*noted, *frozen, *jumped)
     text = f"the tracker's sensor lies {lever:.3g} mm from the head"
     return (*noted, *frozen, *jumped, finding("unusual_scan", text, "check that the lever arm is in mm"))
+
+
+def _clock_steps(frames: Span, poses: Span) -> Iterator[Finding]:
+    """A caution where only one device's times have a gap, and it lasts longer than the other by just that gap."""
+    remedy = "import them again without that step, or record with --clock arrival"
+    for one, other, whose in ((frames, poses, "frames"), (poses, frames, "poses")):
+        longer_s = one.last_s - one.first_s - (other.last_s - other.first_s)
+        together = abs(one.first_s - other.first_s) < _SAME_S and abs(longer_s - one.gap_s) < _SAME_S
+        if together and other.gap_s <= TOLERATED_S < one.gap_s:
+            text = (
+                f"the {whose}' clock seems to step by {one.gap_s:.1f} s at {one.gap_at_s:.2f} s: the rest is misplaced"
+            )
+            yield finding("frames_contradict", text, remedy, "have the scan taken again")
 
 
 def _frozen_cautions(poses: TrackerPoses) -> list[str]:

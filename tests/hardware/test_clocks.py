@@ -10,6 +10,7 @@ from emulated_devices import short_scan
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, DeviceError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import ScanWriter, read_scan
@@ -26,6 +27,8 @@ from tactile_bayes.hardware.readings import (
     wrap_period,
 )
 from tactile_bayes.hardware.recorder import DeviceLine, LandmarkTouch, Recorder, RecordingReport
+from tactile_bayes.mapping.select import scan_findings
+from tactile_bayes.scans import PressureFrames, TrackerPoses
 
 S = 1_000_000_000
 FRAME_NS = S // 200
@@ -467,3 +470,16 @@ def test_a_file_with_a_time_that_no_reader_can_hold_is_refused_in_one_line(tmp_p
         writer.finish()
     with pytest.raises(BadDataError, match=f"{topic} holds a time of {2**63} ns"):
         read_scan(tmp_path / "a.mcap")
+
+
+@pytest.mark.parametrize("stepped", [("frames",), ("poses",), ("frames", "poses"), ()])
+def test_a_step_of_one_clock_is_a_caution(stepped):
+    """A gap in the one, which then lasts longer by it: of a ball of 15 mm no map showed a thing."""
+    scan = short_scan(1.0)
+    frame_s, pose_s = scan.frames.time_s, scan.poses.time_s
+    frames = PressureFrames(frame_s + 0.3 * ("frames" in stepped) * (frame_s > 0.5), scan.frames.counts)
+    pose_s = pose_s + 0.3 * ("poses" in stepped) * (pose_s > 0.5)
+    poses = TrackerPoses(pose_s, scan.poses.position_mm, scan.poses.quaternion_wxyz)
+    found = [one.text for one in scan_findings(replace(scan, frames=frames, poses=poses)) if one.severity == "caution"]
+    wanted = [f"the {name}' clock seems to step by 0.3 s" for name in stepped if len(stepped) == 1]
+    assert [text.partition(" at ")[0] for text in found] == wanted
