@@ -323,7 +323,10 @@ class InlineExecutor(Executor):
 
 
 def open_executor(*, workers: int = 1, cluster: str | None = None) -> AbstractContextManager[Executor]:
-    """Executor over a dask cluster, else over `workers` processes; 0 or 1 are this one, with the same results."""
+    """Open an executor over a dask cluster if its address is given, else over `workers` processes of this machine.
+
+    Killed processes are replaced; 0 or 1 `workers` run in this process, with the same results.
+    """
     if cluster:
         return cluster_executor(cluster)
     if workers < 0:
@@ -333,7 +336,10 @@ def open_executor(*, workers: int = 1, cluster: str | None = None) -> AbstractCo
 
 @contextlib.contextmanager
 def cluster_executor(address: str, *, timeout_s: float = 10.0) -> Iterator[Executor]:
-    """Executor over the workers of a running dask scheduler (``tcp://10.0.0.5:8786``), which must have this version."""
+    """Executor over the workers of a running dask scheduler, for example ``tcp://10.0.0.5:8786``.
+
+    The workers must have this version of the program installed: another one could give other results.
+    """
     try:
         from distributed import Client
     except ImportError:
@@ -406,7 +412,11 @@ class Outcome(Record, Generic[Result]):
 
 
 class BatchInterrupted(KeyboardInterrupt):
-    """Ctrl-C during a batch, with its outcomes; `store` keeps the results, `before` counts those of earlier batches."""
+    """Ctrl-C during a batch, with the finished outcomes.
+
+    `store` is the path that keeps the results for the next run, `before` the number of items done by earlier batches
+    of the same run.
+    """
 
     def __init__(self, outcomes: Sequence[Outcome[Any]], *, total: int, store: Path | None, before: int = 0) -> None:
         self.outcomes = list(outcomes)

@@ -43,7 +43,10 @@ IN_FILE: Final = Meta(extra={"file": True})  #: Marks a setting of the file of `
 
 
 def cli_meta(metavar: str, *, option: str = "", also: str = "", **rules: Any) -> Meta:
-    """Rules of an option: its value's name in the help, its own where that is not the field's, a second one."""
+    """Rules of an option with the name of its value in the help.
+
+    `option` names it on the command line, by default its field's name; `also` is a second name.
+    """
     names = {"metavar": metavar, "option": option, "also": also}
     return Meta(extra={key: name for key, name in names.items() if name}, **rules)
 

@@ -131,7 +131,10 @@ def printable(text: str) -> str:
 
 
 class PrintableStream:
-    """A text stream that escapes control characters and wraps lines on a terminal; a `required` one must be written."""
+    """A text stream that escapes control characters and, on a terminal, wraps lines; otherwise as the one underneath.
+
+    A failed write is an error where `required` (standard output), else ignored (standard error: nowhere to report it).
+    """
 
     def __init__(self, stream: TextIO, *, required: bool) -> None:
         self._stream = stream
@@ -186,7 +189,10 @@ def protect_streams() -> None:
 
 
 def _buffered(stream: io.TextIOWrapper) -> io.TextIOWrapper:
-    """The stream with escapes and a buffer: without one Python drops text that a full disk does not take."""
+    """The stream with a buffer and with escapes in place of encoding errors.
+
+    Without a buffer (``PYTHONUNBUFFERED=1``, as in many containers) Python drops text that a full disk does not take.
+    """
     if isinstance(stream.buffer, io.RawIOBase):
         raw = io.FileIO(stream.fileno(), "w", closefd=False)
         stream = io.TextIOWrapper(io.BufferedWriter(raw), encoding=stream.encoding, line_buffering=True)

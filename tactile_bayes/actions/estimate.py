@@ -39,7 +39,10 @@ def _pool(
     verbose: bool,
     force: bool,
 ) -> int:
-    """Pool the maps unless one cannot be read, print and write the result; return the exit code."""
+    """Pool the maps, print and write the result; return the exit code.
+
+    If one of the maps cannot be read, its error is printed and nothing is pooled.
+    """
     if failures := [one for one in answers if isinstance(one, Failure)]:
         for failure in failures:
             click.echo(failure.text, err=True)

@@ -82,7 +82,10 @@ class Request(RecordOptions, kw_only=True):
 
 
 def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration | None, Landmarks | None]:
-    """Geometry, calibration (None with --uncalibrated) and landmarks of the files that the options name."""
+    """Geometry, calibration and landmarks, read from the files of the options; `UsageError` where one is missing.
+
+    Without a calibration is --uncalibrated: the head's own full scale is needed for one.
+    """
     like = read_scan(request.like) if request.like else None
     if request.head_geometry:
         head = read_head_geometry(request.head_geometry)

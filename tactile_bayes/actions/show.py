@@ -255,7 +255,10 @@ def _foreign(path: Path) -> BadDataError:
 
 
 def _scan(path: Path) -> dict[str, Any]:
-    """Summarise a scan without the content of its messages, faults in which are not told: memory holds their times."""
+    """Summarise frames, poses, duration, losses, session and provenance; memory grows by one time per message.
+
+    The content of the messages is not read, so faults in it are not reported.
+    """
     records = scan_mcap.scan_records(path, keep=())
     with in_file(path):
         head = scan_mcap.read_attachment(records, HeadGeometry, "head.json")

@@ -323,7 +323,10 @@ class Breasts:
             self._exams[exam.patient, exam.side].append(exam)
 
     def exams_with_places(self, exam: Exam, of: Container[str] | None = None) -> list[Exam]:
-        """Exams that place the breast's masses, one for each; none if this has a place, or its mass has not."""
+        """Exams that place the breast's masses, one for each mass, of the exam's visit if possible.
+
+        Empty if the exam has a place itself, or no exam places its mass; `of`: names of the exams to choose from.
+        """
         if exam.centre_mm is not None:
             return []
         breast = [one for one in self._exams[exam.patient, exam.side] if of is None or one.name in of]

@@ -32,7 +32,10 @@ _OTHERS: Final = ("pool", "compare", _BESIDE)  #: Steps that are of no single ex
 
 @contextlib.contextmanager
 def open_campaign(folder: Path, *, dry: bool = False) -> Iterator[BatchStore | None]:
-    """Open the journal of a folder, made if need be and of no other use; for a dry run read it, or None without one."""
+    """Open the journal of a folder, which is made if need be; for a dry run read it only, None where there is none.
+
+    A folder of something else, one that another run is using, or one that cannot be made or read is a `UsageError`.
+    """
     journal = folder / JOURNAL
     try:
         has_journal, has_files = journal.exists(), folder.is_dir() and any(folder.iterdir())
@@ -80,7 +83,11 @@ def unchanged(folder: Path, result: Result) -> bool:
 def remove_stale_files(
     folder: Path, exams: Sequence[Exam], files_of: Callable[[str, str], Collection[str]], *, unread: Collection[str]
 ) -> list[str]:
-    """Remove what this run did not make, but of exams that are `unread`; returns the folders of exams of no row."""
+    """Remove files of earlier runs that this one did not make; returns folders of exams that the table does not list.
+
+    `files_of`: names of the files that a step of this run made for an exam or mass; `unread`: exams whose file could
+    not be read, which keep their files.
+    """
     left = []
     spared = {*unread, *(name for exam in exams if exam.name in unread for name in (exam.of_mass, exam.of_visits))}
     _clear(folder, known=FILES[_BESIDE], made=files_of(_BESIDE, SITE))
@@ -155,7 +162,11 @@ def _digest(file: tuple[str, Path, str]) -> dict[str, Any]:
 def read_sources(
     exams: Sequence[Exam], *, store: BatchStore | None, keep: bool, executor: Executor | None, progress: Progress
 ) -> tuple[dict[Path, str], dict[Path, str]]:
-    """SHA-256 of each exam's file by its path, read or from the journal (`keep`: into it, too), and faults."""
+    """SHA-256 of every exam's file by its path, from the journal where the file is as it was then, and faults of files.
+
+    New digests go into the journal (`keep`), or else files in object stores that are not known are passed over. A lost
+    cluster is a `TactileBayesError`.
+    """
     files = {exam.path: (exam, *_digest_key(exam)) for exam in {exam.path: exam for exam in exams}.values()}
     values: Mapping[str, Any] = {} if store is None else store
     known = {path: values[key]["sha256"] for path, (_, key, settled) in files.items() if settled and key in values}
@@ -178,14 +189,20 @@ def read_sources(
 
 
 class DuplicateExams:
-    """Finds exams of the same `shared` (bytes or recording), which only masses of one scan may have, block by block."""
+    """Finds exams with the same content, which only masses of one scan may have, block by block.
+
+    `shared` is the content's name for messages: ``"bytes"`` or ``"recording"``.
+    """
 
     def __init__(self, breasts: Breasts, shared: str) -> None:
         self._breasts, self._shared = breasts, shared
         self._sharing: dict[str, list[Exam]] = defaultdict(list)
 
     def faults(self, marks: Mapping[Exam, Iterable[str]]) -> dict[str, str]:
-        """Faults of these exams and of earlier ones, by name; `marks`: digests of each exam's content."""
+        """Faults of these exams and of earlier ones, by name; `marks`: digests of each exam's content.
+
+        Masses of one scan, each with its place, have none.
+        """
         new = {mark: None for of_exam in marks.values() for mark in of_exam}
         for exam, of_exam in marks.items():
             for mark in dict.fromkeys(of_exam):

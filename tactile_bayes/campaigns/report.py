@@ -175,7 +175,10 @@ def failure_lines(campaign: Campaign, rows: Sequence[ExamRow]) -> list[dict[str,
 def trial_lines(
     campaign: Campaign, rows: Sequence[ExamRow], pooled: Pooled, masses: Collection[tuple[str, str]] | None
 ) -> list[dict[str, object]]:
-    """``trial.csv``: exams as readings of ``tactile``, pooled visits as ``tactile-pooled``, of `masses` (None: all)."""
+    """``trial.csv``: every exam as a reading of ``tactile``, every pooled visit as one of ``tactile-pooled``.
+
+    `masses` have a size after excision: the others are left out. None takes all. Numbers run over the visits of a mass.
+    """
     in_trial = [row for row in rows if masses is None or (row.exam.patient, row.exam.mass) in masses]
     readings = [_trial_reading(row, TACTILE, reader=row.exam.reader) for row in in_trial]
     visits: dict[str, list[ExamRow]] = defaultdict(list)
@@ -276,7 +279,10 @@ class Written(Record):
 
 
 def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Written:
-    """Write tables, index and, with excision sizes, the trial's report; `unlisted`: folders of exams of no row."""
+    """Write tables, the index and, where excision sizes are given, the trial's report.
+
+    `unlisted` are folders of exams that the table does not list.
+    """
     folder, growth, pooled = campaign.folder, growth_rows(campaign), pooled_reports(campaign)
     rows, excised = exam_rows(campaign, pooled), _excised(campaign.settings)
     masses = None if excised is None else set(_masses_of(excised))
@@ -356,7 +362,11 @@ def _names_with_finding(rows: Sequence[ExamRow], sought: str, name: str) -> list
 
 
 def check_inputs(exams: Sequence[Exam], settings: CampaignSettings) -> None:
-    """Read the excision sizes and the protocol, so that a fault in them, or against the exams, costs no work."""
+    """Read the table of excision sizes and the protocol, so that a fault in them costs no work.
+
+    Codes of patients and masses must be spelled as those of the exams; other patients and masses may be there. A mass
+    that was excised before every exam is refused.
+    """
     if settings.excision is None:
         purposes = {"columns": "is the layout of the excision table", "protocol": "is for the trial's report"}
         for option, purpose in purposes.items():

@@ -63,7 +63,11 @@ def no_bar(_label: str) -> AbstractContextManager[Progress]:
 
 @dataclass(eq=False)
 class Campaign:
-    """A run (or with `dry` its plan) and how far it is: results by step and name, faults by name, counts of steps."""
+    """A run, or the plan of one, and how far it is: results by step and name, faults by name, counts of steps.
+
+    A plan (`dry`) runs and writes nothing. `bar` gives, for what is counted ("files read", "steps"), a context with a
+    callback for those done and those needed.
+    """
 
     exams: Sequence[Exam]
     folder: Path
@@ -107,7 +111,11 @@ class Campaign:
         return dict(self.result(step, name).get("files", {}))
 
     def run(self) -> None:
-        """Run what is missing; what is done is kept where the disk is full, the cluster is lost, or on Ctrl-C."""
+        """Run what is missing: maps, estimates and figures by blocks, repeatability, sizes by it, pages, pools, growth.
+
+        Where the disk does not take a result (`UsageError`), the cluster is lost (`TactileBayesError`) or on Ctrl-C
+        (`BatchInterrupted`), all that is done is kept.
+        """
         self._read_sources()
         sound = [exam for exam in self.exams if exam.name not in self.faults]
         self.not_pooled = self.not_compared = self._unpoolable()
@@ -132,7 +140,11 @@ class Campaign:
                 self._run_masses("compare", growing, self._compare_task, masses=len(masses_with_visits(sound)))
 
     def _steps(self, exams: int, masses: int, *, learns: bool = False, compared: int = 0) -> dict[str, int]:
-        """Steps of so many exams, masses to pool and masses to compare; repeats that may teach the spread add some."""
+        """Steps that so many exams and masses take, done or not.
+
+        `masses` are to be pooled, `compared` between visits; where the repeats may teach the spread between exams
+        (`learns`), every exam gets its size by it.
+        """
         needed = {"map": exams, "estimate": exams, "figures": exams * self.settings.figures, "page": exams}
         needed |= {"pool": masses, "compare": compared}
         needed |= {"repeatability": 1, "size": exams} if learns else {}

@@ -147,7 +147,10 @@ class Task(Record):
 
 
 def _write_staged(task: Task, writes: Writes) -> Result:
-    """Write a step's files beside their place, equal ones in equal folders; returns digests and that folder."""
+    """Write a step's files beside their place; returns their digests and where they are.
+
+    Equal files have equal folders. Those of earlier runs are removed when the others are put in place.
+    """
     staged = task.folder / f"{WAITING}{task.step}-{task.digest[:_DIGITS]}"
     try:
         if writes:
@@ -163,7 +166,11 @@ def _write_staged(task: Task, writes: Writes) -> Result:
 
 
 def run_step(task: Task) -> Result:
-    """Run a step; returns its results, and digests and folder of its files, which `put_in_place` takes from there."""
+    """Run a step; returns the digests of its files by name, their staging folder, its seconds, and its other results.
+
+    `put_in_place` moves the files to their place: a worker that outlives its command must not. A fault of the exam is a
+    `TactileBayesError` without a path.
+    """
     begun, begun_cpu = time.perf_counter(), time.thread_time()
     try:
         facts, writes = task.make()
@@ -182,7 +189,11 @@ def run_step(task: Task) -> Result:
 def make_map(
     source: Path, *, source_sha256: str, expected: Mapping[str, str], normalise: str, address: str = ""
 ) -> Made:
-    """The exam's map from its scan or arrays, or as its file is one; one of another exam than `expected` is refused."""
+    """The exam's map from its scan or its arrays (brought in as `import` does), or the map that its file is.
+
+    `expected`: the table's facts of the exam, by column; a file of another exam is refused. `address`: of a file in an
+    object store, downloaded for as long as the map is made.
+    """
     if address:
         with reading.downloaded(address) as path:
             return make_map(path, source_sha256=source_sha256, expected=expected, normalise=normalise)
@@ -245,7 +256,10 @@ def make_estimate(folder: Path, settings: Settings, match: Match | None, side: s
 
 
 def _estimate_exam(folder: Path, settings: Settings, match: Match | None, side: str) -> SizeEstimate:
-    """The exam's estimate, with a match of the mass that lies there; `side`: by the table, where no scan says it."""
+    """The exam's estimate; with a match, of the mass that lies where other exams place it.
+
+    `side`: of the breast by the table, where no scan says it; the landmarks are held against it.
+    """
     path, findings = folder / layout.MAP, list[Finding]()
     if match is None:
         sized = estimate_file(path, settings)
@@ -276,7 +290,10 @@ def make_figures(folder: Path, settings: Settings, match: Match | None, side: st
 
 
 def make_page(folder: Path, expected: Mapping[str, str], *, report: str) -> Made:
-    """The exam's page and thumbnail, the size from the file `report`; what no scan says is the table's."""
+    """The exam's page and thumbnail from the files of earlier steps, its size from the file `report`.
+
+    Facts that the scans lack are the table's.
+    """
     tactile_map, scans = read_map_and_scans(folder / layout.MAP)
     from_table = {layout.SAME_IN_SCANS[name]: text for name, text in expected.items() if name in layout.SAME_IN_SCANS}
     facts = [from_table | scan for scan in scans or [{}]]
@@ -304,7 +321,10 @@ def make_pool(folder: Path, names: Sequence[str], settings: Settings) -> Made:
 def make_growth(
     folder: Path, visits: Sequence[Sequence[str]], settings: Settings, *, course: Course, figures: bool
 ) -> Made:
-    """Compare the visits of a mass as `compare` does; the table says that they are of one where landmarks do not."""
+    """Compare the visits of a mass as `compare` does; the table says that they are of one where landmarks do not.
+
+    `visits`: names of each visit's exams in order of time, with folders below `folder`; `course`: the table's facts.
+    """
     answers = [[_answer(folder / name) for name in names] for names in visits]
     with_draws = [one for maps in answers for one in maps if one.shape is not None]
     placed = all(answer.report.centre_patient_mm is not None for answer in with_draws)
@@ -375,7 +395,10 @@ def learn_repeatability(repeats: Sequence[ExamFolder]) -> Made:
 
 
 def make_size(folder: Path, settings: Settings, *, figures: bool) -> Made:
-    """Size an exam by the site's repeatability from its draws: its estimate with other sizes, if it has any."""
+    """Size an exam by the site's repeatability: its estimate with other sizes. Nothing where it had no size.
+
+    The size is from the draws of the exam, in the axes of its map as `estimate` has it.
+    """
     report = read_record(folder / layout.ESTIMATE, EstimateReport)
     if report.max_size_mm is None:
         return {}, {}

@@ -230,7 +230,11 @@ class NumberOr(_ParamType):
 
 
 def record_options(record: type[Record], *names: str, **attributes: Any) -> Decorator:
-    """The options of a command for fields of a record, by default all, as declared but for click's `attributes`."""
+    """The options of a command for some fields of a record, in this order; for all where none is named.
+
+    Type, range, default and help come from the field's declaration, `metavar` and the name from its ``extra``;
+    `attributes` of `click.option` replace them.
+    """
     return _chain(*(_option(record, name, attributes) for name in names or record.__struct_fields__))
 
 

@@ -92,7 +92,10 @@ _WAYS_OUT = {
 
 
 def refuse_existing(*paths: Path | None, force: bool) -> None:
-    """Refuse, before any work, paths (None is no file) that exist without --force, or can never be written."""
+    """Raise an error, before any work is done, when one of `paths` (None is no file) exists and --force was not given,
+    is a directory or a device (with or without --force), or lies in a directory that does not exist or may not be
+    written.
+    """
     for path in filter(None, paths):
         try:
             kind = special_kind(path.stat().st_mode)

@@ -29,7 +29,10 @@ StatedSize = Quantity | Interval
 
 
 def read_stated_size(path: Path, number: int | None = None) -> StatedSize | None:
-    """Largest size in a file of `estimate`, mm, or in the one of a `number` from 1 in its list; None without one."""
+    """Largest size in a file of `estimate`, mm; None without one.
+
+    `number` is the estimate's place in a list, from 1; a list of one needs none.
+    """
     head = first_bytes(path, 8)
     if is_json(head):
         return _from_json(path, number)
@@ -42,7 +45,10 @@ def read_stated_size(path: Path, number: int | None = None) -> StatedSize | None
 
 
 def fill_from_posteriors(table: Table) -> tuple[dict[str, list[Any]], list[Path]]:
-    """Columns of a trial table, filled from files of its ``posterior`` (``list.json#3`` is the third), and these."""
+    """Columns of a trial table, with sizes and intervals from the files of its ``posterior`` column, and these files.
+
+    Relative paths start at the table's folder; ``batch.json#3`` is the third of a list.
+    """
     filled = {name: list(values) for name, values in table.columns.items()}
     folder, paths = table.path.parent, []
     for row, name in enumerate(filled.get("posterior", [])):

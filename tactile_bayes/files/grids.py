@@ -341,7 +341,10 @@ _LONGEST_MM: Final = 500.0
 
 
 def import_grid(path: Path, options: GridOptions, *, progress: Progress = no_progress) -> tuple[TactileMap, list[str]]:
-    """Map of a file, and notes on how it was read; `progress` counts two of three steps, the caller's is the third."""
+    """Map of a file, and notes on how it was read; see `open_grid` and `grid_map`.
+
+    `progress` counts reading and the map as two of three steps; the caller's work is the third.
+    """
     with in_file(path):
         grid = open_grid(path, no_value=options.no_value, array=options.array or "")
         progress(1, 3)
@@ -351,7 +354,11 @@ def import_grid(path: Path, options: GridOptions, *, progress: Progress = no_pro
 
 
 def grid_map(grid: Grid, options: GridOptions) -> tuple[TactileMap, list[str]]:
-    """Map of a grid, and notes on how it was read; values that are not normalised are divided only by a `level`."""
+    """Map of a grid, and notes on how it was read.
+
+    The spacing may be left out where the grid has it. With ``normalise="none"`` values are divided only where a `level`
+    is given, which makes it ``"gain"``.
+    """
     spacing, notes = _spacing(grid, stated_mm=options.spacing_mm)
     marked: list[str] = []
     mean = _real(grid.arrays["mean"], name="mean")

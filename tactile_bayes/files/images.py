@@ -34,7 +34,10 @@ _GREY_HEADER: Final = re.compile(rb"P([25])" + 3 * rb"(?:\s|#[^\n\r]*[\n\r])+(\d
 
 
 def read_image(path: Path) -> Grid:
-    """Read a grey TIFF, PNG or PGM as the file numbers its pixels, more is brighter, NaN where it says "no value"."""
+    """Read a grey TIFF, PNG or PGM as the file numbers its pixels, more is brighter, NaN where it says "no value".
+
+    Colours, several images and samples that would be changed are refused; what a viewer would not show is noted.
+    """
     data = read_bytes(path, most=IMAGE_BYTES)  # from memory: a chunk cannot claim more than there is
     return _decode_graymap(data) if data[:1] == b"P" else _decode_tiff_or_png(data)
 

@@ -115,7 +115,12 @@ def natural_key(code: str) -> tuple[int, str]:
 
 
 def read_manifest(path: Path) -> list[Exam]:
-    """Read the table; exams come in the order of `Exam.order`, whatever the order of the rows."""
+    """Read the table; exams come in the order of `Exam.order`, whatever the order of the rows.
+
+    Besides cells that are not as ``exams.table.json`` has them it refuses a path that leaves the table's folder or has
+    backslashes, half a place, codes that differ by capitals or leading zeros alone, rows of one mass that contradict
+    each other, and visits of one mass whose order is not known.
+    """
     if kind := "a folder" if path.is_dir() else kind_of(path):
         way_out = "give the table of exams: `tactile-bayes campaign init FOLDER -o exams.csv` writes one"
         raise BadDataError(f"is {kind}, not a table", way_out=way_out, path=str(path))

@@ -27,7 +27,10 @@ _MOST_WINDOW: Final = 2**27
 
 
 def decompress_chunk(chunk: Any, *, count: Callable[[int], None]) -> bytes:
-    """Decompressed records of a chunk; `count` gets their size first, and no more than one byte beyond it is made."""
+    """Decompressed records of a chunk; `count` gets their size first, and no more than one byte beyond it is made.
+
+    A damaged chunk raises exceptions of many kinds, which `describe_damage` puts into words.
+    """
     packing, data, most = chunk.compression, bytes(chunk.data), chunk.uncompressed_size
     if packing == "zstd":
         declared = zstandard.frame_content_size(data)  # -1 where the frame does not say
@@ -72,7 +75,11 @@ _KINDS: Final = {Opcode.CHUNK: Chunk, Opcode.METADATA: Metadata, Opcode.ATTACHME
 
 
 class Messages:
-    """Times of messages, in order of log times, and with `keep` their bodies, in a few buffers: no object a message."""
+    """Times of messages, and their bodies with `keep`, in a few buffers: no Python object per message.
+
+    Where a file has them in another order than that of time, which the MCAP specification allows, they are given by
+    their log times.
+    """
 
     def __init__(self, *, keep: bool = True) -> None:
         self._times = array("Q")

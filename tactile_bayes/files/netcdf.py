@@ -77,7 +77,9 @@ class Contents(Record):
 
 
 def grouped_netcdf_bytes(groups: Mapping[str, Contents]) -> bytes:
-    """A netCDF-4 file of groups by name (``/``: root), each with its own dimensions; equal ones give equal bytes."""
+    """A netCDF-4 file of several groups by name, each with its own dimensions; ``/`` is the root.
+
+    Equal contents give equal bytes under one version of HDF5 and zlib."""
     name = f"memory {get_ident()}"  # HDF5 knows its open files by name, and another thread may be writing
     with h5py.File(name, "w", driver="core", backing_store=False, track_order=True) as file:
         written = 0

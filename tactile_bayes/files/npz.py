@@ -100,7 +100,10 @@ SHAPES = {"chain": 4, "log_density": 2, "accepted": 1, "twister": 2, "cursor": 2
 
 
 class CheckpointFile:
-    """A checkpoint file, rewritten after each block of steps; refused with another `context` of the chain."""
+    """A checkpoint file, made when it does not exist and rewritten after each block of steps.
+
+    `context` is a text that the chain depends on, such as the calibration's hash; with another it is refused.
+    """
 
     def __init__(self, path: Path, *, context: str = "") -> None:
         self.path, self.context = path, context

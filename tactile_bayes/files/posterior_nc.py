@@ -39,7 +39,12 @@ def write_posterior(
     groups: Mapping[str, DrawGroup] | None = None,
     force: bool = False,
 ) -> None:
-    """Write draws, of an estimate or of a size from several maps, with its report, as InferenceData has its groups."""
+    """Write the draws of an estimate, or of a mass's size from several maps, atomically; equal draws give equal bytes.
+
+    The file has groups as InferenceData has them: the (chain, draw) variables of the posterior, then `groups`, see
+    `inference_groups`; `report` is the estimate's, which `read_estimate` gives back. A map without an estimate has no
+    draws: a ValueError.
+    """
     method, draws, figures = _draws_of(result)
     finite = {name: v for name, v in figures.items() if not isinstance(v, float) or math.isfinite(v)}
     attributes = {

@@ -240,7 +240,11 @@ def schema_kind(schema: object) -> str:
 
 
 def wrong_kind(path: Path, expected: str, *, what: str, way_out: str) -> BadDataError:
-    """Error for a file that is not of the `expected` kind: names its own, or `what` where that is damaged."""
+    """Error for a file of another kind than `expected` (in the words of `kind_of`); names the kind where it is known.
+
+    `what` and `way_out` are the fault and the remedy where it is not, or where the file is of the expected kind and
+    damaged.
+    """
     kind = kind_of(path)
     if not kind or kind == expected:
         return BadDataError(what, way_out=way_out, path=str(path))

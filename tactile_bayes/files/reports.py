@@ -45,7 +45,11 @@ class Sized(Record):
 
     @property
     def leading(self) -> Self | AnotherExam:
-        """The sizes to give first (record 0130): `another_exam` until the site's spread between exams is known."""
+        """The record of the sizes to give first (record 0130): this one or `another_exam`.
+
+        Until a site's repeatability is known these are the sizes for exams as far apart as patients' (`another_exam`);
+        with it, or a stated spread, there is one interval.
+        """
         another: AnotherExam | None = getattr(self, "another_exam", None)
         return self if another is None else another
 

@@ -49,7 +49,11 @@ T = TypeVar("T")
 
 
 class ScanWriter:
-    """Writer of one scan to a binary stream, which stays open: its description, then messages as they arrive."""
+    """Writer of one scan to a binary stream, which stays open: its description, then messages as they arrive.
+
+    `truth` is the scene of a simulated scan, which `read_scan_report` returns beside the scan. `findings` are those of
+    the file that the scan is a copy of.
+    """
 
     def __init__(
         self,
@@ -212,7 +216,11 @@ def write_scan(
 
 
 def read_scan(path: Path) -> scans.Scan:
-    """Read a scan, of an unfinished file up to the last complete chunk; damage is for `read_scan_report` alone."""
+    """Read a scan; from an unfinished file, everything up to the last complete chunk.
+
+    Damaged chunks are an error: a scan with a hole must not pass for a whole one. `read_scan_report` reads around the
+    damage.
+    """
     file = read_scan_report(path)
     if file.damaged:
         way_out = "copy it again, or keep what is intact with `tactile-bayes import`"
@@ -422,7 +430,11 @@ class RecordingWriter(ScanWriter):
         self._send_message(self._log_channel, message, device_ns=device_ns, host_ns=host_ns)
 
     def flush(self) -> None:
-        """Hand the chunk to the system, where it survives this process; within `SYNC_S` it is on the disk too."""
+        """Close the chunk and hand it to the system, from where it survives this process.
+
+        Within `SYNC_S` it is on the disk too, and survives the computer. An OSError may be that of the disk before this
+        call.
+        """
         self._writer.flush()
         if self._synced is not None and self._synced.done():
             self._synced.result()  # raises what the disk did not take

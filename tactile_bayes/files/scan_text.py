@@ -393,7 +393,10 @@ def _without_word_columns(lines: Sequence[Line]) -> Sequence[Line]:
 
 
 def _blocks(lines: Sequence[Line], taxels: int | None) -> list[list[Line]]:
-    """Runs of lines of as many numbers as the longest rows have; lines of another width may stand before them."""
+    """Runs of lines of numbers, of which each has as many as the last: the longest of the text's widths.
+
+    Lines of numbers of another width that come first belong to what stands before.
+    """
     widths = [len(line.fields) for line in lines if len(line.fields) > 1 and line.is_numbers]
     if not widths:
         raise BadDataError("holds no row of numbers", way_out="give one row a frame, or blocks of rows")

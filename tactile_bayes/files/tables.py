@@ -151,7 +151,12 @@ class Table(Record):
 
 
 def read_table(source: Path | Sheet, schema_name: str) -> Table:
-    """Read a CSV file under the Table Schema ``data_schema/SCHEMA_NAME``, without blank rows and nameless columns."""
+    """Read a CSV file under the Table Schema ``data_schema/SCHEMA_NAME`` (``trial.table.json``...).
+
+    The file is UTF-8, with or without a byte order mark. Between the cells are commas, semicolons or tabs, and with the
+    last two a number may have a decimal comma. Blank lines are skipped, and so are rows without a filled cell and
+    columns without a name or a filled cell, which spreadsheets write.
+    """
     schema = load_schema(schema_name)
     fields = {field["name"]: field for field in schema["fields"]}
     path, text = (source.name, source.text) if isinstance(source, Sheet) else (source, read_text(source))
@@ -491,7 +496,10 @@ def read_lines(path: Path) -> list[str]:
 
 
 def read_text_table(path: Path, decimal: str | None = None) -> tuple[list[Line], str]:
-    """Lines of a text that are not blank, split so that most fields are numbers, and their separator in words."""
+    """Lines of a text that are not blank, split so that most fields are numbers, and their separator in words.
+
+    Where no `decimal` (``"point"`` or ``"comma"``) is stated, commas that may separate thousands are refused.
+    """
     texts = read_lines(path)
     separator = detect_separator(texts)
     if not separator:
@@ -545,7 +553,10 @@ def split_fields(text: str, separator: str) -> list[str]:
 
 
 def comma_numbers(rows: Iterable[Sequence[str]], marks: Sequence[str] = (), *, way_out: str) -> list[str]:
-    """Fields of number rows with commas; with a `way_out` refused where all may separate thousands or decimals."""
+    """Fields of rows of numbers that have a decimal comma, or commas between thousands.
+
+    With a `way_out` they are refused where all may have commas between thousands: which is meant cannot be told.
+    """
     fields = (field for row in rows if _is_number_row(row, marks) for field in row)
     commas = [one for one in fields if _ANY_DECIMAL_COMMA.fullmatch(one) or may_be_thousands(one)]
     if way_out and commas and all(map(may_be_thousands, commas)):

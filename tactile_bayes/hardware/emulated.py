@@ -139,7 +139,11 @@ class EmulatedHead(Device):
 
 
 def tool_readings(poses: TrackerPoses, faults: Faults, index: int, *, names: tuple[str, str]) -> list[ToolReading]:
-    """A tracker's tool at the n-th time of a scan, after the reference, its second name, where the body breathes."""
+    """Readings of a tracker's tools at the n-th time of a scan, with the faults that a tracker can have.
+
+    `names` are those of the tool and of a reference fixed to the body. The reference comes first, and only where the
+    body breathes.
+    """
     measured = index - index % max(1, faults.hold)  # the values of the latest measurement, at its own time
     x, y, z = poses.position_mm[measured].tolist()
     w, i, j, k = poses.quaternion_wxyz[measured].tolist()
@@ -225,7 +229,11 @@ def crc16(data: bytes) -> int:
 
 
 class EmulatedNdi(Device):
-    """NDI tracker that answers with the pose of now, by `elapsed` s of a shared scan or counted from TSTART."""
+    """Emulated NDI tracker: it answers with the poses of the present time, counted from TSTART; it sends nothing else.
+
+    It has only the faults that a tracker can have. `elapsed` returns the seconds of a scan that other devices play too,
+    None while that waits; by default the scan begins with TSTART.
+    """
 
     _port = "plugged in"
 
@@ -351,7 +359,10 @@ class PtyLink:
         return 0
 
     def finish(self, patience_s: float) -> None:
-        """Wait until the terminal's buffers stay empty: closing loses them, and only the last says what it holds."""
+        """Wait until the terminal's buffers are empty, because closing it loses them.
+
+        Only the last buffer says how much it holds, so it must stay empty for a while.
+        """
         end, left, empty = time.monotonic() + patience_s, bytearray(4), 0
         while time.monotonic() < end and empty < _LOOKS:
             time.sleep(_LOOK_S)

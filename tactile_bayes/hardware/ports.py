@@ -42,7 +42,10 @@ _NETWORK: Final = ("socket://", "rfc2217://")  #: Beginnings of URLs that name a
 
 
 class Port:
-    """A port by its URL: ``/dev/ttyUSB0``, ``socket://host:port``, ``rfc2217://...``; `role` is for messages."""
+    """A port by its URL: ``/dev/ttyUSB0``, ``socket://host:port``, ``rfc2217://host:port`` or pyserial's ``loop://``.
+
+    `role`, ``head`` or ``tracker``, is for messages.
+    """
 
     def __init__(self, url: str, *, baud: int, role: str) -> None:
         self.url = url
@@ -104,7 +107,11 @@ class Port:
 
     @contextlib.contextmanager
     def descriptor(self) -> Iterator[int]:
-        """File descriptor for a reading process; without one (rfc2217, loop) a thread here passes bytes on."""
+        """File descriptor that a reading process can inherit.
+
+        A port without one (rfc2217, loop) is read by a thread here that passes its bytes on; under load a thread may be
+        late where a process is not.
+        """
         number = None
         with contextlib.suppress(AttributeError, OSError, TypeError):
             number = int(self._serial.fileno())

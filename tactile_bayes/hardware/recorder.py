@@ -273,7 +273,10 @@ class Recorder:
             self._stopped_ns = self.clock_ns()
 
     def run(self, each_tick: Callable[[], None] = lambda: None) -> RecordingReport:
-        """Record to the end, whatever that is, and stop the devices; `each_tick` may call `stop` and `start`."""
+        """Record until the end; `each_tick`, called many times a second, may call `stop` and `start` and set `touch`.
+
+        However the recording ends, the devices get their stop commands and the report is complete.
+        """
         flushed_ns = self.clock_ns()
         try:
             while not self._done():

@@ -228,7 +228,11 @@ class TrackerDriver(Record):
     hint: str = "check its power, cable and line rate"  #: Advice when nothing comes.
 
     def check(self, port: Port, *, tool: str | None = None, reference: str | None = None) -> TrackerAnswer:
-        """Configure the tracker, ask it for records and choose the tools to follow; errors name what came."""
+        """Configure the tracker, ask it for records and choose the tools to follow.
+
+        `DeviceError` if no record fits the protocol, or none is of a tool that is named; `UsageError` if several tools
+        send and none is named.
+        """
         unasked = b""
         if self.stop:
             port.write(self.stop)
