@@ -82,7 +82,6 @@ class Gaussians(Record, eq=False):
 
     @classmethod
     def single(cls, mean: FloatArray, covariance: FloatArray) -> Gaussians:
-        """A single Gaussian."""
         return cls(np.ones(1), mean[None], covariance[None])
 
     def __len__(self) -> int:

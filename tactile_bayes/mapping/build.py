@@ -228,9 +228,7 @@ def build_map(
     findings = _numbered([select.scan_findings(scan) for scan in every_frame])
     try:
         findings += _arrangement_findings(selections, late_ms, figures, refuse=not settings.as_stated)
-        return _build(
-            findings, selections, settings, figures, late_ms=late_ms, gap_ms=max_pose_gap_ms, progress=progress
-        )
+        return _build(findings, selections, settings, figures, late_ms, max_pose_gap_ms, progress)
     except BadDataError as error:
         raise with_cause(error, (*findings, *exam_findings(figures))) from None
 
@@ -240,7 +238,6 @@ def _build(
     selections: list[SelectedFrames],
     settings: MapOptions,
     figures: dict[str, float],
-    *,
     late_ms: float,
     gap_ms: float,
     progress: Progress,

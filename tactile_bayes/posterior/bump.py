@@ -58,9 +58,8 @@ def covariance_from_log_widths(p: FloatArray, q: FloatArray, r: FloatArray) -> F
     even = scale * np.cosh(2.0 * ratio)
     # sinh(2 rho) / rho, finite at rho = 0
     odd = scale * 2.0 * np.where(ratio > 1e-8, np.sinh(2.0 * ratio) / np.where(ratio > 1e-8, 2.0 * ratio, 1.0), 1.0)
-    return np.stack(
-        [np.stack([even + odd * q, odd * r], axis=-1), np.stack([odd * r, even - odd * q], axis=-1)], axis=-2
-    )
+    rows = [even + odd * q, odd * r], [odd * r, even - odd * q]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def principal_widths(

@@ -382,9 +382,7 @@ def pose_covariance(fit: FieldFit) -> FloatArray:
     if noise is None or fit.scene.shape == "ridge":
         return covariance
     tangents, window = tangent_columns(fit), fit.target.window
-    across, along = (
-        _overlap_roots(axis, side) for axis, side in zip((window.x_mm, window.y_mm), noise.side_mm, strict=True)
-    )
+    across, along = map(_overlap_roots, (window.x_mm, window.y_mm), noise.side_mm)
     power = np.outer(np.sum(along**2, axis=1), np.sum(across**2, axis=1))
     i, j = np.nonzero(power > LEAST_EIGENVALUE * power.max())
     # columns whose products sum to the share of frames that two cells have in common

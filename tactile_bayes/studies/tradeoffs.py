@@ -71,7 +71,6 @@ class LumpCase(Record):
 
     @property
     def body(self) -> Body:
-        """Geometry and tissues of the body."""
         return self.plane.body(self.d_mm, self.depth_ratio, seat=self.seat)
 
     def settings(self, model: str) -> paper.StudySettings | SolidSettings:
@@ -189,9 +188,8 @@ def _element_mm(body: Body, settings: paper.StudySettings | SolidSettings) -> fl
 def _exact_answer(fitted: paper.MapFit, element_mm: float, rule: SizeRule) -> SizeAnswer:
     """Answer of a map without errors; the interval of its size is the calibration's scatter."""
     exact = {AMPLITUDE: fitted.amplitude, **dict(zip(WIDTHS, fitted.widths_mm, strict=True)), ELEMENT: element_mm}
-    quantities = {
-        name: IntervalWithError(value, value, value, 0.0) for name, value in exact.items() if value is not None
-    }
+    known = {name: value for name, value in exact.items() if value is not None}
+    quantities = {name: IntervalWithError(value, value, value, 0.0) for name, value in known.items()}
     size = rule.size_mm(fitted.amplitude, *fitted.widths_mm)
     if np.isfinite(size):
         low, high = (size * float(np.exp(z * np.nan_to_num(rule.scatter))) for z in ndtri([0.025, 0.975]))
@@ -306,9 +304,8 @@ def calibrated_rule(calibration: Calibration, *, name: str) -> SizeRule:
 
     def by_axes(amplitude: float, across: float, along: float | None) -> float:
         widths = across, across if along is None else along
-        return max(
-            float(axis.size_mm(np.array([mm]), np.array([amplitude]))[0]) for axis, mm in zip(axes, widths, strict=True)
-        )
+        sizes = [axis.size_mm(np.array([mm]), np.array([amplitude])) for axis, mm in zip(axes, widths, strict=True)]
+        return float(np.max(sizes))
 
     def outside(amplitude: float, across: float, along: float | None) -> list[str]:
         texts = calibration.outside(amplitude, across, across if along is None else along)

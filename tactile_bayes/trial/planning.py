@@ -116,11 +116,9 @@ def map_gains(designs: Iterable[Design]) -> tuple[Gain, ...]:
     """Gain from each further map at the same number of patients: change of power and of tactile error."""
     ordered = sorted(designs, key=lambda design: (design.patients, design.maps))
     return tuple(
-        Gain(
-            more.patients, fewer.maps, more.maps, more.power - fewer.power, more.tactile_percent - fewer.tactile_percent
-        )
-        for fewer, more in pairwise(ordered)
-        if fewer.patients == more.patients
+        Gain(b.patients, a.maps, b.maps, b.power - a.power, b.tactile_percent - a.tactile_percent)
+        for a, b in pairwise(ordered)
+        if a.patients == b.patients
     )
 
 

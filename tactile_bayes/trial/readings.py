@@ -72,9 +72,8 @@ class ModalitySizes(Record, eq=False):
         n = len(self.ex_vivo_mm)
         if len(self.mass) != n:
             set_fields(self, mass=np.arange(n))
-        if not (
-            self.patient.shape == self.ex_vivo_mm.shape == self.size_mm.shape == (n,) == (len(self.replicates_mm),)
-        ):
+        shapes = self.patient.shape, self.ex_vivo_mm.shape, self.size_mm.shape, (len(self.replicates_mm),)
+        if set(shapes) != {(n,)}:
             raise ValueError(f"{self.name}: patient, ex_vivo_mm, size_mm and replicates_mm must be of one length ({n})")
         if not (np.all(self.ex_vivo_mm > 0) and np.all(self.size_mm >= 0)):
             raise ValueError(f"{self.name}: ex_vivo_mm must be above 0 and size_mm must not be below it")
@@ -302,7 +301,6 @@ class Trial(Record, eq=False):
     files: Mapping[str, Path] = field(default_factory=dict)  #: Files that they were read from, by role.
 
     def sizes(self) -> dict[str, ModalitySizes]:
-        """The sizes by each modality."""
         return gather(self.readings, self.ex_vivo_mm)
 
     def sized_readings(self, modality: str) -> list[Reading]:

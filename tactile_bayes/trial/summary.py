@@ -206,9 +206,8 @@ def prediction_of(trial: Trial, modality: str) -> Prediction | None:
 
     The caliper's relative error is added in quadrature.
     """
-    stated = [
-        (one.key, uncertainty) for one in trial.sized_readings(modality) if (uncertainty := log_normal(one)) is not None
-    ]
+    sized = trial.sized_readings(modality)
+    stated = [(one.key, uncertainty) for one in sized if (uncertainty := log_normal(one)) is not None]
     if not stated:
         return None
     masses = mass_numbers(trial.ex_vivo_mm)
