@@ -126,6 +126,7 @@ class SurfaceCompliance(Record, eq=False):
 
     @property
     def cell_mm(self) -> float:
+        """Width of the cells."""
         return float(self.edges_mm[1] - self.edges_mm[0])
 
     def without_lump(self) -> FloatArray:

@@ -78,6 +78,7 @@ class Body(Record):
 
     @property
     def radius_mm(self) -> float:
+        """Half the diameter."""
         return 0.5 * self.d_mm
 
     @property

@@ -227,9 +227,11 @@ class _Ensemble:
 
     @property
     def steps(self) -> int:
+        """Number of steps taken."""
         return int(self._sampler.backend.iteration)
 
     def advance(self, steps: int) -> None:
+        """Take more steps."""
         self._state = self._sampler.run_mcmc(self._state, steps)
 
     def chain(self) -> FloatArray:
@@ -244,6 +246,7 @@ class _Ensemble:
         return {"lp": self._sampler.get_log_prob()[first:].T.ravel(), "accepted": accepted[first:].T.ravel()}
 
     def acceptance(self) -> float:
+        """Share of accepted proposals."""
         return float(np.mean(self._sampler.backend.accepted)) / self.steps
 
     def state(self) -> tuple[FloatArray, FloatArray, float, FloatArray, FloatArray]:

@@ -82,6 +82,7 @@ class Gaussians(Record, eq=False):
 
     @classmethod
     def single(cls, mean: FloatArray, covariance: FloatArray) -> Gaussians:
+        """A single Gaussian."""
         return cls(np.ones(1), mean[None], covariance[None])
 
     def __len__(self) -> int:

@@ -42,6 +42,7 @@ class FramePoses(Record, eq=False):
     """(n,) bool array: False without poses near in time; position and rotation are then meaningless but finite."""
 
     def part(self, frames: slice | BoolArray | IndexArray) -> FramePoses:
+        """A subset of the frames."""
         return FramePoses(self.position_mm[frames], self.rotation[frames], self.known[frames])
 
     def places_mm(self, point_mm: FloatArray) -> FloatArray:
@@ -139,6 +140,7 @@ class HeadMoments(Record, eq=False):
 
     @property
     def count(self) -> int:
+        """Number of frames."""
         return self.sums[0]
 
     def plane(self) -> Plane:
@@ -356,6 +358,7 @@ class Projection(Record, eq=False):
         return self.matrix[:, :, 3]
 
     def part(self, frames: slice | IndexArray | BoolArray) -> Projection:
+        """The projection of some of the frames."""
         return Projection(self.taxels, self.matrix[frames], self.cell_mm)
 
     def moved(self, cells: FloatArray) -> Projection:

@@ -123,6 +123,7 @@ class GrowingProfile:
             self._thin_out()
 
     def figures(self) -> dict[str, float]:
+        """`profile_figures` of the frames so far."""
         self._thin_out()
         return profile_figures(self._rows)
 

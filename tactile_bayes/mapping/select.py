@@ -256,6 +256,7 @@ class Jumps:
 
     @classmethod
     def of(cls, poses: TrackerPoses) -> Jumps:
+        """Jumps of a scan's poses."""
         jumps = cls()
         for time_s, place_mm in zip(poses.time_s.tolist(), poses.position_mm.tolist(), strict=True):
             jumps.add(time_s, place_mm)

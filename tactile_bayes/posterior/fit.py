@@ -47,6 +47,7 @@ class FieldFit(Record, eq=False, dict=True):
 
     @property
     def scene(self) -> Scene:
+        """Structures in the model."""
         return self.target.scene
 
     @cached_property
@@ -59,6 +60,7 @@ class FieldFit(Record, eq=False, dict=True):
 
     @property
     def centre_mm(self) -> tuple[float, float]:
+        """The bump's centre at the mode."""
         return self.at["x"], self.at["y"]
 
     @property
@@ -67,6 +69,7 @@ class FieldFit(Record, eq=False, dict=True):
         return self.mixture.log_evidence
 
     def modal(self) -> ModalBump:
+        """The bump at the mode."""
         sigma_x, sigma_y, _ = (float(one[0]) for one in drawn_widths(*(np.array([self.at[name]]) for name in "pqr")))
         return ModalBump(self.target.amplitude_at(self.mode), *self.centre_mm, sigma_x, sigma_y)
 

@@ -168,6 +168,7 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         return self.with_other_sd(float(np.hypot(self.other_sd, UNLIKE_SD)))
 
     def with_other_sd(self, other_sd: float, **source: str) -> BodyCalibration:
+        """This calibration with another `other_sd`."""
         return replace(self, spread=replace(self.spread, other_sd=other_sd, **source))
 
     @property

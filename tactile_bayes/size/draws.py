@@ -39,6 +39,7 @@ class BumpDraws(Record, eq=False):
         return replace(self, **{name: getattr(self, name).ravel() for name in BUMP})
 
     def median(self) -> BumpDraws:
+        """A single draw: the medians."""
         return replace(self, **{name: np.full(1, np.median(getattr(self, name))) for name in BUMP}, labels=None)
 
 

@@ -68,6 +68,7 @@ class PlaceShift(Record):
 
     @property
     def distance_mm(self) -> float:
+        """Length of the shift."""
         return float(np.hypot(*self.shift_mm))
 
     @property
@@ -220,6 +221,7 @@ class Change(Record, eq=False):
         return draws.summarise(100.0 * np.expm1(self.log_ratio), probability=probability, replicates=self.replicates)
 
     def log_summary(self, probability: float) -> draws.Quantity:
+        """Summary of the log ratio."""
         return draws.summarise(self.log_ratio, probability=probability, replicates=self.replicates)
 
 
@@ -235,6 +237,7 @@ class JointSizes(Record, eq=False):
     calibrations: tuple[BodyCalibration, ...]  #: One per visit: at the depth of fat that its maps give.
 
     def change(self, earlier: int, later: int) -> Change:
+        """Change from one visit to another."""
         c = self.covariance
         sd = np.sqrt(np.maximum(c[:, later, later] + c[:, earlier, earlier] - 2.0 * c[:, later, earlier], 1e-18))
         mean = self.mean[later] - self.mean[earlier]

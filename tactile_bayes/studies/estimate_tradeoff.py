@@ -210,6 +210,7 @@ class Tradeoff(Record):
 
     @property
     def default(self) -> MeasuredSetting:
+        """The program's default."""
         return next(row for row in self.rows if row.default)
 
     def cheapest_sufficient(self) -> MeasuredSetting | None:

@@ -44,6 +44,7 @@ class CaseSettings(CaseOptions, kw_only=True):
         return as_dict(self)
 
     def body(self, d_mm: float, depth_ratio: float, *, seat: float) -> Body:
+        """The body of a case."""
         return Body(d_mm, depth_ratio, seat, self.thickness_mm, self.fat_kpa, self.gland_ratio, self.poisson)
 
     def maps(self, body: Body) -> Callable[[float], Any]:
@@ -51,6 +52,7 @@ class CaseSettings(CaseOptions, kw_only=True):
         raise NotImplementedError
 
     def fitted(self, tactile_map: Any) -> MapFit:
+        """The Gaussian of a map."""
         raise NotImplementedError
 
     def recipe(self) -> dict[str, Any]:
@@ -111,6 +113,7 @@ class StudySettings(CaseSettings, kw_only=True):
         return self.over(self.surface(body))
 
     def far(self, layers: Layers) -> plane.LineFrames:
+        """The frame far from any lump."""
         return plane.press_layers(layers, head=self.head, mean_kpa=self.mean_kpa, cell_mm=self.cell_mm)
 
     def empirical(self, d_mm: float, layers: Layers, over: plane.LineFrames) -> plane.EmpiricalModel:

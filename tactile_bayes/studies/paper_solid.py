@@ -144,6 +144,7 @@ class SolidSettings(CaseSettings, kw_only=True):
     flat_field: bool = True  #: True when each taxel is divided by what it reads of the same body without the lump.
 
     def as_dict(self) -> dict[str, object]:
+        """Plain data for a store's header."""
         return {"model": "solid", **as_dict(self)}
 
     def recipe(self) -> dict[str, Any]:
@@ -157,9 +158,11 @@ class SolidSettings(CaseSettings, kw_only=True):
         return fit_raster(tactile_map, self)
 
     def geometry(self, body: Body) -> LumpGeometry:
+        """The ball in the body."""
         return LumpGeometry(body.radius_mm, body.radius_mm, body.centre_mm, body.layers)
 
     def condensed(self, body: Body) -> CondensedLump:
+        """The body around the ball, condensed."""
         return condense_lump(self.geometry(body), size=self.mesh_size)
 
     @property

@@ -213,6 +213,7 @@ class Population(Record):
     head: Head = field(default_factory=Head)
 
     def scenes(self, index: int) -> list[Scene]:
+        """The exams of one mass."""
         centred = self.first_centred is not None and index >= self.first_centred
         rng = np.random.default_rng([self.seed, index])
         body, lump = draw_body(replace(self.bodies, seat=(0.0, 0.0)) if centred else self.bodies, rng)

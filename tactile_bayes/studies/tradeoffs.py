@@ -71,6 +71,7 @@ class LumpCase(Record):
 
     @property
     def body(self) -> Body:
+        """Geometry and tissues of the body."""
         return self.plane.body(self.d_mm, self.depth_ratio, seat=self.seat)
 
     def settings(self, model: str) -> paper.StudySettings | SolidSettings:

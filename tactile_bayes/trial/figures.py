@@ -271,6 +271,7 @@ class Figures(Record):
     """Base of the records that hold figures: the value of each, its ends as ``NAME_interval``, and `reasons`."""
 
     def figure(self, name: str) -> Figure:
+        """A figure with its interval, by its name."""
         interval, reasons = f"{name}_interval", getattr(self, "reasons", {})
         ends: Any = getattr(self, interval, UNSET)
         if ends is UNSET:

@@ -301,6 +301,7 @@ class Trial(Record, eq=False):
     files: Mapping[str, Path] = field(default_factory=dict)  #: Files that they were read from, by role.
 
     def sizes(self) -> dict[str, ModalitySizes]:
+        """The sizes by each modality."""
         return gather(self.readings, self.ex_vivo_mm)
 
     def sized_readings(self, modality: str) -> list[Reading]:
