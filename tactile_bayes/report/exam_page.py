@@ -37,6 +37,7 @@ def exam_page(exam: ShownExam) -> str:
     if len(findings) > most:
         findings = [*findings[:most], f"And {len(findings) - most} more, which the full report tells."]
     masses = sorted(exam.main.masses, key=lambda one: one.number)
+    masses = masses if len(masses) > 1 or exam.elsewhere else []
     made = f"method {report.origin.settings.get('method', 'unknown')}"
     made += f"; {exam.report.known_words}" if size and exam.report.known_words else ""
     shown = exam.maps[:MOST_REPEATS] if several else ()
@@ -55,8 +56,8 @@ def exam_page(exam: ShownExam) -> str:
         colours=frame and svg.colour_bar(exam.main),
         marked=frame and svg.marked_place(exam.main),
         smallest=[] if least is None or drawn is None else list(svg.smallest_pictures(drawn, least)),
-        of_mass=f" of mass {exam.main.masses[0].number}" if len(masses) > 1 else "",
-        place=_place(exam) if masses else None,
+        of_mass=f" of mass {exam.main.masses[0].number}" if masses else "",
+        place=_place(exam) if exam.main.masses else None,
         size=size
         and {"ruler": svg.size_ruler(_intervals(exam, size)), "sentences": list(exam_words.size_sentences(exam, size))},
         nothing=[] if size else list(exam_words.nothing_sentences(exam)),

@@ -117,6 +117,11 @@ class ShownExam(Record, eq=False):
         return self.report.leading.max_size_mm
 
     @property
+    def elsewhere(self) -> bool:
+        """True if a mass was looked for at a place without a lump, and the masses of the map lie elsewhere."""
+        return self.main.report.centre_mm is None and len(self.main.masses) > 0
+
+    @property
     def disagrees(self) -> bool:
         """True if the maps are not of one size, or not of one mass."""
         return self.pooled is not None and self.pooled.status == DISAGREE
@@ -169,11 +174,12 @@ def headline(exam: ShownExam) -> str:
         return f"{lead} about {size.median:.1f} mm, {interval}"
     if exam.disagrees:
         return capitalised(exam.report.reason)
-    if masses:
+    if masses and not exam.elsewhere:
         return f"{'Lump' if len(masses) < 2 else f'{len(masses)} masses'} seen, no size"
     if exam.main.report.reason_code == CANNOT_SHOW:
         return "No answer: the data cannot show whether there is a lump"
-    return "No lump found in the area covered" if exam.main.report.reason_code in NO_LUMP else "No size"
+    where = "at the place looked at" if exam.elsewhere else "in the area covered"
+    return f"No lump found {where}" if exam.main.report.reason_code in NO_LUMP else "No size"
 
 
 def reason_on_paper(report: EstimateReport) -> str:
@@ -240,7 +246,9 @@ def nothing_sentences(exam: ShownExam) -> Iterator[str]:
         yield f"{capitalised(exam.pooled.reason)}."
     if report.reason_code in NO_LUMP:
         area = "" if tactile_map is None else f": {covered_text(tactile_map)}"
-        yield f"No lump was found in the area that was covered{area}."
+        covered = f"in the area that was covered{area}"
+        where = "at the place looked at; the masses below lie elsewhere" if exam.elsewhere else covered
+        yield f"No lump was found {where}."
         if report.reason_code == "ridge":
             yield "What rises at the cross on the picture is long like a rib, not round like a lump."
         if report.smallest_lump is not None:
@@ -378,6 +386,9 @@ def facts(exam: ShownExam) -> Iterator[tuple[str, str]]:
     for key in ("subject", "side", "mass", "visit", "posture", "examiner"):
         values = list(dict.fromkeys(scan[key] for scan in exam.scans if scan.get(key)))
         if values:
-            yield key.capitalize(), first_of([cut(value, 32) for value in values], 2)
+            text = first_of([cut(value, 32) for value in values], 2)
+            by_number = key == "mass" and len(exam.main.masses) > 1 and not exam.elsewhere
+            numbered = f" (number {exam.main.masses[0].number} on the map)" if by_number else ""
+            yield key.capitalize(), f"{text}{numbered}"
     if exam.labels.day:
         yield "Date", exam.labels.day

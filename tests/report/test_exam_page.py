@@ -298,11 +298,22 @@ def test_several_masses_are_numbered_with_a_place_each() -> None:
     second = unsized("its window reaches beyond the map")
     first = replace(second, number=1, reported=True, reason="")
     both = replace(report, masses=(first, second))
-    page = Page(exam_page(ShownExam((exam_map(tactile_map, both, side="left"),), None, SCANS)))
+    scans = ({**SCANS[0], "mass": "B"},)
+    page = Page(exam_page(ShownExam((exam_map(tactile_map, both, side="left"),), None, scans)))
+    assert "Mass B (number 1 on the map)" in page.words
     assert "2 masses, mass 1 about" in page.words
     assert "Size of mass 1" in page.words
     assert "no size (probability of a lump 0.99): its window reaches beyond the map" in page.words
     assert len(page.named("path", **{"class": "centre"})) == 2
+
+
+def test_a_mass_elsewhere_is_not_taken_for_the_one_that_was_looked_for() -> None:
+    page = Page(exam_page(without_lump(masses=(unsized("its window reaches beyond the map"),))))
+    assert "No lump found at the place looked at" in page.words
+    assert "No lump was found at the place looked at; the masses below lie elsewhere." in page.words
+    assert "Place of mass 2" in page.words
+    assert "2 no size (probability of a lump 0.99): its window reaches beyond the map" in page.words
+    assert "Lump seen" not in page.words
 
 
 def test_a_second_mass_is_drawn_as_its_ellipse() -> None:
