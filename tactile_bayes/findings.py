@@ -57,6 +57,7 @@ KINDS: Final[Mapping[str, Severity]] = {
     # of a campaign
     "unnamed_mass": "check",
     "own_axes": "check",
+    "after_excision": "caution",
 }
 """Severity by kind. Caution: the result may be off by more than its interval. Check: to be looked at first."""
 SEVERITIES: Final[tuple[Severity, ...]] = get_args(Severity)

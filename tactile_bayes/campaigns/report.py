@@ -22,7 +22,7 @@ from tactile_bayes.files.manifest_csv import Exam, same_code
 from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
 from tactile_bayes.files.reports import EstimateReport, PooledReport, centre_of
 from tactile_bayes.files.tables import Table
-from tactile_bayes.findings import Finding, by_severity, capitalised, counted, finding_lines, first_of, verdict
+from tactile_bayes.findings import Finding, by_severity, capitalised, counted, finding, finding_lines, first_of, verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.report.campaign_page import ExamEntry, MassEntry, VisitEntry, campaign_html, worst
 from tactile_bayes.report.compare import CompareReport, growths
@@ -221,9 +221,12 @@ def _trial_reading(row: ExamRow, modality: str, *, reader: str | None = None) ->
     }
 
 
-def growth_rows(campaign: Campaign) -> list[Growth]:
-    """Change of each mass with several visits, in order of the masses."""
-    compared, rows = campaign.keys["compare"], []
+def growth_rows(campaign: Campaign, excised_on: Mapping[tuple[str, str], date | None]) -> list[Growth]:
+    """Change of each mass with several visits, in order of the masses; those to a visit after excision have a caution.
+
+    `excised_on`: days of the masses' excisions, by patient and mass.
+    """
+    compared, rows = campaign.keys["compare"], list[Growth]()
     for name, visits in masses_with_visits(campaign.exams).items():
         codes, exam = [*visits], next(iter(visits.values()))[0]
         place = f"{layout.GROWTH}/{name}"
@@ -231,7 +234,13 @@ def growth_rows(campaign: Campaign) -> list[Growth]:
             report = read_record(campaign.folder / place / layout.COMPARED, CompareReport)
             of = {one.map for visit in report.visits for one in visit.maps}
             sized = [code for code, exams in visits.items() if any(one.name in of for one in exams)]
-            rows += growths(exam.patient, exam.mass, sized, report, f"{place}/{layout.GROWTH_PAGE}")
+            changes = growths(exam.patient, exam.mass, sized, report, f"{place}/{layout.GROWTH_PAGE}")
+            days, excision = visit_dates(visits), excised_on.get((exam.patient, exam.mass)) or date.max
+            for change in changes:
+                day = days[change.later]
+                after = f"visit {change.later} ({day}) is after the excision ({excision}): the mass was taken out before"
+                more = (finding("after_excision", after),) if day is not None and day > excision else ()
+                rows.append(replace(change, findings=by_severity((*more, *change.findings))))
         else:
             fault = campaign.faults.get(name)
             reason = "exams of fewer than two visits came through" if fault is None else fault.reason
@@ -283,13 +292,13 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
 
     `unlisted` are folders of exams that the table does not list.
     """
-    folder, growth, pooled = campaign.folder, growth_rows(campaign), pooled_reports(campaign)
-    rows, excised = exam_rows(campaign, pooled), _excised(campaign.settings)
-    masses = None if excised is None else set(_masses_of(excised))
+    folder, pooled, excised = campaign.folder, pooled_reports(campaign), _excised(campaign.settings)
+    excised_on = {} if excised is None else _excision_dates(excised)
+    rows, growth, masses = exam_rows(campaign, pooled), growth_rows(campaign, excised_on), set(excised_on)
     tables = {
         layout.DONE: [done_line(row) for row in rows if not row.failed],
         layout.FAILURES: failure_lines(campaign, rows),
-        layout.TRIAL: trial_lines(campaign, rows, pooled, masses),
+        layout.TRIAL: trial_lines(campaign, rows, pooled, None if excised is None else masses),
         **({layout.GROWN: [grown_line(one) for one in growth]} if growth else {}),
     }
     for name, lines in tables.items():
@@ -306,13 +315,15 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
     sized, failed = sum(row.size is not None for row in rows), sum(row.failed for row in rows)
     counts = f"{sized} sized, {len(rows) - sized - failed} without a size, {failed} failed"
     write_text(folder / INDEX, index_html(campaign, rows, pooled, growth, counts=counts, links=links), force=True)
-    left_out = set() if masses is None else {(row.exam.patient, row.exam.mass) for row in rows} - masses
+    examined = {(row.exam.patient, row.exam.mass) for row in rows}
+    left_out = [] if excised is None else sorted(examined - masses)
     doubts = {
-        "no size after excision, left out of trial.csv": [" ".join(mass) for mass in sorted(left_out)],
+        "no size after excision, left out of trial.csv": [" ".join(mass) for mass in left_out],
+        "sizes after excision of masses without an exam": [" ".join(mass) for mass in sorted(masses - examined)],
         "exams with a caution, see their findings": _names_with_finding(rows, "caution", "name"),
         "masses whose exams disagree, without a pooled size": _names_with_finding(rows, "maps_disagree", "of_mass"),
         "exams with a mass that no row names, see their findings": _names_with_finding(rows, "unnamed_mass", "name"),
-        **_dated_doubts(campaign.exams, excised),
+        **_dated_doubts(campaign.exams, excised_on),
         "folders of exams that the table does not list": unlisted,
     }
     doubtful = [f"{words}: {first_of(names, FEW)}" for words, names in doubts.items() if names]
@@ -325,9 +336,10 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
     )
 
 
-def _dated_doubts(exams: Sequence[Exam], excised: Table | None) -> dict[str, list[str]]:
+def _dated_doubts(
+    exams: Sequence[Exam], excised_on: Mapping[tuple[str, str], date | None]
+) -> dict[str, list[str]]:
     """Visits of masses with exams of several days, and those after excision, by what is told of them."""
-    excised_on = {} if excised is None else dict(zip(_masses_of(excised), excised.columns["date"], strict=True))
     last_day = {exam.of_mass: excised_on.get((exam.patient, exam.mass)) or date.max for exam in exams}
     days_of = defaultdict[str, set[date]](set)
     for exam in exams:
@@ -337,7 +349,7 @@ def _dated_doubts(exams: Sequence[Exam], excised: Table | None) -> dict[str, lis
         "exams of one visit on several days, the last of which counts": [
             name for name, days in days_of.items() if len(days) > 1
         ],
-        "visits after excision, left out of the report and not of growth.csv": [
+        "visits after excision, left out of the report and in growth.csv with a caution": [
             name for name, days in days_of.items() if max(days) > last_day[name]
         ],
     }
@@ -375,8 +387,8 @@ def check_inputs(exams: Sequence[Exam], settings: CampaignSettings) -> None:
     table = _excised(settings)
     if table is not None:
         _check_spelling(table, exams)
-        dates = dict(zip(_masses_of(table), table.columns["date"], strict=True))
-        at_excision([exam.as_reading for exam in exams], dates, fault=partial(_fault_of_exam, exams))
+        fault = partial(_fault_of_exam, exams)
+        at_excision([exam.as_reading for exam in exams], _excision_dates(table), fault=fault)
     settings_by(settings.protocol)
 
 
@@ -388,6 +400,11 @@ def _excised(settings: CampaignSettings) -> Table | None:
 def _masses_of(table: Table) -> Iterator[tuple[str, str]]:
     """Patient and mass of each row."""
     return zip(table.columns["patient"], table.columns["mass"], strict=True)
+
+
+def _excision_dates(table: Table) -> dict[tuple[str, str], date | None]:
+    """Days of excision by patient and mass, in the order of the rows; None where a row has none."""
+    return dict(zip(_masses_of(table), table.columns["date"], strict=True))
 
 
 def _check_spelling(table: Table, exams: Iterable[Exam]) -> None:

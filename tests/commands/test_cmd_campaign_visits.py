@@ -147,8 +147,9 @@ def test_one_visit_has_no_growth_landmarks_are_not_needed_and_findings_have_the_
     (tmp_path / "ex.csv").write_text("patient,mass,ex_vivo_mm,date\nP1,1,20,2026-02-01\n")
     both = campaign(tmp_path, lines, "--excision", "ex.csv").stdout
     assert "1 grown (growth.csv)" in both
-    assert "visits after excision, left out of the report and not of growth.csv: P1.vpost.m1" in both
+    assert "visits after excision, left out of the report and in growth.csv with a caution: P1.vpost.m1" in both
     (row,) = rows_of(tmp_path / "out" / "growth.csv")
     assert "CAUTION: no landmarks show where the mass of visit 1 (coded pre) lies" in row["findings"]
+    assert row["findings"].startswith("CAUTION: visit post (2026-04-10) is after the excision (2026-02-01)")
     campaign(tmp_path, lines[:1])  # files that this run would not make go
     assert not (tmp_path / "out" / "growth").exists()
