@@ -27,7 +27,7 @@ from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.posterior_nc import posterior_attributes
 from tactile_bayes.files.provenance import EXAM_FACTS, scans_of
 from tactile_bayes.files.reports import REPORTS, EstimateReport, MassReport, PooledReport, centre_of
-from tactile_bayes.findings import capitalised, finding_lines
+from tactile_bayes.findings import capitalised, counted, finding_lines
 from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
@@ -258,6 +258,9 @@ def masses_of(report: EstimateReport | PooledReport) -> tuple[ExportedMass, ...]
     """The masses that an estimate lists, or its only one, each with the leading sizes."""
     spread = report.figures.get("between_map_sd")
     listed = report.masses if isinstance(report, EstimateReport) else ()
+    if listed and not any(mass.reported for mass in listed):  # of a place without a lump: theirs is not its size
+        elsewhere = f"{report.reason}; the map shows {counted(len(listed), 'mass')} elsewhere"
+        report, listed = replace(report, reason=elsewhere), ()
     return tuple(_exported_mass(mass, spread) for mass in listed or (report,))
 
 

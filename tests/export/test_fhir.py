@@ -151,6 +151,11 @@ def test_every_mass_of_an_estimate_has_its_observations(estimate: dict[str, Any]
     assert found[0].centre_patient_mm == (1.0, 2.0)
     assert [mass.outcome.value for mass in found] == ["sized", "not-sized"]
     assert found[1].reason == "too near the rim"
+    gone = {"status": "no_estimate", "reason": "no lump found near (9, 9) mm", "reason_code": "undetected"}
+    empty = replace(report, **gone, **nothing, masses=(replace(first, reported=False),))
+    (place_alone,) = masses_of(empty)
+    assert (place_alone.outcome.value, place_alone.largest) == ("no-lump-shown", None)
+    assert place_alone.reason == "no lump found near (9, 9) mm; the map shows 1 mass elsewhere"
 
 
 @pytest.mark.skipif(not R4_SCHEMA, reason="FHIR_R4_SCHEMA does not name HL7's fhir.schema.json")
