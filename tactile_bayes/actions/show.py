@@ -239,7 +239,7 @@ def _table(path: Path) -> dict[str, Any]:
         schema = load_schema(f"{name}.table.json")
         required = {f["name"] for f in schema["fields"] if f.get("constraints", {}).get("required")}
         if header and required <= set(header):
-            table = read_table(path, f"{name}.table.json")
+            table = read_table(path, f"{name}.table.json", may_be_empty=True)
             filled = [n for n, values in table.columns.items() if any(v is not None for v in values)]
             kind = f"table: {name.replace('_', ' ')}"
             return {"schema": schema["$id"], "kind": kind, "rows": len(table), "columns": filled}

@@ -28,7 +28,7 @@ from tactile_bayes.files.provenance import scans_of
 from tactile_bayes.files.reading import HDF5_MAGIC, first_bytes
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.files.size_json import read_repeatability
-from tactile_bayes.findings import finding_lines
+from tactile_bayes.findings import counted, finding_lines
 from tactile_bayes.options import IdentityOptions
 from tactile_bayes.report.estimate_document import side_of
 from tactile_bayes.report.exam_page import exam_page
@@ -209,6 +209,9 @@ def _from_estimate(estimate_path: Path, map_path: Path | None) -> ShownExam:
     """Make the exam of a page from an estimate's file, and its map's, whose digest the estimate must name."""
     if estimate_path.suffix.lower() == ".json":
         document = load_json(estimate_path, way_out="give what `estimate --json` printed for one map")
+        if isinstance(document, list):
+            fault = f"holds {counted(len(document), 'estimate')} in a list, and a page takes one"
+            raise BadDataError(fault, way_out="give the maps: they are pooled if of one mass", path=str(estimate_path))
         report = checked_report(document, EstimateReport, path=estimate_path)
     else:
         report = read_estimate(estimate_path)

@@ -44,6 +44,8 @@ def open_campaign(folder: Path, *, dry: bool = False) -> Iterator[BatchStore | N
     if not has_journal:
         if has_files:
             raise UsageError(f"{folder} holds files, and no campaign; choose a new folder")
+        if not folder.absolute().parent.is_dir():
+            raise UsageError(f"{folder.parent} is not a directory; create it first")
         if dry:
             yield None
             return

@@ -238,7 +238,9 @@ def growth_rows(campaign: Campaign, excised_on: Mapping[tuple[str, str], date | 
             days, excision = visit_dates(visits), excised_on.get((exam.patient, exam.mass)) or date.max
             for change in changes:
                 day = days[change.later]
-                after = f"visit {change.later} ({day}) is after the excision ({excision}): the mass was taken out before"
+                after = (
+                    f"visit {change.later} ({day}) is after the excision ({excision}): the mass was taken out before"
+                )
                 more = (finding("after_excision", after),) if day is not None and day > excision else ()
                 rows.append(replace(change, findings=by_severity((*more, *change.findings))))
         else:
@@ -336,9 +338,7 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
     )
 
 
-def _dated_doubts(
-    exams: Sequence[Exam], excised_on: Mapping[tuple[str, str], date | None]
-) -> dict[str, list[str]]:
+def _dated_doubts(exams: Sequence[Exam], excised_on: Mapping[tuple[str, str], date | None]) -> dict[str, list[str]]:
     """Visits of masses with exams of several days, and those after excision, by what is told of them."""
     last_day = {exam.of_mass: excised_on.get((exam.patient, exam.mass)) or date.max for exam in exams}
     days_of = defaultdict[str, set[date]](set)

@@ -238,7 +238,7 @@ def check_facts(expected: Mapping[str, str], facts: Mapping[str, str]) -> None:
         return
     shown = list(dict.fromkeys([*(name for name in ("patient", "side") if name in both), *differs]))
     table_words, file_words = (", ".join(f"{name} {one[name]}" for name in shown) for one in (expected, both))
-    way_out = "is it another exam's file? correct the row or the file"
+    way_out = "is it another exam's file? correct the row, or the file's session (import --session)"
     raise BadDataError(f"the table says {table_words}; the file says {file_words}", way_out=way_out)
 
 

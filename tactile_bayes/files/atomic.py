@@ -88,6 +88,7 @@ _WAYS_OUT = {
     errno.ENOSPC: "make room, or choose another place",
     errno.EDQUOT: "make room, or choose another place",
     errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ENOENT: "create the folder that it is to lie in",
 }
 
 

@@ -150,7 +150,7 @@ class Table(Record):
         return _fault(self.line_numbers[row], column, what, way_out=way_out).with_path(self.path)
 
 
-def read_table(source: Path | Sheet, schema_name: str) -> Table:
+def read_table(source: Path | Sheet, schema_name: str, *, may_be_empty: bool = False) -> Table:
     """Read a CSV file under the Table Schema ``data_schema/SCHEMA_NAME`` (``trial.table.json``...).
 
     The file is UTF-8, with or without a byte order mark. Between the cells are commas, semicolons or tabs, and with the
@@ -168,7 +168,7 @@ def read_table(source: Path | Sheet, schema_name: str) -> Table:
         if not header:
             raise BadDataError("is empty", way_out=f"its first line must name columns: {_names(fields)}")
         _check_header(header, fields, wide=schema.get("wide", ""))
-        if not body:
+        if not body and not may_be_empty:
             raise BadDataError("holds a header and no rows", way_out="add at least one row")
         for line, cells in body:
             _check_length(line, cells, header)
@@ -337,8 +337,8 @@ def _parse_cell(text: str, field: Mapping[str, Any], *, decimal_comma: bool) -> 
         raise BadDataError(f"{_shown(text)} is not known", way_out=f"{guess}it must be {' or '.join(rules['enum'])}")
     if "pattern" in rules and not re.fullmatch(rules["pattern"], text):
         small = text.lower() if re.fullmatch(rules["pattern"], text.lower()) else ""
-        way_out = f"write {small}, in small letters" if small else field["description"]
-        raise BadDataError(f"{_shown(text)} does not match {rules['pattern']}", way_out=way_out)
+        way_out = f"write {small}, in small letters" if small else f"correct it: {field['description']}"
+        raise BadDataError(f"{_shown(text)} is too long or has letters that may not be there", way_out=way_out)
     return value
 
 

@@ -49,6 +49,8 @@ def test_a_dry_run_needs_no_leave_to_write(begun: Path, monkeypatch: pytest.Monk
     refused = run_here(*DRY[:-1], cwd=begun)
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
     assert f"out/{JOURNAL} cannot be opened (Permission denied); choose another place" in refused.stderr
+    nowhere = run_here("campaign", "run", "exams.csv", "-o", "no/out", "--dry-run", cwd=begun)
+    assert (nowhere.returncode, nowhere.stderr) == (2, "error: no is not a directory; create it first\n")
 
 
 def test_a_dry_run_leaves_a_journal_as_it_is(begun: Path) -> None:

@@ -39,6 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_repeat(place, "b.nc", seed=2, subject="P1", side="left")
     write_repeat(place, "other.nc", seed=3, subject="P2", side="left")
     (place / "a.json").write_text(run_here("estimate", "a.nc", "--json", "-o", "post.nc", cwd=place).stdout)
+    (place / "list.json").write_text(f"[{(place / 'a.json').read_text()},{(place / 'a.json').read_text()}]")
     run_here("estimate", "--pool", "a.nc", "b.nc", "-o", "both.nc", cwd=place)
     shutil.copy(place / "post.nc", place / "old.nc")
     with h5py.File(place / "old.nc", "r+") as file:
@@ -159,6 +160,7 @@ REFUSED = [
     (("post.nc", "a.json"), 2, "an estimate goes with one map"),
     (("both.nc",), 3, "both.nc: holds a size pooled from several maps; give the maps"),
     (("old.nc",), 3, "old.nc: holds draws without their estimate; give its map"),
+    (("list.json",), 3, "list.json: holds 2 estimates in a list, and a page takes one; give the maps"),
     (("a.nc", "a.nc"), 2, "a.nc is given twice; give each file once"),
     (("a.nc", "other.nc"), 3, "the maps differ in subject (P1, P2); give the maps of one mass"),
     (("a.nc", "a.json", "--size-calibration", "eq6"), 2, "an estimate has settings of its own; leave out --size"),

@@ -30,6 +30,7 @@ KINDS = {
     "trial.csv": (None, "table: trial", "rows"),
     "excision.csv": (None, "table: excision", "rows"),
     "failures.csv": ("tactile-bayes/failures/1", "table: failures", "step"),
+    "none.csv": ("tactile-bayes/failures/1", "table: failures", "rows     0"),
     "phantoms.csv": ("tactile-bayes/size_table/1", "table: size table", "rows"),
 }
 
@@ -42,7 +43,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("scan.mcap", "trial.csv", "excision.csv", "phantoms.csv"):
         shutil.copyfile(DEMO / name, place / name)
     row = "P1,1,1,1,a.mcap,map,it was cut off; copy it again"
-    (place / "failures.csv").write_text(f"patient,visit,mass,replicate,file,step,reason\n{row}\n")
+    header = "patient,visit,mass,replicate,file,step,reason\n"
+    (place / "failures.csv").write_text(f"{header}{row}\n")
+    (place / "none.csv").write_text(header)
     fast = ("--method", "laplace", "--size-calibration", "size.json", "--json")
     one = run_here("estimate", "a.nc", *fast, "-o", "post.nc", cwd=place)
     many = run_here("estimate", "a.nc", "b.nc", *fast, cwd=place)
