@@ -158,8 +158,7 @@ def _import_scan(source: Path, output: Path, request: ImportRequest) -> list[str
     scan = corrected(with_session(scan, request.session_file), request.corrections)
     inputs = hash_inputs(source=source, session=request.session_file, **request.scan_files)
     write_scan(output, scan, provenance=Provenance("import", settings, inputs), truth=truth, force=request.force)
-    doubts = (line for line in _arrangement_lines(scan) if line.rstrip(".") not in notes)
-    return [*describe_scan(scan), *notes, *(f"lost: {line}" for line in lost), *doubts]
+    return [*describe_scan(scan), *notes, *(f"lost: {line}" for line in lost), *_arrangement_lines(scan)]
 
 
 def _lengths(scan: Scan) -> str:
@@ -176,7 +175,7 @@ def _arrangement_lines(scan: Scan) -> list[str]:
     try:
         check = check_scan(scan, thorough=False)
     except BadDataError as error:
-        return [f"{LEADS['caution']}no map can be made of it: {error}"]
+        return [*finding_lines(scan.findings), f"{LEADS['caution']}no map can be made of it: {error}"]
     return [*finding_lines(check.doubts), *(finding_lines(check.findings_of(scan)) or [check.words])]
 
 

@@ -402,15 +402,14 @@ def scan(
         layout = replace(layout, time_unit="s")  # whatever unit a file has
     others = [times, _poses(poses, layout), _head(head), _calibration(calibration), _landmarks(landmarks)]
     if isinstance(frames, str | Path):
-        imported, notes = imports.import_arrays(path_of(frames), layout, others)
+        imported, _ = imports.import_arrays(path_of(frames), layout, others)
     else:
         arrays = {"frames": _array(frames)}
         if not arrays["frames"].ndim:
             raise UsageError(f"frames is {type(frames).__name__}; give (n, rows, columns) numbers, or a path")
-        imported, notes = imports.combine_sources([Source(arrays), *others], layout)
-    for note in notes:
-        if note.startswith("CAUTION"):
-            warnings.warn(note, stacklevel=4)
+        imported, _ = imports.combine_sources([Source(arrays), *others], layout)
+    for line in finding_lines(imported.findings):
+        warnings.warn(line, stacklevel=4)
     return corrected(with_session(imported, path_of(session)), corrections)
 
 

@@ -23,7 +23,7 @@ from tactile_bayes.files.reading import kind_of
 from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.scan_text import is_identity, read_frames, read_poses, visible_poses
 from tactile_bayes.files.sequence_mha import is_sequence, read_sequence
-from tactile_bayes.findings import LEADS, finding
+from tactile_bayes.findings import Finding, finding
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.select import LEAST_FRAMES, unit_question
 from tactile_bayes.presets import KPA_PER_UNIT, MM_PER_UNIT, PRESSURE_RANGE_KPA, PRESSURE_WINDOW_KPA
@@ -164,6 +164,7 @@ def combine_sources(sources: Sequence[Source], options: Stated) -> tuple[Scan, l
     """A scan of the sources' arrays, of which a later one stands for an earlier, and the notes on what was guessed."""
     stated = options
     notes: list[str] = []
+    findings: list[Finding] = []
     arrays: Arrays = {}
     checked_on = ""
     for source in sources:
@@ -183,13 +184,13 @@ def combine_sources(sources: Sequence[Source], options: Stated) -> tuple[Scan, l
     _check_numbers(arrays)
     if "frames" in arrays:
         arrays["counts"] = arrays.pop("frames")
-    _arrange_poses(arrays, stated, notes)
-    _arrange_frames(arrays, stated, notes)
+    _arrange_poses(arrays, stated, notes, findings)
+    _arrange_frames(arrays, stated, notes, findings)
     _arrange_times(arrays, stated)
     _check_largest(arrays)
     pressure = stated.unit not in (None, "counts")
     if pressure:
-        _as_counts(arrays, stated, notes)
+        _as_counts(arrays, stated, notes, findings)
     elif stated.saturation is not None:
         arrays["saturation_count"] = np.asarray(int(np.ceil(stated.saturation)))
     arrays = {name: arrays[name] for name in LAYOUT if name in arrays}
@@ -206,9 +207,7 @@ def combine_sources(sources: Sequence[Source], options: Stated) -> tuple[Scan, l
     facts = {"frames_unit": str(stated.unit)} if pressure else {}
     if notes:
         facts["imported_as"] = "; ".join(notes)[:2000]
-    cautions = (note.removeprefix(LEADS["caution"]) for note in notes if note.startswith(LEADS["caution"]))
-    findings = tuple(finding("unlike_an_exam", text) for text in cautions)
-    return replace(_scan_of_arrays(arrays, facts, checked_on), findings=findings), notes
+    return replace(_scan_of_arrays(arrays, facts, checked_on), findings=tuple(findings)), notes
 
 
 def _refuse_missing(arrays: Arrays, unknown: Sequence[str], *, pressure: bool) -> None:
@@ -241,7 +240,7 @@ def _leave_out_gaps(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
     notes += poses.notes
 
 
-def _arrange_poses(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
+def _arrange_poses(arrays: Arrays, stated: Stated, notes: list[str], findings: list[Finding]) -> None:
     """Make positions in mm, and quaternions with the scalar first, of the poses in any layout and unit."""
     if "pose_matrix" in arrays:
         if "position_mm" in arrays or "quaternion_wxyz" in arrays:
@@ -254,8 +253,8 @@ def _arrange_poses(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
             notes.append(f"{name} of shape {(width, pose_count)} read along its columns")
     if "quaternion_wxyz" in arrays and stated.pose_layout in ("xyzw", "euler"):
         if stated.pose_layout == "euler" and np.abs(arrays["quaternion_wxyz"]).max() <= _TURN:
-            caution = f"{LEADS['caution']}angles lie within {_TURN:.1f} and are read as degrees"
-            notes.append(f"{caution}: radians are to be multiplied by 57.296")
+            text = f"angles lie within {_TURN:.1f} and are read as degrees"
+            findings.append(finding("unlike_an_exam", text, "multiply radians by 57.296, and import them again"))
         arrays["quaternion_wxyz"] = quaternions(arrays["quaternion_wxyz"], stated.pose_layout)
     if "position_mm" in arrays:
         arrays["position_mm"] = arrays["position_mm"] * MM_PER_UNIT[stated.length_unit or "mm"]
@@ -297,7 +296,7 @@ def _poses_of_matrices(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:
     return matrices[:, :3, 3], np.asarray(Rotation.from_matrix(rotations).as_quat(scalar_first=True))
 
 
-def _arrange_frames(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
+def _arrange_frames(arrays: Arrays, stated: Stated, notes: list[str], findings: list[Finding]) -> None:
     """Make the counts (n, rows, columns)."""
     if "counts" not in arrays:
         return
@@ -336,10 +335,10 @@ def _arrange_frames(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
         raise BadDataError(what, way_out=way_out)
     arrays["counts"] = counts
     if counts.ndim == 3 and min(counts.shape[1:]) > 3:
-        _check_order(counts, stated, notes)
+        _check_order(counts, stated, findings)
 
 
-def _check_order(counts: np.ndarray, stated: Stated, notes: list[str]) -> None:
+def _check_order(counts: np.ndarray, stated: Stated, findings: list[Finding]) -> None:
     """Refuse readings of which neighbours agree better in another order, unless their order is stated."""
     means = counts.mean(axis=(1, 2), dtype=np.float64)
     if means.max() <= 0:
@@ -363,10 +362,10 @@ def _check_order(counts: np.ndarray, stated: Stated, notes: list[str]) -> None:
     if roughness >= min(_OTHER_ORDER * as_stated, transposed):  # of transposed frames the check of arrangements speaks
         return
     what = f"frames have neighbours that differ by {100 * (1 - np.sqrt(roughness / as_stated)):.0f} % less if {other}"
+    way_out = "put the readings in the order of the array"
     if stated.frame_order is None:
-        way_out = "put the readings in the order of the array; --frame-order rows takes them as they are"
-        raise BadDataError(what, way_out=way_out)
-    notes.append(f"{LEADS['caution']}{what}: the size may be wrong")
+        raise BadDataError(what, way_out=f"{way_out}; --frame-order rows takes them as they are")
+    findings.append(finding("unlike_an_exam", f"{what}: the size may be wrong", way_out))
 
 
 def _roughness(frames: FloatArray) -> float:
@@ -398,7 +397,7 @@ def _arrange_times(arrays: Arrays, stated: Stated) -> None:
         arrays["pose_time_s"] = arrays["pose_time_s"] + stated.pose_offset_s
 
 
-def _as_counts(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
+def _as_counts(arrays: Arrays, stated: Stated, notes: list[str], findings: list[Finding]) -> None:
     """Make counts of frames of pressures, with the gain and offset that give the pressures back."""
     unit = str(stated.unit)
     for name in _CALIBRATION:
@@ -410,7 +409,12 @@ def _as_counts(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
     whole = frames.dtype.kind in "iu" and frames.min() >= 0 and frames.max() <= _MOST_COUNTS
     kpa = frames.astype(np.float64) * factor
     gain, offset = (factor, 0.0) if whole else (_STEP_KPA, min(0.0, float(np.floor(kpa.min() / _STEP_KPA)) * _STEP_KPA))
-    notes.append(_pressure_note(kpa, unit, rounding="" if whole else f", kept to {1000 * _STEP_KPA:g} Pa"))
+    means_of, question = _pressed_means(kpa, unit)
+    rounding = "" if whole else f", kept to {1000 * _STEP_KPA:g} Pa"
+    notes.append(f"frames in {unit}{rounding}; {means_of}")
+    if question:
+        text = f"frames in {unit}: {means_of}"
+        findings.append(finding("unlike_an_exam", text, f"import them again with the right --unit ({question})"))
     if offset + gain * _MOST_COUNTS < min(kpa.max(), PRESSURE_RANGE_KPA[1]):  # the others would be cut off
         at = tuple(map(int, np.unravel_index(kpa.argmin(), kpa.shape)))
         what = f"frames in {unit} hold {frames.min():g} (first at {at}), and an array reads no such pressure"
@@ -423,8 +427,8 @@ def _as_counts(arrays: Arrays, stated: Stated, notes: list[str]) -> None:
     arrays["saturation_count"] = np.asarray(min(max(full, 1), _MOST_COUNTS))
 
 
-def _pressure_note(kpa: FloatArray, unit: str, *, rounding: str) -> str:
-    """Note on the frames' means; it asks for another unit where no examination presses so."""
+def _pressed_means(kpa: FloatArray, unit: str) -> tuple[str, str]:
+    """Words on the pressed frames' means, and a question for another unit where no examination presses so."""
     means = kpa.reshape(len(kpa), -1).mean(axis=1)
     if means.max() < 0:
         raise BadDataError(f"frames in {unit} are below 0 throughout", way_out="give pressures that rise when pressed")
@@ -436,8 +440,7 @@ def _pressure_note(kpa: FloatArray, unit: str, *, rounding: str) -> str:
     if middle >= PRESSURE_RANGE_KPA[1]:
         what = f"frames in {unit}: {means_of}, and an array's range ends at {PRESSURE_RANGE_KPA[1]:g} kPa"
         raise BadDataError(what, way_out=question or "give their unit, --unit")
-    lead, end = (LEADS["caution"], f": {question}") if question else ("", "")
-    return f"{lead}frames in {unit}{rounding}; {means_of}{end}"
+    return means_of, question
 
 
 # --- Checks of arrays in the layout.

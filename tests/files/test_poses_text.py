@@ -210,7 +210,9 @@ def test_gaps_of_arrays_are_gaps_too(hidden: float, as_matrices: bool) -> None:
 def test_angles_that_may_be_radians_are_asked_about() -> None:
     angles = TURNED.as_euler("ZYX")
     poses = TIME, PLACE, angles
-    with pytest.warns(UserWarning, match="CAUTION: angles lie within 6.3 and are read as degrees"):
+    with pytest.warns(
+        UserWarning, match="CAUTION: angles lie within 6.3 and are read as degrees; multiply radians by 57.296"
+    ):
         tb.scan(pressures(SCAN), SCAN.frames.time_s, poses, head=SCAN.head, unit="kPa", pose_layout="euler")
 
 
