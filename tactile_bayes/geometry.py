@@ -90,8 +90,13 @@ def check_rigid(transform: FloatArray, *, name: str) -> None:
         raise BadDataError(f"{name} must be a finite (4, 4) matrix (shape {transform.shape})")
     rotation = transform[:3, :3]
     departure = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-    if departure > NOT_RIGID or np.linalg.det(rotation) < 0 or not np.array_equal(transform[3], [0, 0, 0, 1]):
-        what = f"{name} is not a rigid transform (R R^T departs from 1 by {departure:.1e})"
+    faults = {
+        "its last row is not 0 0 0 1": not np.array_equal(transform[3], [0, 0, 0, 1]),
+        f"R R^T departs from 1 by {departure:.1e}": departure > NOT_RIGID,
+        "it mirrors": np.linalg.det(rotation) < 0,
+    }
+    if fault := next((words for words, wrong in faults.items() if wrong), ""):
+        what = f"{name} is not a rigid transform ({fault})"
         raise BadDataError(what, way_out="give a proper rotation and a translation in mm, last row 0 0 0 1")
 
 

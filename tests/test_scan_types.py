@@ -28,7 +28,11 @@ SURFACE = np.zeros((3, 4, 3))
         (lambda: TrackerPoses(np.array([0.0, 1.0]), P[:1], Q), "position_mm has shape"),
         (lambda: HeadGeometry(SURFACE, 0.0, np.eye(4)), "pitch_mm is 0.0"),
         (lambda: HeadGeometry(SURFACE, 1.5, 2 * np.eye(4)), "not a rigid transform"),
-        (lambda: HeadGeometry(SURFACE, 1.5, np.diag([1.0, 1.0, -1.0, 1.0])), "not a rigid transform"),
+        (lambda: HeadGeometry(SURFACE, 1.5, np.diag([1.0, 1.0, -1.0, 1.0])), "not a rigid transform .it mirrors"),
+        (
+            lambda: HeadGeometry(SURFACE, 1.5, np.eye(4) + 55 * np.eye(4, k=-1)[[0, 0, 0, 3]]),
+            "its last row is not 0 0 0 1",
+        ),
         (lambda: ElementCalibration(-np.ones((3, 4)), np.zeros((3, 4))), "negative at"),
         (lambda: ElementCalibration(np.ones((3, 4)), np.zeros((4, 3))), "offset_kpa has shape"),
         (lambda: Landmarks(np.zeros(2), np.zeros(3)), "sternal_notch_mm has shape"),

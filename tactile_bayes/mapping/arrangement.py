@@ -149,6 +149,7 @@ class Arrangement(Record, eq=False):
     sway_mm: float = 0.0
     sways_a_minute: float = 0.0
     """`sway_mm`, `sways_a_minute`: Distance and rate of the body's motion to and fro."""
+    poses: tuple[str, ...] = ()  #: How the poses are made, if otherwise than as stated, and what to do then.
 
     @property
     def in_words(self) -> str:
@@ -160,7 +161,8 @@ class Arrangement(Record, eq=False):
         if self.late_ms:
             way = "late" if self.late_ms > 0 else "early"
             return f"the poses' times are {abs(self.late_ms):.0f} ms too {way} against the frames'"
-        return " and ".join(CORRECTIONS[name] for name in self.corrections) or "all is as it is stated"
+        mistakes = self.poses[:1] or [CORRECTIONS[name] for name in self.corrections]
+        return " and ".join(mistakes) or "all is as it is stated"
 
     @property
     def slow(self) -> bool:
@@ -206,7 +208,7 @@ class ArrangementCheck(Record, eq=False):
     @property
     def refused(self) -> bool:
         """True where `map` refuses the scan: another arrangement is sure. Another clock can be stated to it."""
-        return self.log_odds >= log(SURE_ODDS) and bool(self.best.corrections)
+        return self.log_odds >= log(SURE_ODDS) and bool(self.best.corrections or self.best.poses)
 
     @property
     def not_shown(self) -> tuple[str, ...]:
@@ -255,7 +257,7 @@ class ArrangementCheck(Record, eq=False):
         return words, finding(
             "wrong_arrangement",
             "the sensor array or the tracker seems not to be mounted as stated; size and place may be wrong",
-            convention.import_again(self.best.corrections),
+            self.best.poses[1] if self.best.poses else convention.import_again(self.best.corrections),
             "have it checked how the array and the tracker are mounted",
         )
 
@@ -303,15 +305,38 @@ def odds_words(log_odds: float) -> str:
     return "above 10^6" if tens >= 6 else f"10^{tens}" if tens >= 3 else f"{exp(log_odds):.0f}"
 
 
-def check_arrangement(selection: SelectedFrames, *, latency_ms: float = 0.0, thorough: bool = True) -> ArrangementCheck:
+def check_arrangement(
+    selection: SelectedFrames, *, latency_ms: float = 0.0, thorough: bool = True, other_poses: bool = False
+) -> ArrangementCheck:
     """Compare the stated arrangement with all of up to `MOST_CHANGES` corrections, and with a body that moved.
 
     Unless `thorough`, several corrections are tried only where none alone fits. The best is the likeliest plausible
-    arrangement, each of whose corrections must gain `LIKELY_ODDS`.
+    arrangement, each of whose corrections must gain `LIKELY_ODDS`. Poses of another kind are tried with `other_poses`,
+    and where something speaks against the stated arrangement.
     """
     overlap = _Overlap.of(selection, latency_ms)
     if overlap is None:
         return _TOO_SHORT
+    check = _with_corrections(selection, overlap, thorough=thorough)
+    doubted = check.best is not check.stated or check.contradicting or check.stated.agreement < LEAST_AGREEMENT
+    return _with_other_poses(overlap, check) if doubted or other_poses else check
+
+
+def _with_other_poses(overlap: _Overlap, check: ArrangementCheck) -> ArrangementCheck:
+    """The check, with poses of another kind as the best arrangement where the frames agree with that alone."""
+    rough = _Overlap.of(overlap.selection, overlap.latency_ms, rough=True) or overlap
+    roughly = [replace(rough, paths={(): path}).judge(()) for _, path in convention.other_paths(rough.path(()))]
+    closest = max(range(len(roughly)), key=lambda number: roughly[number].gain_over(rough.stated_fit[0]))
+    words, path = list(convention.other_paths(overlap.path(())))[closest]
+    other = replace(replace(overlap, paths={(): path}).judge(()), poses=words)
+    odds, to_best = (overlap.stretches * other.gain_over(one) - log(len(roughly)) for one in (check.stated, check.best))
+    if not other.plausible or odds < log(LIKELY_ODDS) or to_best < log(LIKELY_ODDS) * (1 - check.best.changes):
+        return check
+    return replace(check, best=other, log_odds=odds, contradicting=False)
+
+
+def _with_corrections(selection: SelectedFrames, overlap: _Overlap, *, thorough: bool) -> ArrangementCheck:
+    """The stated arrangement against corrections of it, other clocks, and a body that moved."""
     # an identity has no other lever arm to try
     lever = _LEVER[:1] if np.allclose(selection.scan.head.scanhead_from_tracker, np.eye(4)) else _LEVER
     combinations: list[Corrections] = [sum(parts, ()) for parts in product(_ARRAY, _FRAMES, lever, _ROTATIONS)]
@@ -322,7 +347,7 @@ def check_arrangement(selection: SelectedFrames, *, latency_ms: float = 0.0, tho
         return ArrangementCheck(stated, stated, 0.0, {one[0]: 0.0 for one in single})
     trials: list[Trial] = [(one, 0.0) for one in single]
     trials += [((), float(sign * ms)) for ms in CLOCK_MS for sign in (1, -1)]
-    rough = None if thorough else _Overlap.of(selection, latency_ms, rough=True)
+    rough = None if thorough else _Overlap.of(selection, overlap.latency_ms, rough=True)
     if rough is not None:
         close, excluded = _screened(rough, trials, stretches=overlap.stretches)
         check = _compared(overlap, [stated, *(overlap.judge(*one) for one in close)], tried=len(trials) + 1)
@@ -397,7 +422,10 @@ def check_scan(
     """Check a scan as recorded, by its frames within the window; `BadDataError` where there is none."""
     selection = select_frames(scan, pressure_window_kpa=pressure_window_kpa)
     doubts = (*scan_findings(scan), *scan_doubts(selection, pressure_window_kpa=pressure_window_kpa))
-    return replace(check_arrangement(selection, thorough=thorough), doubts=doubts)
+    check = check_arrangement(selection, thorough=thorough, other_poses=True)
+    if not check.refused:
+        convention.check_convention([selection])  # as map does, which refuses the scan
+    return replace(check, doubts=doubts)
 
 
 _NOT_JUDGED: Final = Arrangement((), spread=0.0, explained=0.0, lasting=0.0, agreement=0.0)
@@ -521,7 +549,7 @@ class _Overlap(Record, eq=False, dict=True):
         tolerance = _ROUGH_TOLERANCE if self.rough else COMPARED_TOLERANCE
         rest, levelled = map_fit([array], values, cells, tolerance=tolerance, within=not self.rough)
         # by another clock the first or last frames have no pose: all at one place they would seem to agree
-        weight = np.repeat(self._path(corrections).known.astype(np.float64), varying.shape[1])
+        weight = np.repeat(self.path(corrections).known.astype(np.float64), varying.shape[1])
         cell = cells.number
         cell_block = block * (int(cell.max()) + 1) + cell
         total, count = np.bincount(cell, weight * rest), np.bincount(cell, weight)
@@ -549,7 +577,7 @@ class _Overlap(Record, eq=False, dict=True):
         mounted = corrected(scan, (name for name in corrections if name.startswith(("lever", "quarter"))))
         tracker_from_head = inverse(mounted.head.scanhead_from_tracker)
         taxels = array.weight.T @ apply(tracker_from_head, surface.reshape(-1, 3)[array.taxels])
-        middle, path = taxels.mean(axis=0), self._path(corrections)
+        middle, path = taxels.mean(axis=0), self.path(corrections)
         centre, offsets = path.places_mm(middle), taxels - middle
         spread = path.rotation @ (offsets.T @ offsets) @ path.rotation.swapaxes(1, 2)
         scatter = len(offsets) * np.cov(centre.T, bias=True) + spread.mean(axis=0)
@@ -559,7 +587,7 @@ class _Overlap(Record, eq=False, dict=True):
         agreement = abs(float(normal @ (path.rotation @ tracker_from_head[:3, 2]).mean(axis=0)))
         return place.swapaxes(1, 2), agreement
 
-    def _path(self, corrections: Corrections) -> FramePoses:
+    def path(self, corrections: Corrections) -> FramePoses:
         """Mean poses of the tracker at the averaged frames; known where all of these lie within its times."""
         rotations = tuple(name for name in corrections if name in _ROTATIONS[-1])
         if rotations not in self.paths:

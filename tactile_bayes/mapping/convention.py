@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, permutations, product
 from typing import Final
 
 import numpy as np
 
-from tactile_bayes.declarations import Record
+from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding, finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, inverse, rotation_from_quaternion
-from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, Projection
+from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, FramePoses, Projection
 from tactile_bayes.mapping.select import SelectedFrames, chunks
 from tactile_bayes.scans import TrackerPoses
 
@@ -143,6 +143,47 @@ def directions_along(x_mm: FloatArray) -> FloatArray:
     return directions
 
 
+# --- Poses of other makes: inverted, or of angles in another order, unit or sense.
+
+INVERTED: Final = "the poses lead from the base to the sensor", "invert the 4 x 4 matrices, and import the scan again"
+_UNITS: Final = {
+    "in degrees": ("angles, degrees=True", 1.0),
+    "in radians": ("angles", float(np.degrees(1.0))),
+    "of the other sense": ("-angles, degrees=True", -1.0),
+}
+"""How angles are given, as scipy takes them, and the factor to those read as degrees."""
+
+
+def other_paths(path: FramePoses) -> Iterator[tuple[tuple[str, str], FramePoses]]:
+    """Words, way out and path of each other reading of poses: inverted, and of other angles than z, new y, new x."""
+    back = path.rotation.swapaxes(1, 2)
+    yield INVERTED, replace(path, position_mm=-np.einsum("mij,mj->mi", back, path.position_mm), rotation=back)
+    r = path.rotation
+    angles = (
+        np.arctan2(r[:, 1, 0], r[:, 0, 0]),
+        -np.arcsin(np.clip(r[:, 2, 0], -1, 1)),
+        np.arctan2(r[:, 2, 1], r[:, 2, 2]),
+    )
+    for axes, (unit, (call, factor)) in product(permutations("xyz"), _UNITS.items()):
+        first, second, third = (_turns(axis, factor * angle) for axis, angle in zip(axes, angles, strict=True))
+        orders = {"".join(axes).upper(): first @ second @ third, "".join(axes): third @ second @ first}
+        for order, rotation in orders.items():
+            if (order, factor) in (("ZYX", 1.0), ("zyx", -1.0)):
+                continue  # as stated, and the inverse rotation, which is a correction
+            about = f"about {', the new '.join(axes)}" if order.isupper() else f"about the fixed {', '.join(axes)}"
+            words = f"the rotations' angles (azimuth, elevation, roll) are {unit}, {about}"
+            quaternions = f'Rotation.from_euler("{order}", {call}).as_quat(scalar_first=True)'
+            way_out = f"import the scan again with quaternions of scipy's {quaternions}"
+            yield (words, way_out), replace(path, rotation=rotation)
+
+
+def _turns(axis: str, angle: FloatArray) -> FloatArray:
+    """(m, 3, 3) rotations about one axis by (m,) angles."""
+    wxyz = np.zeros((len(angle), 4))
+    wxyz[:, 0], wxyz[:, "wxyz".index(axis)] = np.cos(angle / 2), np.sin(angle / 2)
+    return rotation_from_quaternion(wxyz)
+
+
 # --- Check of a tracker's rotation convention (order and sense) against the motion of the head.
 
 DECLARED = "scalar first"
@@ -240,12 +281,17 @@ def convention_way_out(selections: Sequence[SelectedFrames]) -> str:
     return _way_out(convention_agreement(selections) or {DECLARED: 0.0})
 
 
+_ANGLES_TOO: Final = "order and unit of angles"
+
+
 def _way_out(agreement: dict[str, float]) -> str:
     best = max(agreement, key=agreement.__getitem__)
     if best == DECLARED or agreement[best] < AGREEMENT:
-        return "check the quaternion order (scalar first) and scanhead_from_tracker"
+        return (
+            f"check the quaternion order (scalar first), {_ANGLES_TOO}, the positions' axes, and scanhead_from_tracker"
+        )
     seems = f"the quaternions seem to be {best} (agreement {agreement[best]:.2f} of 1)"
-    return f"{seems}; {import_again(CONVENTIONS[best])}"
+    return f"{seems}; {import_again(CONVENTIONS[best])}; or check {_ANGLES_TOO}"
 
 
 def _poses_near_used(part: SelectedFrames) -> TrackerPoses:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import tactile_bayes as tb
 from tactile_bayes.declarations import replace
@@ -104,8 +105,33 @@ def test_a_mistake_is_refused_and_named(name):
     assert np.array_equal(right.poses.quaternion_wxyz, lump().poses.quaternion_wxyz)
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("order", "call"), [("XYZ", "angles, degrees=True"), ("zxy", "angles, degrees=True"), ("ZYX", "angles")]
+)
+def test_angles_of_another_order_or_in_radians_are_named(order, call):
+    """They were told as an array or quaternions the wrong way round, and `--correct` made a map of them."""
+    poses = lump().poses
+    angles = Rotation.from_quat(poses.quaternion_wxyz, scalar_first=True).as_euler(order, degrees="degrees" in call)
+    wxyz = Rotation.from_euler("ZYX", angles, degrees=True).as_quat(scalar_first=True)
+    check = check_scan(replace(lump(), poses=TrackerPoses(poses.time_s, poses.position_mm, wxyz)), thorough=False)
+    assert check.refused
+    assert f'Rotation.from_euler("{order}", {call}).as_quat(scalar_first=True)' in check.remedy
+
+
+@pytest.mark.long
+def test_poses_that_lead_from_the_base_to_the_sensor_are_named():
+    """They were told as quaternions with the scalar last."""
+    poses = lump().poses
+    back = rotation_from_quaternion(poses.quaternion_wxyz).swapaxes(1, 2)
+    place, wxyz = -np.einsum("mij,mj->mi", back, poses.position_mm), poses.quaternion_wxyz * [1.0, -1, -1, -1]
+    check = check_scan(replace(lump(), poses=TrackerPoses(poses.time_s, place, wxyz)), thorough=False)
+    assert check.refused
+    assert check.words.startswith("the poses lead from the base to the sensor (odds ")
+
+
 def test_a_scan_that_is_right_is_left_alone():
-    check = checked(lump())
+    check = check_arrangement(select(lump()), thorough=False, other_poses=True)
     assert check.best is check.stated
     assert not check.findings
     assert not set(check.not_shown) & set(SEEN)

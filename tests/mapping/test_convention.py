@@ -13,6 +13,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import finding
 from tactile_bayes.geometry import inverse, quaternion_from_rotation, rigid, rotation_from_quaternion
 from tactile_bayes.mapping import convention
+from tactile_bayes.mapping.arrangement import check_scan
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.convention import CONVENTIONS, check_convention, convention_findings, import_again
 from tactile_bayes.mapping.select import SelectedFrames, select_frames
@@ -70,6 +71,13 @@ def test_a_wrong_convention_hardly_ever_passes(name):
     verdicts = [verdict(told(scan_of(seed), name)) for seed in range(SCANS)]
     assert verdicts.count("refused") > 0.6 * SCANS
     assert verdicts.count("passed") <= 0.1 * SCANS
+
+
+def test_import_and_check_refuse_what_map_refuses():
+    """They said that all is as it is stated, and map then refused the scan."""
+    scan = next(one for seed in range(SCANS) if verdict(one := told(scan_of(seed), WRONG[0])) == "refused")
+    with pytest.raises(BadDataError, match="the head's face and its motion are .* or check order and unit of angles"):
+        check_scan(scan, thorough=False)
 
 
 @pytest.mark.long
