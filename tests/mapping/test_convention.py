@@ -76,7 +76,7 @@ def test_a_wrong_convention_hardly_ever_passes(name):
 def test_import_and_check_refuse_what_map_refuses():
     """They said that all is as it is stated, and map then refused the scan."""
     scan = next(one for seed in range(SCANS) if verdict(one := told(scan_of(seed), WRONG[0])) == "refused")
-    with pytest.raises(BadDataError, match="the head's face and its motion are .* or check order and unit of angles"):
+    with pytest.raises(BadDataError, match=r"the head's face and its motion are .* or check order and unit of angles"):
         check_scan(scan, thorough=False)
 
 
