@@ -63,7 +63,7 @@ def plan_action(
     errors = read_pilot(pilot, excision, typed.get("against"))
     if errors is not None:
         protect_inputs(*errors.trial.files.values())
-        for doubt in errors.doubts():
+        for doubt in errors.doubts() if as_json else ():
             click.echo(f"{pilot}: {doubt}", err=True)
     with progress_bar("designs") as progress:
         plan = planned(typed, errors, progress)

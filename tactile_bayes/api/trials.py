@@ -20,6 +20,7 @@ from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_ex
 from tactile_bayes.files.documents import dump_json, read_protocol
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.tables import Sheet, Table, check_references, read_table
+from tactile_bayes.findings import capitalised
 from tactile_bayes.options import MOST_PATIENTS, Aim, PlanErrors, PlanOptions, TrialSettings
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
 from tactile_bayes.progress import Progress, no_progress
@@ -221,7 +222,7 @@ class TrialPlan(TextResult, eq=False):
     @property
     def text(self) -> str:
         """The text that ``plan`` prints."""
-        return plan_text(self.report)
+        return "".join(f"{capitalised(doubt)}\n" for doubt in self.doubts) + plan_text(self.report)
 
     def write_json(self, path: Path, *, force: bool = False) -> None:
         """Write the file of ``plan -o``."""

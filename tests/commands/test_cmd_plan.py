@@ -158,6 +158,10 @@ def test_python_plans_as_the_command_does(tmp_path: Path) -> None:
     assert found.text == plan(*SMALL, *words, "--map-sd", 0.2).stdout
     frames = {name: pandas.read_csv(path) for name, path in tables.items()}
     assert {**tb.plan(**given, **frames).document, "provenance": 0} == {**found.document, "provenance": 0}
+    frames["excision"] = frames["excision"].assign(
+        ex_vivo_mm=frames["excision"].ex_vivo_mm / 10, ex_vivo_second_mm=None
+    )
+    assert tb.plan(**given, **frames).text.startswith("Doubtful: 14 of 25 ex-vivo sizes outside 2 to 150 mm")
 
 
 @pytest.mark.parametrize(
