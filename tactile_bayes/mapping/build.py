@@ -326,7 +326,7 @@ def _select(scans: list[Scan], settings: MapOptions, late_ms: float, gap_ms: flo
     try:
         select.refuse_without_frames(selections, pressure_window_kpa=window)
     except BadDataError as error:
-        count = sum(map(len, (scan.frames for scan in scans)))
+        count = sum(len(scan.frames) for scan in scans)
         if settings.every > 1 and count < select.LEAST_FRAMES:
             what = f"one frame of every {settings.every} leaves {counted(count, 'frame')}, none of which can be used"
             raise BadDataError(what, way_out="give a smaller --every") from None

@@ -445,7 +445,7 @@ def _prior_findings(result: MapDraws, prior: BumpPrior) -> Iterator[Finding]:
         (("log_ratio_sd",), ratio, 0.0, prior.log_ratio_sd),
     ):
         named, kept = [name for name in names if name in own], float(draws.std()) / sd
-        if named and max(kept, kept * abs(float(draws.mean()) - mean) / sd) > 0.5:
+        if named and max(kept, kept * abs(float(draws.mean()) - mean) / sd) > verdict.MOST_PRIOR_SHARE:
             given = ", ".join(f"{name} = {getattr(prior, name):g}" for name in named)
             text = "the size follows the priors it was estimated with as much as the map"
             remedy = f"{given}: leave {' and '.join(named)} out of the settings"

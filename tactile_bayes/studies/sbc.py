@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 
 import numpy as np
 from scipy.stats import binom, chisquare, poisson
@@ -62,10 +63,9 @@ class RankTest(Record):
         return self.ecdf_p > 1.0 - BAND
 
 
-def rank_test(name: str, ranks: IntArray, *, draws: int, tails: FloatArray | None = None) -> RankTest:
-    """Run all tests on one parameter's (n,) ranks from 0 to `draws`; `tails` are those of `uniform_least_tails`, by
-    default computed here."""
-    tails = uniform_least_tails(len(ranks), draws) if tails is None else tails
+def rank_test(name: str, ranks: IntArray, *, draws: int) -> RankTest:
+    """Run all tests on one parameter's (n,) ranks from 0 to `draws`."""
+    tails = uniform_least_tails(len(ranks), draws)
     # equally likely tails of discrete counts differ by rounding
     as_far = float(np.mean(tails <= least_tail(ecdf_counts(ranks[None], draws), len(ranks))[0] * (1.0 + 1e-9)))
     share = (ranks + 0.5) / (draws + 1)
@@ -114,6 +114,7 @@ def least_tail(counts: IntArray, n: int) -> FloatArray:
     return np.asarray(np.min(tails[counts, np.arange(len(uniform))], axis=-1))
 
 
+@cache
 def uniform_least_tails(n: int, draws: int) -> FloatArray:
     """(BAND_SIMULATIONS,) `least_tail` of n simulated uniform ranks, with a seed of their own."""
     rng = np.random.default_rng([n, draws])
@@ -354,5 +355,4 @@ def rank_tests(maps: list[MapRanks]) -> list[RankTest]:
     ranks = np.array([one.ranks for one in maps if one.ranks is not None])
     if not len(ranks):
         return []
-    tails = uniform_least_tails(len(ranks), DRAWS)
-    return [rank_test(name, column, draws=DRAWS, tails=tails) for name, column in zip(RANKED, ranks.T, strict=False)]
+    return [rank_test(name, column, draws=DRAWS) for name, column in zip(RANKED, ranks.T, strict=False)]

@@ -291,16 +291,15 @@ def calibrated_rule(calibration: Calibration, *, name: str) -> SizeRule:
     amplitude and widths are exact.
     """
     if isinstance(calibration, BodyCalibration):
-        population = calibration
 
         def by_bodies(amplitude: float, across: float, along: float | None) -> float:
             width = np.array(mean_width_mm(across, along))
-            return float(np.exp(population.corrected_log_size(np.log(np.array(amplitude)), np.log(width))))
+            return float(np.exp(calibration.corrected_log_size(np.log(np.array(amplitude)), np.log(width))))
 
-        scatter = population.fit.get("left_out_sd", float(np.exp(population.spread.mean[0])))
-        form = "Eq 6" if population.residual is None else "Eq 6 and its residual"
+        scatter = calibration.fit.get("left_out_sd", float(np.exp(calibration.spread.mean[0])))
+        form = "Eq 6" if calibration.residual is None else "Eq 6 and its residual"
         source = f"{form} of {name} at an average depth of fat (`estimate` reads it from the frames)"
-        return SizeRule(by_bodies, float(scatter), source, population.outside)
+        return SizeRule(by_bodies, float(scatter), source, calibration.outside)
     axes = calibration.x, calibration.y
 
     def by_axes(amplitude: float, across: float, along: float | None) -> float:
