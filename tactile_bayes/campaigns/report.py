@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from datetime import date
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -387,7 +386,11 @@ def check_inputs(exams: Sequence[Exam], settings: CampaignSettings) -> None:
     table = _excised(settings)
     if table is not None:
         _check_spelling(table, exams)
-        fault = partial(_fault_of_exam, exams)
+
+        def fault(row: int, column: str, words: str, /, *, way_out: str) -> BadDataError:
+            where = f"table of exams, line {exams[row].line}, column {column}"
+            return BadDataError(f"{where}: {words}", way_out=way_out)
+
         at_excision([exam.as_reading for exam in exams], _excision_dates(table), fault=fault)
     settings_by(settings.protocol)
 
@@ -418,10 +421,6 @@ def _check_spelling(table: Table, exams: Iterable[Exam]) -> None:
             if code != spelled:
                 words = f"{code!r} is {spelled!r} in the table of exams (line {exam.line})"
                 raise table.error(row, column, words, way_out="write it one way in both tables")
-
-
-def _fault_of_exam(exams: Sequence[Exam], row: int, column: str, words: str, /, *, way_out: str) -> BadDataError:
-    return BadDataError(f"table of exams, line {exams[row].line}, column {column}: {words}", way_out=way_out)
 
 
 def _write_report(folder: Path, settings: CampaignSettings, growth: Sequence[Growth]) -> tuple[str, str]:

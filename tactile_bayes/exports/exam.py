@@ -32,6 +32,7 @@ from tactile_bayes.geometry import FloatArray, apply
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import IdentityOptions
+from tactile_bayes.report.estimate_document import at_place, from_xiphoid
 from tactile_bayes.report.estimate_text import exams_label
 
 # --- Unique identifiers that follow from content: equal content, equal identifier, on every machine.
@@ -152,6 +153,13 @@ class ExportedMass(Record, eq=False):
     """`centre_mm`, `centre_patient_mm`: Medians of x and y in `plane` and `patient`; None where the file has none."""
     narrower: str = ""
     """The narrower interval, for exams that differ less, in words; empty where there is one interval."""
+
+    @property
+    def place(self) -> str:
+        """Where it lies, in words: from the xiphoid, else on the map; empty where the file has no place."""
+        if self.centre_patient_mm is not None:
+            return from_xiphoid(*self.centre_patient_mm)
+        return "" if self.centre_mm is None else f"{at_place(*self.centre_mm)} on the map"
 
     @property
     def outcome(self) -> Code:

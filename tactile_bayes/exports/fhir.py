@@ -112,7 +112,8 @@ class _Resources:
         notes = [RESEARCH_USE, self.estimate.verdict_line, *self.estimate.lines]
         notes += [finding.narrower] if finding.narrower else []
         if len(self.estimate.masses) > 1:
-            notes.append(f"Mass {finding.number} of {len(self.estimate.masses)}")
+            place = f", {finding.place}" if finding.place else ""
+            notes.append(f"Mass {finding.number} of {len(self.estimate.masses)}{place}")
         return {
             "resourceType": "Observation",
             "id": self.id(role),
@@ -151,11 +152,12 @@ def _lines(estimate: exam.EstimateFile) -> Iterator[str]:
     yield estimate.verdict_line
     yield from estimate.lines
     for one in estimate.masses:
-        mass = f"Mass {one.number}: " if len(estimate.masses) > 1 else ""
+        several = len(estimate.masses) > 1
+        mass, place = f"Mass {one.number}: " if several else "", f", {one.place}" if several and one.place else ""
         if one.largest is None or one.smallest is None:
-            yield f"{mass}{one.outcome.meaning}. Reason: {one.reason or one.code}."
+            yield f"{mass}{one.outcome.meaning}{place}. Reason: {one.reason or one.code}."
             continue
-        yield f"{mass}Largest size {exam.size_words(one.largest)}."
+        yield f"{mass}Largest size {exam.size_words(one.largest)}{place}."
         yield f"{mass}Smallest size {exam.size_words(one.smallest)}."
         if one.narrower:
             yield f"{mass}{one.narrower}."

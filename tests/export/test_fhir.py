@@ -12,7 +12,8 @@ import pytest
 from export_files import exported
 
 from tactile_bayes.declarations import as_dict, from_plain, replace
-from tactile_bayes.exports.exam import masses_of
+from tactile_bayes.exports.exam import Identity, masses_of, parse_estimate
+from tactile_bayes.exports.fhir import bundle_of
 from tactile_bayes.files.reports import EstimateReport, Place
 from tactile_bayes.findings import finding
 
@@ -151,6 +152,11 @@ def test_every_mass_of_an_estimate_has_its_observations(estimate: dict[str, Any]
     assert found[0].centre_patient_mm == (1.0, 2.0)
     assert [mass.outcome.value for mass in found] == ["sized", "not-sized"]
     assert found[1].reason == "too near the rim"
+    both = bundle_of(replace(parse_estimate(estimate, Path("e.json")), masses=found), Identity())
+    (told,) = resources(both, "DiagnosticReport")
+    where = "1 mm to the patient's right of the xiphoid and 2 mm above it"
+    assert f" mm, {where}. Mass 1: Smallest size " in told["conclusion"]
+    assert {"text": f"Mass 1 of 2, {where}"} in resources(both, "Observation")[0]["note"]
     gone = {"status": "no_estimate", "reason": "no lump found near (9, 9) mm", "reason_code": "undetected"}
     empty = replace(report, **gone, **nothing, masses=(replace(first, reported=False),))
     (place_alone,) = masses_of(empty)
