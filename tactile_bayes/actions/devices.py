@@ -152,7 +152,7 @@ def replay_action(*, scan: Path, output: Path | None, speed: float, **record_opt
     """Replay a scan through emulated devices, recorder and live view, as if it were being recorded."""
     original = read_scan(scan)
     with tempfile.TemporaryDirectory() as folder, _emulated(scan, speed, poses=bool(len(original.poses))) as urls:
-        options = {"like": scan, "clock": "shared", "at_once": True}
+        options = {"like": scan, "clock": "shared", "at_once": True, "accept_calibration": True}
         options |= {"replayed": dict(original.session), "replay_speed": speed}
         options |= record_options | {f"{role}_url": url for role, url in urls.items()} | {"tracker_protocol": "open"}
         if original.landmarks is not None:

@@ -81,11 +81,12 @@ class Request(RecordOptions, kw_only=True):
         }
 
 
-def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration | None, Landmarks | None]:
-    """Geometry, calibration and landmarks, read from the files of the options; `UsageError` where one is missing.
+def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration | None, str, Landmarks | None]:
+    """Geometry, calibration, its head if --like gives it, and landmarks; `UsageError` where a file is missing.
 
     Without a calibration is --uncalibrated: the head's own full scale is needed for one.
     """
+    owner = ""
     like = read_scan(request.like) if request.like else None
     if request.head_geometry:
         head = read_head_geometry(request.head_geometry)
@@ -98,10 +99,10 @@ def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration | 
     elif request.array_calibration:
         calibration = read_array_calibration(request.array_calibration).calibration
     elif like is not None:
-        calibration = like.element_calibration
+        calibration, owner = like.element_calibration, like.session.get("head_id", "")
     else:
         raise UsageError("the array's calibration is missing; give --array-calibration, --like or --uncalibrated")
-    return head, calibration, _landmarks(request)
+    return head, calibration, owner, _landmarks(request)
 
 
 def calibration_age(request: Request, *, head_id: str, today: date) -> dict[str, str]:
@@ -270,12 +271,12 @@ def make_recording(request: Request) -> tuple[RecordingReport, bool]:
     if request.tracker_url == request.head_url:
         raise UsageError(f"--head and --tracker are both {request.head_url}; give two ports")
     refuse_existing(request.output, force=request.force)
-    head, given, landmarks = instrument_of(request)
+    head, given, owner, landmarks = instrument_of(request)
     facts = request.facts()
     with ExitStack() as after, ExitStack() as stack:
         hello, lines, follower = _connect(request, stack)
         _check_fit(hello, head, request)
-        calibration = calibration_for(hello, given, request)
+        calibration = calibration_for(hello, given, request, owner=owner)
         age = calibration_age(request, head_id=hello.device_id, today=date.today())
         session = request.session(hello, follower, facts) | age
         check_session(session, path=request.output)
@@ -372,14 +373,21 @@ def _check_fit(hello: HelloReading, head: HeadGeometry, request: Request) -> Non
         click.echo(f"one frame in {request.every}: {hello.rate_hz / request.every:g} Hz", err=True)
 
 
-def calibration_for(hello: HelloReading, given: ElementCalibration | None, request: Request) -> ElementCalibration:
-    """The calibration given, which must be of a head with this full scale; without one a nominal gain."""
+def calibration_for(
+    hello: HelloReading, given: ElementCalibration | None, request: Request, *, owner: str = ""
+) -> ElementCalibration:
+    """The calibration given, which must be of this head and its full scale; without one a nominal gain."""
     full_scale, name = hello.saturation_count, f"head {request.head_url}"
     if given is None:
         if not full_scale:
             raise DeviceError(f"{name}: its HELLO has saturation count 0; it must be the count at full scale, as 4095")
         shape = hello.rows, hello.columns
         return ElementCalibration(np.full(shape, PRESSURE_RANGE_KPA[1] / full_scale), np.zeros(shape), full_scale)
+    if owner not in ("", hello.device_id) and not request.accept_calibration:
+        raise UsageError(
+            f"{name} is {hello.device_id!r}, {request.like} was recorded with {owner!r}; give this head's "
+            "--head-geometry and --array-calibration, or --accept-calibration"
+        )
     if given.saturation_count != full_scale and not request.accept_calibration:
         raise UsageError(
             f"{name} is saturated at {full_scale} counts, the calibration given at {given.saturation_count}; calibrate "

@@ -213,6 +213,15 @@ class Session(Record, forbid_unknown_fields=False):
     source: Text64 | None = None  #: Where the scan came from: recorded, imported, simulated.
 
 
+_OTHER_WORDS: Final = {
+    "side": ("breast", "laterality", "brust", "seite", "cote", "sein", "lado", "seno", "lato"),
+    "subject": ("patient_id", "patient_code", "participant", "patientin", "paciente", "paziente"),
+    "examiner": ("operator", "untersucher", "examinateur"),
+    "visit": ("besuch", "visita"),
+}
+"""Names under which a fact would be lost, by its own."""
+
+
 def check_session(session: Mapping[str, object], *, path: Path) -> None:
     """Check the facts of a scan: those of `Session`, and others, which are texts with names in small letters."""
     for name in session:
@@ -240,7 +249,8 @@ def read_session(path: Path) -> dict[str, str]:
             raise BadDataError(f"{key} is set by the recording itself", way_out=f"leave {key} out", path=str(path))
     known = set(names_of(Session)).difference(SET_BY_RECORDING)
     for key in document:
-        near = ["side"] if key in ("breast", "laterality") else difflib.get_close_matches(key, known, n=1, cutoff=0.8)
+        near = [name for name, words in _OTHER_WORDS.items() if key in words]
+        near = near or difflib.get_close_matches(key, known, n=1, cutoff=0.8)
         if near and near[0] not in document:
             raise BadDataError(f"{key} is not known", way_out=f"did you mean {near[0]}?", path=str(path))
     check_session(document, path=path)

@@ -62,7 +62,7 @@ def test_a_recording_tells_the_age_of_its_array_calibration(monkeypatch: pytest.
 def test_readings_at_the_heads_own_full_scale_carry_no_pressure() -> None:
     """A head of 10 bits was taken for one of 12: its saturated readings counted as pressure."""
     hello = HelloReading("7", 2, 3, 1023, 100.0)
-    request = SimpleNamespace(head_url="/dev/x", accept_calibration=False)
+    request = SimpleNamespace(head_url="/dev/x", like="last.mcap", accept_calibration=False)
     nominal = calibration_for(hello, None, request)
     assert nominal.saturation_count == 1023
     assert np.isnan(nominal.to_kpa(np.full((1, 2, 3), 1023, np.uint16))).all()
@@ -72,7 +72,9 @@ def test_readings_at_the_heads_own_full_scale_carry_no_pressure() -> None:
         UsageError, match="saturated at 1023 counts, the calibration given at 4095; calibrate this head"
     ):
         calibration_for(hello, twelve_bits, request)
+    with pytest.raises(UsageError, match=r"is '7', last.mcap was recorded with '6'"):  # it was taken without a word
+        calibration_for(hello, nominal, request, owner="6")
     request.accept_calibration = True
-    assert calibration_for(hello, twelve_bits, request) is twelve_bits
+    assert calibration_for(hello, twelve_bits, request, owner="6") is twelve_bits
     with pytest.raises(DeviceError, match="saturation count 0"):
         calibration_for(hello._replace(saturation_count=0), None, request)
