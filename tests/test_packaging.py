@@ -73,7 +73,7 @@ def test_the_wheel_holds_every_module_and_no_tests(installed):
 
 def test_the_wheel_installs_the_program(installed):
     (entry_points,) = installed.glob("*.dist-info/entry_points.txt")
-    assert "tactile-bayes = tactile_bayes.cli:main" in entry_points.read_text()
+    assert "tactile-bayes = tactile_bayes.__main__:main" in entry_points.read_text()
 
 
 @pytest.mark.parametrize("layout", ["checkout", "wheel"])

@@ -13,6 +13,7 @@ import pytest
 from in_process import run_here
 
 from tactile_bayes import errors
+from tactile_bayes.__main__ import main as start
 from tactile_bayes.cli import GROUPS, main
 from tactile_bayes.shell import interrupt_on_signals
 from tests.conftest import ROOT
@@ -85,6 +86,18 @@ def test_ctrl_c_once_the_command_has_ended_leaves_its_exit_code() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("before", [signal.default_int_handler, signal.SIG_IGN])
+def test_ctrl_c_while_the_program_is_loaded_prints_no_traceback(monkeypatch: pytest.MonkeyPatch, before) -> None:
+    """In the first 0.15 s of every command it did; where the signal is ignored, it stays so."""
+    found, kept = [], signal.signal(signal.SIGINT, before)
+    monkeypatch.setattr("tactile_bayes.cli.main", lambda: found.append(signal.getsignal(signal.SIGINT)))
+    try:
+        start()
+    finally:
+        signal.signal(signal.SIGINT, kept)
+    assert found == [signal.SIG_IGN if before is signal.SIG_IGN else signal.SIG_DFL]
 
 
 def test_what_nohup_ignores_stays_ignored() -> None:
