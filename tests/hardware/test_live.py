@@ -345,9 +345,12 @@ def test_the_live_estimate_is_the_estimate(state):
 @pytest.mark.long
 def test_the_live_view_of_a_recording_estimates_the_size_while_it_grows(run_python, tmp_path):
     demo = Path(__file__).resolve().parents[2] / "tactile_bayes" / "demo" / "scan.mcap"
-    words = ("replay", demo, "-o", "again.mcap", "--serve", "127.0.0.1:0")
-    done = run_python("-m", "tactile_bayes", *words, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    estimates = re.search(r"(\d+) estimates in", done.stderr)
-    assert estimates is not None, done.stderr
-    assert int(estimates[1]) > 1, "the process that estimates does not answer"  # its first answer is that it is there
+    words = ("replay", demo, "-o", "again.mcap", "--serve", "127.0.0.1:0", "--force", "--speed")
+    for speed in (1.0, 0.2):  # more time on a computer that is busy
+        done = run_python("-m", "tactile_bayes", *words, speed, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        estimates = re.search(r"(\d+) estimates in", done.stderr)
+        assert estimates is not None, done.stderr
+        if int(estimates[1]) > 1:  # its first answer is that it is there
+            return
+    pytest.fail("the process that estimates does not answer")
