@@ -263,6 +263,8 @@ class TrackerDriver(Record):
         if not answer.came or (answer.tools and set(answer.tools.values()) == {readings.NO_ROTATION}):
             words = self._fault_words(answer.parsed, unasked, received, rate=port.has_line_rate)
             raise DeviceError(f"{port.name}: {words}")
+        if answer.hello is not None and answer.hello.rows:
+            raise DeviceError(f"{port.name}: {answer.hello.device_id!r} is a scan head; give the tracker's port")
         answer.tool, answer.reference = _choose_tools(answer.tools, tool, reference, port)
         return answer
 

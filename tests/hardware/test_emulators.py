@@ -15,7 +15,7 @@ import pytest
 from emulated_devices import serving, short_scan
 
 from tactile_bayes.actions.devices import _link, emulate_action
-from tactile_bayes.errors import UsageError
+from tactile_bayes.errors import DeviceError, UsageError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.hardware import head
@@ -130,6 +130,15 @@ def test_an_emulated_network_tracker_needs_a_network_port(tmp_path):
     given = {"scan": tmp_path / "scan.mcap", "once": True, "speed": 1.0, "seed": 1}
     with pytest.raises(UsageError, match="network; give --tcp 127"):
         emulate_action(kind="both", protocol="igtlink", tcp=None, **given)
+
+
+def test_a_head_in_the_trackers_place_is_refused():
+    """It was recorded to the end of the exam, which had no pose then."""
+    with serving(EmulatedHead(SCAN), PtyLink()) as emulator:
+        port = Port(emulator.link.url, baud=9600, role="tracker")
+        with pytest.raises(DeviceError, match="is a scan head; give the tracker's port"):
+            TRACKERS["open"].check(port)
+        port.close()
 
 
 def test_a_tracker_waits_for_the_head_with_its_first_pose(monkeypatch):
