@@ -44,6 +44,7 @@ TAXEL_PLATEAU: Final = 10
 it are fewer: 66 right scans have up to 5 of one taxel."""
 MOST_SATURATED, MOST_DROPPED = 0.02, 0.2
 """Share of the readings at full scale, and of the frames left out for saturated or faulty taxels."""
+MOST_CUT: Final = 0.02  #: Share of the readings at the lowest count: in 166 right scans 0.001 at most.
 COARSEST_COUNT: Final = 0.1  #: One count over the mean pressure: a lump's rise is a few tenths of it.
 WRAPPED: Final = 2000  #: Readings this near to 65,536 are below 0, or no value.
 LANDMARKS_MM: Final = (80.0, 350.0)  #: Distance from the sternal notch to the xiphoid.
@@ -168,7 +169,13 @@ def _geometry(part: SelectedFrames) -> Iterator[tuple[str, float]]:
         yield "landmark_distance_mm", float(np.linalg.norm(marks.sternal_notch_mm - marks.xiphoid_mm))
         places = part.poses.position_mm[part.used]
         yield "landmark_reach_mm", float(np.linalg.norm(places - marks.xiphoid_mm, axis=1).min())
-    present = np.unique(part.scan.frames.counts[np.flatnonzero(part.used)[:: max(1, len(level) // 50)]])
+    sample = part.scan.frames.counts[np.flatnonzero(part.used)[:: max(1, len(level) // 50)]]
+    present, (lowest, *times) = (
+        np.unique(sample),
+        np.unique(sample[:, part.good_taxels], return_counts=True)[1].tolist(),
+    )
+    if lowest > max(sum(times[:3]), MOST_CUT * (lowest + sum(times))) and times:
+        yield "cut_share", lowest / (lowest + sum(times))
     step = int(np.gcd.reduce(np.diff(present.astype(np.int64)))) if len(present) > 1 else 0
     gain = float(np.median(part.scan.element_calibration.gain_kpa_per_count[part.good_taxels]))
     yield "count_share", step * gain / float(np.median(level))
@@ -244,7 +251,14 @@ def _unlike(quality: Mapping[str, float], head: HeadShape | None) -> Iterator[tu
             f"{quality['plateau_readings']:,.0f} readings stand at the highest count, {quality['plateau_count']:,.0f}, "
             "and few just below it: the array saturates there, which the scan does not say"
         )
-        yield text, f"state it: saturation_count {quality['plateau_count']:.0f} at its import"
+        yield text, "state it at its import: --saturation, in the unit of its frames"
+    if "cut_share" in quality:
+        share = 100 * quality["cut_share"]
+        text = (
+            f"{share:.0f} % of the readings stand at the lowest count, and few just above it: the array cuts off light "
+            "pressures, or the head's edge was off the skin; the size may be wrong"
+        )
+        yield text, "press the whole head on the skin, or record without a threshold"
     if quality.get("count_share", 0.0) > COARSEST_COUNT:
         text = f"one count is {100 * quality['count_share']:.0f} % of the mean pressure: readings are too coarse"
         yield text, "check whether counts were rounded or are pressures already"

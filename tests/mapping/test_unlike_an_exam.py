@@ -100,6 +100,10 @@ def other_pitch(ratio: float) -> Callable[[Scan], Scan]:
 
 UNLIKE: dict[str, tuple[Callable[[Scan], Scan], str]] = {
     "10 bits, saturation left out": (counts(lambda c: np.minimum(c, 2400)), "highest count, 2,400"),
+    "cut off at the bottom": (
+        counts(lambda c: np.where(c < 2200, 0, c)),
+        "readings stand at the lowest",
+    ),
     "8 bits, saturation left out": (counts(lambda c: np.minimum(c // 10, 240), gain=10.0), "highest count, 240"),
     "12 bits left-aligned in 16": (
         counts(lambda c: np.minimum(c, 2400) * 16, gain=1 / 16, saturation=65535),
@@ -225,13 +229,15 @@ def test_a_clock_that_stands_still_is_told_and_a_map_without_times_is_not_doubte
         ({"frames_used": 10.0, "dropped_no_pose": 480.0}, "check the tracker and its times"),
         ({"frames_used": 10.0, "frames_total": 10.0}, "scan for longer"),
         ({"frames_used": 10.0, "frames_total": 10.0, "frames_every": 50.0, "frame_rate_hz": 2.0}, "use more frames"),
+        (
+            {"frames_used": 480.0, "plateau_readings": 50.0, "plateau_count": 2400.0},
+            "state it at its import: --saturation",
+        ),
         ({"frames_used": 480.0, "frame_rate_hz": 4.9999999999}, None),
         ({"frames_used": 480.0, "frame_rate_hz": 2.0, "frames_every": 50.0}, None),
     ],
 )
-def test_what_is_to_be_done_about_few_frames_follows_from_why_they_are_few(
-    figures: dict[str, float], told: str | None
-) -> None:
+def test_what_is_to_be_done_follows_from_the_figures(figures: dict[str, float], told: str | None) -> None:
     findings = exam_findings({"frames_total": 500.0, **figures})
     assert [one.remedy.startswith(str(told)) for one in findings] == ([] if told is None else [True])
 
