@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +22,7 @@ from tactile_bayes.inference.draws import Draws
 from tactile_bayes.options import GROWTH_SHARES, CompareOptions
 from tactile_bayes.presets import REGISTRATION_MM
 from tactile_bayes.report.compare import CompareReport, compare_report, compare_summary, compare_text
+from tactile_bayes.report.estimate_document import at_place
 from tactile_bayes.report.exam_words import PageLabels
 from tactile_bayes.report.growth_page import Course, DrawnMap, draw_comparison, growth_page
 from tactile_bayes.report.pages import PageFiles
@@ -205,7 +206,7 @@ def compare_answers(
         one.labelled(f"visit {number}" if len(maps) == 1 else f"visit {number}, map {i}")
         for number, maps in by_number.items()
         for i, answer in enumerate(maps, start=1)
-        for one in answer.report.findings
+        for one in (*answer.report.findings, *(() if numbers else _which_mass(answer)))
         if one.kind != "outside_calibration"  # of a size alone: judged anew
     )
     compared = replace(compared, findings=by_severity((*compared.findings, *of_visits)))
@@ -222,6 +223,16 @@ def compare_answers(
         repeatability=settings.repeatability,
     )
     return Comparison(compared, report, settings)
+
+
+def _which_mass(answer: Answer) -> Iterator[Finding]:
+    """A check that names the mass of a map of several that is compared; a campaign's table says which it is."""
+    masses = answer.report.masses
+    for mass in masses if len(masses) > 1 else ():
+        if mass.reported:
+            x, y = mass.centre_mm.median
+            text = f"the map shows {len(masses)} masses, and the one {at_place(x, y)} is compared"
+            yield finding("several_masses", text)
 
 
 def _common_fact(fact: str, maps: Sequence[SizeEstimate]) -> str:

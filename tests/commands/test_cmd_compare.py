@@ -16,12 +16,15 @@ from scipy.special import ndtri
 from settings_files import settings
 
 import tactile_bayes as tb
+from tactile_bayes.api.comparing import compare_answers
+from tactile_bayes.api.settings import Settings
 from tactile_bayes.commands.estimate import number_groups
 from tactile_bayes.declarations import from_plain, replace
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.map_nc import read_map, write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.geometry import rigid
+from tactile_bayes.options import CompareOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import CompareReport, compare_summary, growths, verdict
 from tactile_bayes.report.pages import signed
@@ -380,3 +383,20 @@ def test_the_verdict_and_what_it_rests_on_are_by_95_percent_whatever_interval_is
         another = {"between_map_sd": 0.1, "percent": wide | {"low": 1.0}, "probability_grown": chance}
         text = reworded(grown, percent=percent, another_exam=another)
         assert text.startswith(f"By the 95 % interval: the mass has grown{more}")
+
+
+@pytest.mark.long
+def test_of_several_masses_the_one_that_is_compared_is_named(folder: Path) -> None:
+    settings = Settings(method="laplace")
+    first, later = (tb.estimate(folder / name, method="laplace").answer for name in ("a0.nc", "grown0.nc"))
+    (mass,) = first.report.masses
+    both = replace(first.report, masses=(mass, replace(mass, number=2, reported=False)))
+    visits, names = [[replace(first, report=both)], [later]], [["a"], ["b"]]
+    (told,) = [
+        one.sentence()
+        for one in compare_answers(visits, settings, CompareOptions(), names=names).report.findings
+        if one.kind == "several_masses"
+    ]
+    assert told.startswith("visit 1: the map shows 2 masses, and the one at (")
+    by_table = compare_answers(visits, settings, CompareOptions(), names=names, numbers=["1", "2"]).report
+    assert "several_masses" not in [one.kind for one in by_table.findings]
