@@ -280,7 +280,7 @@ def thumbnail_svg(exam: ExamMap, *, label: str) -> str:
         level = report.background.median
     low, high = sorted(level * end for end in THUMB_ENDS)
     drawn = exam_picture(
-        replace(exam, masses=exam.masses[:1]),
+        replace(exam, masses=() if report.centre_mm is None else exam.masses[:1]),
         Frame(tactile_map, scale),
         label=label,
         small=True,

@@ -37,7 +37,7 @@ from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import PageLabels, ShownExam, exam_map, headline, reach_text
 from tactile_bayes.report.pages import BROWSERS, find_printer
-from tactile_bayes.report.svg import MARGIN_MM, Frame, exam_picture
+from tactile_bayes.report.svg import MARGIN_MM, Frame, exam_picture, thumbnail_svg
 from tactile_bayes.scans import Landmarks
 
 HOSTILE = "\"><img src=x onerror=alert(1)><script>alert(2)</script>'&lt; </p></svg></body>"
@@ -308,7 +308,10 @@ def test_several_masses_are_numbered_with_a_place_each() -> None:
 
 
 def test_a_mass_elsewhere_is_not_taken_for_the_one_that_was_looked_for() -> None:
-    page = Page(exam_page(without_lump(masses=(unsized("its window reaches beyond the map"),))))
+    shown = without_lump(masses=(unsized("its window reaches beyond the map"),))
+    page = Page(exam_page(shown))
+    assert page.named("path", **{"class": "centre"}) != []
+    assert 'class="centre"' not in thumbnail_svg(shown.main, label="of another mass's row")
     assert "No lump found at the place looked at" in page.words
     assert "No lump was found at the place looked at; the masses below lie elsewhere." in page.words
     assert "Place of mass 2" in page.words
