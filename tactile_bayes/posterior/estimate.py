@@ -327,7 +327,7 @@ def _estimate_of_lump(task: EstimationTask, assessment: Assessment, candidates: 
         scene=assessment.scene,
         sensitivity=prior_sensitivity(posterior.sigma_x_mm, posterior.sigma_y_mm, quantities, options.prior),
         bump=bump,
-        findings=(*_findings(result, cell_mm=cell_mm), *_prior_findings(result, options.prior)),
+        findings=(*_findings(result, cell_mm=cell_mm), *_prior_findings(result, options)),
     )
 
 
@@ -435,7 +435,9 @@ def _prior_findings(result: MapDraws, prior: BumpPrior) -> Iterator[Finding]:
     They do where the posterior keeps half of the prior's SD, or lies half of its own SD from where it would without it;
     least squares use none.
     """
-    bump, own = result.posterior, [] if result.draws.method == "optimise" else verdict.own_priors(prior)
+    bump, own = result.posterior, verdict.own_priors(prior)
+    if not own or result.draws.method == "optimise":
+        return
     amplitude = bump.amplitude / result.fit.bump.scale
     width = 0.5 * np.log(bump.sigma_x_mm * bump.sigma_y_mm)
     ratio = 0.5 * np.log(bump.sigma_x_mm / bump.sigma_y_mm)

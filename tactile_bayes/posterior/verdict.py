@@ -156,7 +156,8 @@ def no_verdict(tactile_map: TactileMap) -> Abstention | None:
 
 def own_priors(prior: BumpPrior) -> list[str]:
     """Names of the priors that are not the default ones."""
-    return [name for name in PRIORS if getattr(prior, name) != getattr(BumpPrior(), name)]
+    default = BumpPrior()
+    return [name for name in PRIORS if getattr(prior, name) != getattr(default, name)]
 
 
 def hiding_settings(options: FitSettings) -> Abstention | None:
