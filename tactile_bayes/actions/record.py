@@ -132,6 +132,13 @@ def _landmarks(request: Request) -> Landmarks | None:
     if bool(reference) != bool(request.reference):
         frame = f"relative to the tool {reference!r}" if reference else "of the tracker's own frame"
         raise UsageError(f"the landmarks of {request.landmarks} are {frame}; record with the same --reference")
+    facts = request.facts()
+    for name in ("subject", "visit"):
+        theirs, ours = scan.session.get(name), facts.get(name)
+        if theirs and ours and theirs != ours:
+            raise UsageError(
+                f"the landmarks of {request.landmarks} are of {name} {theirs}, this is {ours}; touch them anew"
+            )
     return scan.landmarks
 
 

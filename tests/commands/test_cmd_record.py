@@ -23,6 +23,7 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from tactile_bayes.cli import cli
+from tactile_bayes.declarations import replace
 from tactile_bayes.errors import TactileBayesError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, write_scan
@@ -341,6 +342,17 @@ def test_no_trace_is_left_when_the_devices_are_not_there(record, tmp_path):
         "`tactile-bayes devices` lists what is there\n"
     )
     assert not (tmp_path / "a.mcap").exists()
+
+
+@pytest.mark.parametrize(("subject", "visit"), [("P2", "1"), ("P1", "2")])
+def test_landmarks_of_another_patient_or_visit_are_refused(record, scan, tmp_path, subject, visit):
+    """Places on the breast were measured from the other one's sternum."""
+    one = replace(scan, session={"subject": "P1", "visit": "1"})
+    write_scan(tmp_path / "last.mcap", one, provenance=Provenance("test", {}))
+    (tmp_path / "s.toml").write_text(f'visit = "{visit}"\n')
+    done = record("--head", "/dev/nothing", "--landmarks", "last.mcap", "--subject", subject, "--session", "s.toml")
+    assert done.returncode == 2
+    assert "are of subject P1, this is P2" in done.stderr or "are of visit 1, this is 2; touch them anew" in done.stderr
 
 
 def test_one_port_for_both_devices_is_refused(record):
