@@ -236,12 +236,11 @@ def growth_rows(campaign: Campaign, excised_on: Mapping[tuple[str, str], date | 
             changes = growths(exam.patient, exam.mass, sized, report, f"{place}/{layout.GROWTH_PAGE}")
             days, excision = visit_dates(visits), excised_on.get((exam.patient, exam.mass)) or date.max
             for change in changes:
-                day = days[change.later]
-                after = (
-                    f"visit {change.later} ({day}) is after the excision ({excision}): the mass was taken out before"
-                )
-                more = (finding("after_excision", after),) if day is not None and day > excision else ()
-                rows.append(replace(change, findings=by_severity((*more, *change.findings))))
+                day, findings = days[change.later], change.findings
+                if day is not None and day > excision:
+                    after = f"visit {change.later} ({day}) is after the excision ({excision})"
+                    findings = (finding("after_excision", f"{after}: the mass was taken out before"), *findings)
+                rows.append(replace(change, findings=by_severity(findings)))
         else:
             fault = campaign.faults.get(name)
             reason = "exams of fewer than two visits came through" if fault is None else fault.reason
