@@ -387,8 +387,10 @@ def facts(exam: ShownExam) -> Iterator[tuple[str, str]]:
         values = list(dict.fromkeys(scan[key] for scan in exam.scans if scan.get(key)))
         if values:
             text = first_of([cut(value, 32) for value in values], 2)
-            by_number = key == "mass" and len(exam.main.masses) > 1 and not exam.elsewhere
-            numbered = f" (number {exam.main.masses[0].number} on the map)" if by_number else ""
-            yield key.capitalize(), f"{text}{numbered}"
+            if key == "mass" and exam.elsewhere:
+                text += " (none of those on the map)"
+            elif key == "mass" and len(exam.main.masses) > 1:
+                text += f" (number {exam.main.masses[0].number} on the map)"
+            yield key.capitalize(), text
     if exam.labels.day:
         yield "Date", exam.labels.day

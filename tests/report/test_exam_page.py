@@ -309,7 +309,8 @@ def test_several_masses_are_numbered_with_a_place_each() -> None:
 
 def test_a_mass_elsewhere_is_not_taken_for_the_one_that_was_looked_for() -> None:
     shown = without_lump(masses=(unsized("its window reaches beyond the map"),))
-    page = Page(exam_page(shown))
+    page = Page(exam_page(replace(shown, scans=({**SCANS[0], "mass": "2"},))))
+    assert "Mass 2 (none of those on the map)" in page.words
     assert page.named("path", **{"class": "centre"}) != []
     assert 'class="centre"' not in thumbnail_svg(shown.main, label="of another mass's row")
     assert "No lump found at the place looked at" in page.words
