@@ -318,7 +318,7 @@ def check_arrangement(
     if overlap is None:
         return _TOO_SHORT
     check = _with_corrections(selection, overlap, thorough=thorough)
-    doubted = check.best is not check.stated or check.contradicting or check.stated.agreement < LEAST_AGREEMENT
+    doubted = check.best is not check.stated or check.contradicting or check.stated.agreement < convention.NEARLY_WHOLE
     return _with_other_poses(overlap, check) if doubted or other_poses else check
 
 

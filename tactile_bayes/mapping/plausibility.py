@@ -44,7 +44,9 @@ TAXEL_PLATEAU: Final = 10
 it are fewer: 66 right scans have up to 5 of one taxel."""
 MOST_SATURATED, MOST_DROPPED = 0.02, 0.2
 """Share of the readings at full scale, and of the frames left out for saturated or faulty taxels."""
-MOST_CUT: Final = 0.02  #: Share of the readings at the lowest count: in 166 right scans 0.001 at most.
+MOST_CUT: Final = (
+    0.02  #: Share of the readings at the lowest count, far below the rest: in 50 right scans 0.001 at most.
+)
 COARSEST_COUNT: Final = 0.1  #: One count over the mean pressure: a lump's rise is a few tenths of it.
 WRAPPED: Final = 2000  #: Readings this near to 65,536 are below 0, or no value.
 LANDMARKS_MM: Final = (80.0, 350.0)  #: Distance from the sternal notch to the xiphoid.
@@ -170,12 +172,12 @@ def _geometry(part: SelectedFrames) -> Iterator[tuple[str, float]]:
         places = part.poses.position_mm[part.used]
         yield "landmark_reach_mm", float(np.linalg.norm(places - marks.xiphoid_mm, axis=1).min())
     sample = part.scan.frames.counts[np.flatnonzero(part.used)[:: max(1, len(level) // 50)]]
-    present, (lowest, *times) = (
-        np.unique(sample),
-        np.unique(sample[:, part.good_taxels], return_counts=True)[1].tolist(),
-    )
-    if lowest > max(sum(times[:3]), MOST_CUT * (lowest + sum(times))) and times:
-        yield "cut_share", lowest / (lowest + sum(times))
+    present, working = np.unique(sample), sample[:, part.good_taxels]
+    readings, times = np.unique(working, return_counts=True)
+    lowest = int(times[0])
+    far_below = 2 * int(readings[0]) < float(np.median(working))
+    if far_below and lowest > max(int(times[1:4].sum()), MOST_CUT * working.size):
+        yield "cut_share", lowest / working.size
     step = int(np.gcd.reduce(np.diff(present.astype(np.int64)))) if len(present) > 1 else 0
     gain = float(np.median(part.scan.element_calibration.gain_kpa_per_count[part.good_taxels]))
     yield "count_share", step * gain / float(np.median(level))
@@ -388,14 +390,11 @@ def _value_doubts(values: FloatArray) -> Iterator[tuple[str, str]]:
     steps, low, high = np.diff(ordered), *np.quantile(ordered, [0.25, 0.75])
     span, widest = float(ordered[-1] - ordered[0]), int(np.argmax(steps))
     if steps[widest] > LEAST_GAP * span and span > LEAST_RANGE * float(high - low):
-        below = widest + 1 <= len(ordered) // 2
-        number = widest + 1 if below else len(ordered) - widest - 1
-        ends = ordered[: widest + 1] if below else ordered[widest + 1 :]
-        rest = ordered[widest + 1 :] if below else ordered[: widest + 1]
+        ends, rest = sorted((ordered[: widest + 1], ordered[widest + 1 :]), key=len)
         values_there = f"{ends[0]:.4g}" if ends[0] == ends[-1] else f"{ends[0]:.4g} to {ends[-1]:.4g}"
         text = (
-            f"{number} of {len(ordered)} cells lie far outside the rest ({values_there}; the others {rest[0]:.4g} to "
-            f"{rest[-1]:.4g}): dead lines, or values that stand for none"
+            f"{len(ends)} of {len(ordered)} cells lie far outside the rest ({values_there}; the others {rest[0]:.4g} "
+            f"to {rest[-1]:.4g}): dead lines, or values that stand for none"
         )
         yield text, "mark them as missing"
     levels: NDArray[np.int64] = np.unique(ordered, return_counts=True)[1]

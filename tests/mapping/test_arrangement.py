@@ -120,6 +120,18 @@ def test_angles_of_another_order_or_in_radians_are_named(order, call):
 
 
 @pytest.mark.long
+def test_a_map_names_angles_of_another_order_where_the_face_leans_on_its_motion():
+    """No correction fits, and the map said to check the tilt of the head."""
+    poses, turn = lump().poses, Rotation.from_euler("z", 40, degrees=True)
+    rotation = turn * Rotation.from_quat(poses.quaternion_wxyz, scalar_first=True)
+    wxyz = Rotation.from_euler("ZYX", rotation.as_euler("XYZ")).as_quat(scalar_first=True)
+    place = poses.position_mm @ turn.as_matrix().T
+    check = checked(replace(lump(), poses=TrackerPoses(poses.time_s, place, wxyz)))
+    assert 0.9 < check.stated.agreement < 0.98
+    assert check.words.startswith("the rotations' angles (azimuth, elevation, roll) are in degrees, about x, the new y")
+
+
+@pytest.mark.long
 def test_poses_that_lead_from_the_base_to_the_sensor_are_named():
     """They were told as quaternions with the scalar last."""
     poses = lump().poses
