@@ -133,13 +133,13 @@ def run_campaign(
     calibrations = (size_calibration_path(str(name)) for name in names)
     inputs = [exams, settings.excision, settings.columns, settings.protocol, *read, *calibrations]
     refuse_same((output / name for name in report.WRITTEN), inputs)
-    report.check_inputs(table, settings)
+    excised_on = report.check_inputs(table, settings)
     with (
         open_campaign(output, dry=settings.dry_run) as store,
         open_executor(workers=settings.workers, cluster=None if settings.dry_run else settings.scheduler) as executor,
     ):
         place = Path(os.path.abspath(output))  # noqa: PTH100 (links stay links)
-        run = Campaign(table, place, settings, store, executor, dry=settings.dry_run, bar=bar or no_bar)
+        run = Campaign(table, place, settings, store, executor, excised_on, dry=settings.dry_run, bar=bar or no_bar)
         run.run()
         if settings.dry_run:
             return CampaignResult(run, output, None)

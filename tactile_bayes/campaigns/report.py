@@ -21,7 +21,7 @@ from tactile_bayes.files.manifest_csv import Exam, same_code
 from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
 from tactile_bayes.files.reports import EstimateReport, PooledReport, centre_of
 from tactile_bayes.files.tables import Table
-from tactile_bayes.findings import Finding, by_severity, capitalised, counted, finding, finding_lines, first_of, verdict
+from tactile_bayes.findings import Finding, by_severity, capitalised, counted, finding_lines, first_of, verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.report.campaign_page import ExamEntry, MassEntry, VisitEntry, campaign_html, worst
 from tactile_bayes.report.compare import CompareReport, growths
@@ -220,11 +220,8 @@ def _trial_reading(row: ExamRow, modality: str, *, reader: str | None = None) ->
     }
 
 
-def growth_rows(campaign: Campaign, excised_on: Mapping[tuple[str, str], date | None]) -> list[Growth]:
-    """Change of each mass with several visits, in order of the masses; those to a visit after excision have a caution.
-
-    `excised_on`: days of the masses' excisions, by patient and mass.
-    """
+def growth_rows(campaign: Campaign) -> list[Growth]:
+    """Change of each mass with several visits, in order of the masses."""
     compared, rows = campaign.keys["compare"], list[Growth]()
     for name, visits in masses_with_visits(campaign.exams).items():
         codes, exam = [*visits], next(iter(visits.values()))[0]
@@ -233,14 +230,7 @@ def growth_rows(campaign: Campaign, excised_on: Mapping[tuple[str, str], date | 
             report = read_record(campaign.folder / place / layout.COMPARED, CompareReport)
             of = {one.map for visit in report.visits for one in visit.maps}
             sized = [code for code, exams in visits.items() if any(one.name in of for one in exams)]
-            changes = growths(exam.patient, exam.mass, sized, report, f"{place}/{layout.GROWTH_PAGE}")
-            days, excision = visit_dates(visits), excised_on.get((exam.patient, exam.mass)) or date.max
-            for change in changes:
-                day, findings = days[change.later], change.findings
-                if day is not None and day > excision:
-                    after = f"visit {change.later} ({day}) is after the excision ({excision})"
-                    findings = (finding("after_excision", f"{after}: the mass was taken out before"), *findings)
-                rows.append(replace(change, findings=by_severity(findings)))
+            rows += growths(exam.patient, exam.mass, sized, report, f"{place}/{layout.GROWTH_PAGE}")
         else:
             fault = campaign.faults.get(name)
             reason = "exams of fewer than two visits came through" if fault is None else fault.reason
@@ -292,19 +282,18 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
 
     `unlisted` are folders of exams that the table does not list.
     """
-    folder, pooled, excised = campaign.folder, pooled_reports(campaign), _excised(campaign.settings)
-    excised_on = {} if excised is None else _excision_dates(excised)
-    rows, growth, masses = exam_rows(campaign, pooled), growth_rows(campaign, excised_on), set(excised_on)
+    folder, pooled, by_trial = campaign.folder, pooled_reports(campaign), campaign.settings.excision is not None
+    rows, growth, masses = exam_rows(campaign, pooled), growth_rows(campaign), set(campaign.excised_on)
     tables = {
         layout.DONE: [done_line(row) for row in rows if not row.failed],
         layout.FAILURES: failure_lines(campaign, rows),
-        layout.TRIAL: trial_lines(campaign, rows, pooled, None if excised is None else masses),
+        layout.TRIAL: trial_lines(campaign, rows, pooled, masses if by_trial else None),
         **({layout.GROWN: [grown_line(one) for one in growth]} if growth else {}),
     }
     for name, lines in tables.items():
         columns = [column for column in layout.columns_of(Path(name).stem) if column != "posterior"]
         write_text(folder / name, layout.table_text(lines, columns), force=True)
-    report, fault = ("", "") if excised is None else _write_report(folder, campaign.settings, growth)
+    report, fault = _write_report(folder, campaign.settings, growth) if by_trial else ("", "")
     if not tables[layout.TRIAL]:
         fault = "no exam is of a mass with a size after excision"
     for name in (*(() if report else (REPORT, PAGE)), *(() if growth else (layout.GROWN,))):
@@ -316,14 +305,14 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
     counts = f"{sized} sized, {len(rows) - sized - failed} without a size, {failed} failed"
     write_text(folder / INDEX, index_html(campaign, rows, pooled, growth, counts=counts, links=links), force=True)
     examined = {(row.exam.patient, row.exam.mass) for row in rows}
-    left_out = [] if excised is None else sorted(examined - masses)
+    left_out = sorted(examined - masses) if by_trial else []
     doubts = {
         "no size after excision, left out of trial.csv": [" ".join(mass) for mass in left_out],
         "sizes after excision of masses without an exam": [" ".join(mass) for mass in sorted(masses - examined)],
         "exams with a caution, see their findings": _names_with_finding(rows, "caution", "name"),
         "masses whose exams disagree, without a pooled size": _names_with_finding(rows, "maps_disagree", "of_mass"),
         "exams with a mass that no row names, see their findings": _names_with_finding(rows, "unnamed_mass", "name"),
-        **_dated_doubts(campaign.exams, excised_on),
+        **_dated_doubts(campaign.exams, campaign.excised_on),
         "folders of exams that the table does not list": unlisted,
     }
     doubtful = [f"{words}: {first_of(names, FEW)}" for words, names in doubts.items() if names]
@@ -371,42 +360,35 @@ def _names_with_finding(rows: Sequence[ExamRow], sought: str, name: str) -> list
     return list(dict.fromkeys(getattr(exam, name) for exam in exams))
 
 
-def check_inputs(exams: Sequence[Exam], settings: CampaignSettings) -> None:
+def check_inputs(exams: Sequence[Exam], settings: CampaignSettings) -> dict[tuple[str, str], date | None]:
     """Read the table of excision sizes and the protocol, so that a fault in them costs no work.
 
-    Codes of patients and masses must be spelled as those of the exams; other patients and masses may be there. A mass
-    that was excised before every exam is refused.
+    Returns the days of excision, None where a row has none, by patient and mass in the order of the rows. Their codes
+    must be spelled as those of the exams; others may be there. A mass that was excised before every exam is refused.
     """
     if settings.excision is None:
         purposes = {"columns": "is the layout of the excision table", "protocol": "is for the trial's report"}
         for option, purpose in purposes.items():
             if getattr(settings, option) is not None:
                 raise UsageError(f"--{option} {purpose}; give --excision too")
-    table = _excised(settings)
-    if table is not None:
-        _check_spelling(table, exams)
-
-        def fault(row: int, column: str, words: str, /, *, way_out: str) -> BadDataError:
-            where = f"table of exams, line {exams[row].line}, column {column}"
-            return BadDataError(f"{where}: {words}", way_out=way_out)
-
-        at_excision([exam.as_reading for exam in exams], _excision_dates(table), fault=fault)
     settings_by(settings.protocol)
+    if settings.excision is None:
+        return {}
+    table = read_excision(settings.excision, settings.columns)
+    _check_spelling(table, exams)
+    excised_on = dict(zip(_masses_of(table), table.columns["date"], strict=True))
 
+    def fault(row: int, column: str, words: str, /, *, way_out: str) -> BadDataError:
+        where = f"table of exams, line {exams[row].line}, column {column}"
+        return BadDataError(f"{where}: {words}", way_out=way_out)
 
-def _excised(settings: CampaignSettings) -> Table | None:
-    """Sizes after excision, read and checked; None without any."""
-    return None if settings.excision is None else read_excision(settings.excision, settings.columns)
+    at_excision([exam.as_reading for exam in exams], excised_on, fault=fault)
+    return excised_on
 
 
 def _masses_of(table: Table) -> Iterator[tuple[str, str]]:
     """Patient and mass of each row."""
     return zip(table.columns["patient"], table.columns["mass"], strict=True)
-
-
-def _excision_dates(table: Table) -> dict[tuple[str, str], date | None]:
-    """Days of excision by patient and mass, in the order of the rows; None where a row has none."""
-    return dict(zip(_masses_of(table), table.columns["date"], strict=True))
 
 
 def _check_spelling(table: Table, exams: Iterable[Exam]) -> None:

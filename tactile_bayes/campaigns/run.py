@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from datetime import date
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -35,6 +36,7 @@ from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.manifest_csv import ESTIMATE, EXAMS, GROWTH, MAP, MASSES, REPEATABILITY, SHAPE, SIZED, Exam
 from tactile_bayes.files.provenance import recordings
 from tactile_bayes.files.size_json import default_for, read_repeatability, read_size_calibration, size_calibration_path
+from tactile_bayes.findings import finding
 from tactile_bayes.progress import Progress, no_progress
 from tactile_bayes.report.growth_page import Course
 from tactile_bayes.size.bodies import BodyCalibration
@@ -74,6 +76,8 @@ class Campaign:
     settings: steps.CampaignSettings
     store: BatchStore | None
     executor: Executor | None = None
+    excised_on: Mapping[tuple[str, str], date | None] = field(default_factory=dict)
+    """Day of excision, where it is known, by the patient and mass of each size after excision."""
     dry: bool = False
     bar: Bar = no_bar
     keys: dict[str, dict[str, str]] = field(default_factory=lambda: {step: {} for step in steps.FILES})
@@ -434,12 +438,21 @@ class Campaign:
 
     def _compare_task(self, name: str, visits: Visits) -> steps.Task:
         settings, key = self._shared_settings([exam for exams in visits.values() for exam in exams])
-        dates = tuple("" if day is None else day.isoformat() for day in visit_dates(visits).values())
+        days = [*visit_dates(visits).values()]
+        dates = tuple("" if day is None else day.isoformat() for day in days)
         first = next(iter(visits.values()))[0]
         course = Course("", "", first.patient, first.side or "", first.mass, tuple(visits), dates if any(dates) else ())
         names, figures = [[exam.name for exam in exams] for exams in visits.values()], self.settings.figures
-        key |= {"visits": [len(exams) for exams in names], "figures": figures, "course": repr(course)}
-        make = partial(steps.make_growth, self.folder / EXAMS, names, settings, course=course, figures=figures)
+        excision = self.excised_on.get((first.patient, first.mass)) or date.max
+        after = (
+            f"visit {number} of {day} is after the excision ({excision}): the mass was taken out before"
+            for number, day in zip(course.numbers, days, strict=True)
+            if day is not None and day > excision
+        )
+        findings = [finding("after_excision", words) for words in after]
+        key |= {"visits": [len(exams) for exams in names], "figures": figures, "facts": repr((course, findings))}
+        told = partial(steps.make_growth, course=course, findings=findings, figures=figures)
+        make = partial(told, self.folder / EXAMS, names, settings)
         return self._task("compare", name, key, make)
 
     def _file(self, step: str, name: str, file: str) -> str | None:

@@ -34,7 +34,7 @@ from tactile_bayes.files.npz import read_shape, write_shape
 from tactile_bayes.files.provenance import Provenance, scan_facts
 from tactile_bayes.files.reports import EstimateReport, json_text
 from tactile_bayes.files.scan_mcap import read_scan, write_scan
-from tactile_bayes.findings import Finding, by_severity
+from tactile_bayes.findings import Finding, by_severity, verdict
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap, side_findings
 from tactile_bayes.options import CampaignOptions, CompareOptions, MapOptions
@@ -319,11 +319,18 @@ def make_pool(folder: Path, names: Sequence[str], settings: Settings) -> Made:
 
 
 def make_growth(
-    folder: Path, visits: Sequence[Sequence[str]], settings: Settings, *, course: Course, figures: bool
+    folder: Path,
+    visits: Sequence[Sequence[str]],
+    settings: Settings,
+    *,
+    course: Course,
+    findings: Sequence[Finding],
+    figures: bool,
 ) -> Made:
     """Compare the visits of a mass as `compare` does; the table says that they are of one where landmarks do not.
 
-    `visits`: names of each visit's exams in order of time, with folders below `folder`; `course`: the table's facts.
+    `visits`: names of each visit's exams in order of time, with folders below `folder`; `course`, `findings`: what the
+    tables say of them.
     """
     answers = [[_answer(folder / name) for name in names] for names in visits]
     with_draws = [one for maps in answers for one in maps if one.shape is not None]
@@ -332,7 +339,9 @@ def make_growth(
     days = days_from_first(None, course.dates if course.dates and all(course.dates) else None)
     comparing = CompareOptions(days=days, same_mass=not placed)
     compared = compare_answers(answers, settings, comparing, names=visits, files=files, numbers=course.numbers)
-    comparison, report = compared.compared, compared.report.checked()
+    comparison, found = compared.compared, by_severity((*findings, *compared.report.findings))
+    told = verdict(found, answered=comparison.joint is not None)
+    report = replace(compared.report, findings=found, verdict=told).checked()
     drawn_maps = [
         [DrawnMap(read_map(path), one.report) for path, one in zip(paths, maps, strict=True)]
         for paths, maps in zip(files, answers, strict=True)

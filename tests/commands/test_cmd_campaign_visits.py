@@ -150,6 +150,9 @@ def test_one_visit_has_no_growth_landmarks_are_not_needed_and_findings_have_the_
     assert "visits after excision, left out of the report and in growth.csv with a caution: P1.vpost.m1" in both
     (row,) = rows_of(tmp_path / "out" / "growth.csv")
     assert "CAUTION: no landmarks show where the mass of visit 1 (coded pre) lies" in row["findings"]
-    assert row["findings"].startswith("CAUTION: visit post (2026-04-10) is after the excision (2026-02-01)")
+    excised = "visit 2 (coded post) of 2026-04-10 is after the excision (2026-02-01)"
+    assert row["findings"].startswith(f"CAUTION: {excised}")
+    (page,) = (tmp_path / "out" / "growth").rglob("growth.html")
+    assert excised in page.read_text()
     campaign(tmp_path, lines[:1])  # files that this run would not make go
     assert not (tmp_path / "out" / "growth").exists()
