@@ -44,9 +44,8 @@ TAXEL_PLATEAU: Final = 10
 it are fewer: 66 right scans have up to 5 of one taxel."""
 MOST_SATURATED, MOST_DROPPED = 0.02, 0.2
 """Share of the readings at full scale, and of the frames left out for saturated or faulty taxels."""
-MOST_CUT: Final = (
-    0.02  #: Share of the readings at the lowest count, far below the rest: in 50 right scans 0.001 at most.
-)
+MOST_CUT: Final = 0.02
+"""Share of the readings at the lowest count, where that lies far below the rest: in 50 right scans 0.001 at most."""
 COARSEST_COUNT: Final = 0.1  #: One count over the mean pressure: a lump's rise is a few tenths of it.
 WRAPPED: Final = 2000  #: Readings this near to 65,536 are below 0, or no value.
 LANDMARKS_MM: Final = (80.0, 350.0)  #: Distance from the sternal notch to the xiphoid.
