@@ -7,7 +7,6 @@ import errno
 import hashlib
 import os
 import re
-import socket
 import tempfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -154,7 +153,7 @@ def _stem(target: Path) -> str:
     """Beginning of a target's temporary names on this computer; short, however long the target's name is."""
     name = os.fsencode(target.name)
     short = target.name if len(name) <= _LONGEST_STEM else f"{zlib.crc32(name):08x}"
-    host = zlib.crc32(socket.gethostname().encode())  # directories may be shared with other computers
+    host = zlib.crc32(os.uname().nodename.encode())  # directories may be shared with other computers
     return f".{short}.{host:08x}"
 
 
