@@ -137,7 +137,9 @@ class ChangeReport(Record):
         """True if the change is shown only where exams repeat as simulated ones do: the verdict is by 95 %."""
         if self.verdict == "no_change_shown" or self.another_exam is None:
             return False
-        tail = (1 - VERDICT_PROBABILITY) / 2
+        q, tail = self.another_exam.percent, (1 - VERDICT_PROBABILITY) / 2
+        if q.probability == VERDICT_PROBABILITY:  # its interval stands beside the words, which must not contradict it
+            return q.low <= 0 <= q.high
         return tail <= self.another_exam.probability_grown <= 1 - tail
 
 
