@@ -75,10 +75,7 @@ _ACCOUNT = (
     *("frames_lost", "head_dropped", "poses_repeated", "poses_flagged", "flagged_why", "poses_missing", "missing_why"),
     *("other_tools", "overrun_bytes", "ended_by", "fault"),
 )
-_TABLES = (
-    *("trial", "excision", "exams_done", "failures", "growth", "exams"),
-    *("population", "size_table", "phantom_maps"),
-)
+_TABLES = ("trial", "excision", "exams_done", "failures", "growth", "exams", "population", "size_table", "phantom_maps")
 
 
 def describe(path: Path) -> dict[str, Any]:

@@ -371,9 +371,8 @@ def check_inputs(exams: Sequence[Exam], settings: CampaignSettings) -> dict[tupl
         for option, purpose in purposes.items():
             if getattr(settings, option) is not None:
                 raise UsageError(f"--{option} {purpose}; give --excision too")
-    settings_by(settings.protocol)
-    if settings.excision is None:
         return {}
+    settings_by(settings.protocol)
     table = read_excision(settings.excision, settings.columns)
     _check_spelling(table, exams)
     excised_on = dict(zip(_masses_of(table), table.columns["date"], strict=True))

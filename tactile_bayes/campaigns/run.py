@@ -451,8 +451,9 @@ class Campaign:
         )
         findings = [finding("after_excision", words) for words in after]
         key |= {"visits": [len(exams) for exams in names], "figures": figures, "facts": repr((course, findings))}
-        told = partial(steps.make_growth, course=course, findings=findings, figures=figures)
-        make = partial(told, self.folder / EXAMS, names, settings)
+        make = partial(
+            steps.make_growth, self.folder / EXAMS, names, settings, course=course, findings=findings, figures=figures
+        )
         return self._task("compare", name, key, make)
 
     def _file(self, step: str, name: str, file: str) -> str | None:

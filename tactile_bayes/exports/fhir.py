@@ -151,9 +151,10 @@ def _lines(estimate: exam.EstimateFile) -> Iterator[str]:
     """Sentences of the report: verdict, findings, then the masses."""
     yield estimate.verdict_line
     yield from estimate.lines
+    several = len(estimate.masses) > 1
     for one in estimate.masses:
-        several = len(estimate.masses) > 1
-        mass, place = f"Mass {one.number}: " if several else "", f", {one.place}" if several and one.place else ""
+        mass = f"Mass {one.number}: " if several else ""
+        place = f", {one.place}" if several and one.place else ""
         if one.largest is None or one.smallest is None:
             yield f"{mass}{one.outcome.meaning}{place}. Reason: {one.reason or one.code}."
             continue

@@ -249,9 +249,9 @@ def read_scan_report(path: Path) -> ScanFile:
         check_session(session, path=path)
         frames = _frames(records, head)
         if not len(frames) and not records.finished:
-            what = (
-                f"is damaged ({records.lost[0]})" if records.damaged else "was cut off before its first complete frame"
-            )
+            what = "was cut off before its first complete frame"
+            if records.damaged:
+                what = f"is damaged ({records.lost[0]})"
             raise BadDataError(what, way_out="copy it again from where it was recorded: this copy holds no frame")
         messages = records.messages("/pose", schema="foxglove.PoseInFrame")
         places = _pose_table(messages)

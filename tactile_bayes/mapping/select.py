@@ -322,7 +322,8 @@ def scan_findings(scan: Scan) -> tuple[Finding, ...]:
     jumps = Jumps.of(scan.poses)
     remedy = "set the tracker's hemisphere to the patient's side, and scan again" if jumps.crossed else ""
     jumped = [finding("poses_jump", text, remedy, remedy) for text in jumps.cautions()]
-    noted = tuple(one for one in noted if one.text not in jumps.cautions())
+    told = {one.text for one in jumped}
+    noted = tuple(one for one in noted if one.text not in told)
     frozen = (finding("times_apart", text, *_LEFT_OUT) for text in _frozen_cautions(scan.poses))
     lever = float(np.linalg.norm(scan.head.scanhead_from_tracker[:3, 3]))
     if lever <= 1e-3 or _USUAL_LEVER_MM[0] <= lever <= _USUAL_LEVER_MM[1]:
