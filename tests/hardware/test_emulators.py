@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import re
@@ -117,7 +118,8 @@ def test_once_ends_when_its_host_stops_before_the_end():
     port = Port(link.url, baud=9600, role="head")
     for command in (STOP, START, STOP):  # the first STOP is asked before the head is known
         assert thread.is_alive()
-        port.write(command)
+        with contextlib.suppress(DeviceError):  # after the last STOP the line may go before the host has flushed it
+            port.write(command)
         time.sleep(0.05)
     port.close()
     thread.join(5.0)
