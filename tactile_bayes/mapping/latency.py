@@ -33,7 +33,7 @@ from tactile_bayes.presets import POSE_NOISE
 
 CELL_MM = (2.0, 3.0)  #: Cells of the map, as wide as the averaged frames and taxels.
 _FIT_STEPS = 200
-# Relative tolerance of the conjugate gradients: for shifts, and for errors that are only compared.
+# Relative tolerance of the conjugate gradients: for shifts, and for what is only compared or warned of.
 _FIT_TOLERANCE, COMPARED_TOLERANCE = 2e-3, 1e-2
 
 
@@ -46,18 +46,21 @@ class ShiftFit(Record, eq=False):
     levelled: FloatArray  #: (n,) array: Readings less the frames' and taxels' part, about one common map.
     gradient: FloatArray  #: (n, 2) array: Of the map at each reading, 1/mm along x and y.
     data: FloatArray  #: (n,) array: Readings less their projection on the nuisances.
+    tolerance: float  #: Of the projections.
 
     @classmethod
-    def of(cls, parts: Sequence[CoarseFrames], places_mm: Sequence[FloatArray]) -> ShiftFit:
+    def of(
+        cls, parts: Sequence[CoarseFrames], places_mm: Sequence[FloatArray], *, tolerance: float = _FIT_TOLERANCE
+    ) -> ShiftFit:
         """Fit the map's gradient and the nuisances to the readings."""
         cells = Cells.of(places_mm)
         pressure = np.concatenate([part.pressure.reshape(-1) for part in parts])
-        levelled = map_fit(parts, pressure, cells)[1]
+        levelled = map_fit(parts, pressure, cells, tolerance=tolerance)[1]
         gradient = cells.gradient(levelled)
         row = np.concatenate([np.tile(part.row, len(part.pressure)) for part in parts])
         row_cell = np.unique(row * (cells.number.max() + 1) + cells.number, return_inverse=True)[1]
-        data = _fit_groups(parts, pressure - cells.within(gradient), row_cell)[0]
-        return cls(tuple(parts), cells, row_cell, levelled, gradient, data)
+        data = _fit_groups(parts, pressure - cells.within(gradient), row_cell, tolerance=tolerance)[0]
+        return cls(tuple(parts), cells, row_cell, levelled, gradient, data, tolerance)
 
     def with_gradient_of(self, keep: BoolArray) -> ShiftFit:
         """Copy with the gradient of the map of some of the readings."""
@@ -76,7 +79,7 @@ class ShiftFit(Record, eq=False):
 
     def design(self, moves: Sequence[FloatArray]) -> FloatArray:
         """(n,) change of the readings when their places move by (m, k, 2), less its projection on the nuisances."""
-        return _fit_groups(self.parts, self._changes(moves), self.row_cell)[0]
+        return _fit_groups(self.parts, self._changes(moves), self.row_cell, tolerance=self.tolerance)[0]
 
     def raw_design(self, moves: Sequence[FloatArray]) -> FloatArray:
         """(n,) change of the readings less its projection on the frames' quadratics alone."""
@@ -563,7 +566,8 @@ def stroke_lag_figures(sources: Sequence[FrameSource]) -> dict[str, float]:
     directions = np.array([stroke.direction for stroke in strokes])
     if len({direction for part in parts for direction in directions[part.stroke].tolist()}) < 2:
         return {}
-    fit = ShiftFit.of([part.coarse for part in parts], [part.places_mm for part in parts])
+    coarse, places = [part.coarse for part in parts], [part.places_mm for part in parts]
+    fit = ShiftFit.of(coarse, places, tolerance=COMPARED_TOLERANCE)
     design = fit.design([part.along_x(directions) for part in parts])
     information = float(design @ design)
     if not information > 0:
