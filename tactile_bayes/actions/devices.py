@@ -118,6 +118,8 @@ def devices_action(
     *, url: str | None, pivot_url: str | None, tracker_protocol: str, tool: str | None, duration: float
 ) -> None:
     """List the serial ports and the devices that are probably on them."""
+    if url is not None and pivot_url is not None:
+        raise UsageError("--probe asks a device who it is, --pivot turns a tracker; give one of them")
     if url is not None:
         click.echo(f"{url}: {probe(url)}")
     elif pivot_url is not None:

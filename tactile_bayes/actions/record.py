@@ -113,7 +113,9 @@ def calibration_age(request: Request, *, head_id: str, today: date) -> dict[str,
     age, fault = (today - calibration.day).days, ""
     if calibration.head_id != head_id:
         fault = f"was measured on head {calibration.head_id!r}, this is {head_id!r}; calibrate this head"
-    elif not 0 <= age <= request.calibration_days:
+    elif age < 0:
+        fault = f"is of {calibration.day}, which is to come; correct its date or this computer's clock"
+    elif age > request.calibration_days:
         fault = f"is of {calibration.day}, {age} days ago (at most {request.calibration_days:g}); calibrate again"
     if fault and not request.accept_calibration:
         raise UsageError(f"{request.array_calibration} {fault}, or give --accept-calibration")

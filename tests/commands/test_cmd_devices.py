@@ -71,6 +71,13 @@ def test_a_guessed_device_is_said_to_be_a_guess(vendor, product, words):
     assert words in guess_device(vendor, product)
 
 
+def test_a_pivot_beside_a_probe_is_refused(run_cli):
+    """It was not made, without a word."""
+    done = run_cli("devices", "--probe", "/dev/null", "--pivot", "/dev/null")
+    assert done.returncode == 2
+    assert "give one of them" in done.stderr
+
+
 def test_ports_are_listed(run_cli):
     done = run_cli("devices")
     assert done.returncode == 0, done.stderr

@@ -57,6 +57,8 @@ def test_a_recording_tells_the_age_of_its_array_calibration(monkeypatch: pytest.
     request = SimpleNamespace(array_calibration="array.json", **given)
     assert calibration_age(request, **day) == {"array_calibration_days": "3"}
     assert calibration_age(SimpleNamespace(array_calibration=None, **given), **day) == {}
+    with pytest.raises(UsageError, match="is of 2026-01-30, which is to come"):  # it was -4 days old
+        calibration_age(request, head_id="7", today=date(2026, 1, 26))
 
 
 def test_readings_at_the_heads_own_full_scale_carry_no_pressure() -> None:
