@@ -144,7 +144,7 @@ class _SampleFacts(Record):
     bits: int = 8
     kind: int = 1  #: A key of `_KINDS`.
     white_is_zero: bool = False
-    no_value: float | None = None  #: Number of pixels without a value, in the file's own scale.
+    no_value: float | None = None  #: Number that stands for no value, in the file's own scale.
     spacing_mm: tuple[float, float] | None = None
 
 

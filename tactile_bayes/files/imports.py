@@ -13,6 +13,7 @@ from unicodedata import normalize
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from tactile_bayes import scans
 from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import BadDataError, in_file, suggestion
 from tactile_bayes.files.arrays_layout import KNOWN, LAYOUT, OPTIONAL, ArrayMap, Stated, in_words
@@ -27,15 +28,6 @@ from tactile_bayes.findings import Finding, finding
 from tactile_bayes.geometry import FloatArray, check_rigid
 from tactile_bayes.mapping.select import LEAST_FRAMES, unit_question
 from tactile_bayes.presets import KPA_PER_UNIT, MM_PER_UNIT, PRESSURE_RANGE_KPA, PRESSURE_WINDOW_KPA
-from tactile_bayes.scans import (
-    ElementCalibration,
-    HeadGeometry,
-    Landmarks,
-    PressureFrames,
-    Scan,
-    TrackerPoses,
-    check_pitch,
-)
 
 # No value of a scan is larger, seconds since 1970 included; the squares of damaged ones would overflow.
 _LARGEST: Final = 1e12
@@ -62,12 +54,12 @@ _TEMPLATE: Final = "`tactile-bayes import SRC --template` prints a MAP.toml for 
 _HELP: Final = "`tactile-bayes import --help` says what they are"
 
 
-def read_arrays(path: Path) -> Scan:
+def read_arrays(path: Path) -> scans.Scan:
     """Read a scan from a file of arrays with the layout's names."""
     return import_arrays(path, ArrayMap())[0]
 
 
-def import_arrays(path: Path, options: ArrayMap, others: Sequence[Source] = ()) -> tuple[Scan, list[str]]:
+def import_arrays(path: Path, options: ArrayMap, others: Sequence[Source] = ()) -> tuple[scans.Scan, list[str]]:
     """A scan from a file of arrays and `others`, and a note for each guess; errors name file and array."""
     with in_file(path):
         source = replace(_read_source(path, options, others), path=str(path))
@@ -128,7 +120,7 @@ def pose_source(path: Path, stated: Stated) -> Source:
     return replace(poses, path=str(path))
 
 
-def head_source(head: Path | HeadGeometry) -> Source:
+def head_source(head: Path | scans.HeadGeometry) -> Source:
     """Arrays of the head."""
     head = read_head_geometry(head) if isinstance(head, Path) else head
     arrays = {
@@ -139,13 +131,13 @@ def head_source(head: Path | HeadGeometry) -> Source:
     return Source(arrays, checked_on=head.checked_on)
 
 
-def calibration_source(calibration: Path | ElementCalibration) -> Source:
+def calibration_source(calibration: Path | scans.ElementCalibration) -> Source:
     """Arrays of the pressure array's calibration."""
     calibration = read_array_calibration(calibration).calibration if isinstance(calibration, Path) else calibration
     return Source({name: np.asarray(getattr(calibration, name)) for name in names_of(calibration)})
 
 
-def landmark_source(landmarks: Path | Landmarks) -> Source:
+def landmark_source(landmarks: Path | scans.Landmarks) -> Source:
     """Arrays of the landmarks, also from a JSON file or another scan."""
     if isinstance(landmarks, Path):
         path = landmarks
@@ -160,7 +152,7 @@ def landmark_source(landmarks: Path | Landmarks) -> Source:
 # --- Arrays of other axes, clocks and units, made those of the layout.
 
 
-def combine_sources(sources: Sequence[Source], options: Stated) -> tuple[Scan, list[str]]:
+def combine_sources(sources: Sequence[Source], options: Stated) -> tuple[scans.Scan, list[str]]:
     """A scan of the sources' arrays, of which a later one stands for an earlier, and the notes on what was guessed."""
     stated = options
     notes: list[str] = []
@@ -519,7 +511,7 @@ def _check_units(arrays: Arrays, *, calibrated: bool) -> None:
         what = f"gain_kpa_per_count gives {full_scale:.4g} kPa at 4095 counts"
         raise BadDataError(what, way_out="looks like Pa or MPa, give kPa")
     _check_clocks(arrays)
-    check_pitch(surface, float(arrays["pitch_mm"]))
+    scans.check_pitch(surface, float(arrays["pitch_mm"]))
 
 
 def _check_clocks(arrays: Arrays) -> None:
@@ -542,18 +534,18 @@ def _check_clocks(arrays: Arrays) -> None:
         raise BadDataError(what, way_out=way_out)
 
 
-def _scan_of_arrays(arrays: Arrays, facts: Mapping[str, str], checked_on: str) -> Scan:
+def _scan_of_arrays(arrays: Arrays, facts: Mapping[str, str], checked_on: str) -> scans.Scan:
     values = {name: np.asarray(array, dtype=np.float64) for name, array in arrays.items() if name != "counts"}
     marks = values.get("landmarks_mm")
     surface, transform = values["head_surface_mm"], values["array_from_tracker"]
     check_rigid(transform, name="array_from_tracker")
-    return Scan(
-        frames=PressureFrames(values["frame_time_s"], arrays["counts"].astype(np.uint16)),
-        poses=TrackerPoses(values["pose_time_s"], values["position_mm"], values["quaternion_wxyz"]),
-        head=HeadGeometry(surface, float(values["pitch_mm"]), transform, checked_on),
-        element_calibration=ElementCalibration(
+    return scans.Scan(
+        frames=scans.PressureFrames(values["frame_time_s"], arrays["counts"].astype(np.uint16)),
+        poses=scans.TrackerPoses(values["pose_time_s"], values["position_mm"], values["quaternion_wxyz"]),
+        head=scans.HeadGeometry(surface, float(values["pitch_mm"]), transform, checked_on),
+        element_calibration=scans.ElementCalibration(
             values["gain_kpa_per_count"], values["offset_kpa"], int(values.get("saturation_count", 4095))
         ),
-        landmarks=None if marks is None else Landmarks(marks[0], marks[1], nipple_mm=values.get("nipple_mm")),
+        landmarks=None if marks is None else scans.Landmarks(marks[0], marks[1], nipple_mm=values.get("nipple_mm")),
         session={"source": "imported", **facts},
     )

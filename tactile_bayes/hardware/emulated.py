@@ -24,7 +24,7 @@ from tactile_bayes.errors import DeviceError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.ports import reason
-from tactile_bayes.hardware.readings import HelloReading, MissingReading, PoseReading, ToolReading, pose_from_relative
+from tactile_bayes.hardware.readings import HelloReading, MissingReading, PoseReading, ToolReading, relative_pose
 from tactile_bayes.hardware.serial_trackers import encode_record
 from tactile_bayes.options import FaultOptions
 from tactile_bayes.scans import Scan, TrackerPoses
@@ -155,7 +155,8 @@ def tool_readings(poses: TrackerPoses, faults: Faults, index: int, *, names: tup
         x, y, z = _REFERENCE_MM
         y += faults.breathe_mm / 2 * math.sin(2 * math.pi * time_s / _BREATH_S)
         bases = [PoseReading((x, y, z), _REFERENCE_TURN, pose.device_ns, tool=names[1])]
-        pose = pose_from_relative(pose, bases[0])._replace(tool=names[0])
+        tracker = relative_pose(PoseReading((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), bases[0])
+        pose = relative_pose(pose, tracker)._replace(tool=names[0])
     if is_during(faults.hide, time_s):
         return [*bases, MissingReading("out of sight", pose.tool)]
     return [*bases, pose]

@@ -300,13 +300,8 @@ def fit_array(steps: Sequence[BladderStep], *, saturation_count: int) -> ArrayFi
         raise BadDataError(what, way_out="check which step was recorded under which pressure")
     line = _polynomials(pressure, counts, use, degree=1)
     curve = _polynomials(pressure, counts, use, degree=2 if len(steps) >= STEPS_FOR_CURVATURE else 1)
-    gain, offset = line[1], line[0]
-    if (gain[good] < 0).any():
-        row, column = (int(i) for i in np.argwhere(good & (gain < 0))[0])
-        what = f"row {row} column {column} reads less under more pressure"
-        raise BadDataError(what, way_out="check the steps' pressures")
     return ArrayFit(
-        calibration=ElementCalibration(gain, offset, saturation_count=saturation_count),
+        calibration=ElementCalibration(line[1], line[0], saturation_count=saturation_count),
         curvature_kpa_per_count2=curve[2],
         dead=_taxels_in(dead),
         hot=_taxels_in(hot),

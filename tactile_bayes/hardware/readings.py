@@ -127,7 +127,7 @@ ToolReading = PoseReading | MissingReading
 
 
 def tally(counted: Counter[str], word: str) -> None:
-    """Count a word that a device sent; beyond `_MOST_WORDS` different ones it counts as ``other_tools``."""
+    """Count a word that a device sent; beyond `_MOST_WORDS` different ones it counts as ``others``."""
     counted[word if word in counted or len(counted) < _MOST_WORDS else "others"] += 1
 
 
@@ -178,15 +178,6 @@ class Follower:
             yield MissingReading(f"no pose of {self.reference}", pose.tool), host_ns
         else:
             yield relative_pose(pose, latest[0]), host_ns
-
-
-def pose_from_relative(pose: PoseReading, reference: PoseReading) -> PoseReading:
-    """Convert a pose from the frame of a reference tool to the tracker's frame."""
-    back = _conjugate(reference.quaternion_wxyz)
-    _, x, y, z = _product(_product(reference.quaternion_wxyz, (0.0, *pose.position_mm)), back)
-    a, b, c = reference.position_mm
-    rotation = _product(reference.quaternion_wxyz, pose.quaternion_wxyz)
-    return pose._replace(position_mm=(a + x, b + y, c + z), quaternion_wxyz=rotation)
 
 
 def relative_pose(pose: PoseReading, reference: PoseReading) -> PoseReading:

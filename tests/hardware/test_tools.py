@@ -35,7 +35,6 @@ from tactile_bayes.hardware.readings import (
     HelloReading,
     MissingReading,
     PoseReading,
-    pose_from_relative,
     relative_pose,
 )
 from tactile_bayes.hardware.serial_trackers import TRACKERS, check_head, open_tracker
@@ -264,7 +263,8 @@ def test_a_relative_pose_is_the_product_of_the_transforms(place, base_place, tur
         rotation.T @ rotation_from_quaternion(np.array(TURN)),
         atol=1e-12,
     )
-    np.testing.assert_allclose(pose_from_relative(found, base).position_mm, place, atol=1e-9)
+    tracker = relative_pose(PoseReading((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), base)
+    np.testing.assert_allclose(relative_pose(found, tracker).position_mm, place, atol=1e-9)
 
 
 def test_rotations_are_inverted_before_they_are_combined():
