@@ -12,11 +12,11 @@ import numpy as np
 from tactile_bayes.commands.options import is_folder
 from tactile_bayes.declarations import Record, as_dict, names_of, replace
 from tactile_bayes.errors import EXIT_DONE, BadDataError, TactileBayesError, UsageError, one_line
+from tactile_bayes.files import imports
 from tactile_bayes.files.arrays_layout import ArrayMap, GridOptions, Stated
 from tactile_bayes.files.atomic import check_suffix, refuse_existing, refuse_same
 from tactile_bayes.files.documents import with_session
 from tactile_bayes.files.grids import import_grid
-from tactile_bayes.files.imports import calibration_source, head_source, import_arrays, landmark_source, pose_source
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, array_template, read_array_map
 from tactile_bayes.files.provenance import Provenance, hash_inputs
@@ -30,9 +30,9 @@ from tactile_bayes.scans import Scan
 from tactile_bayes.shell import progress_bar
 
 _SCAN_FILES: Final = {
-    "head_geometry": head_source,
-    "array_calibration": calibration_source,
-    "landmarks": landmark_source,
+    "head_geometry": imports.head_source,
+    "array_calibration": imports.calibration_source,
+    "landmarks": imports.landmark_source,
 }
 
 
@@ -50,13 +50,14 @@ class ImportRequest(Record):
     @property
     def scan_options(self) -> list[str]:
         """The options of this call that only scans have."""
-        values = {"session": self.session_file, "correct": self.corrections}
+        landmarks = self.scan_files.get("landmarks")
+        values = {"session": self.session_file, "correct": self.corrections, "landmarks": landmarks}
         return [*(f"--{name}" for name, value in values.items() if value), *self.array_options]
 
     @property
     def array_options(self) -> list[str]:
         """The options of this call that only scans from arrays or tables have."""
-        return _flags([*self.scan_files, *self.arrays.given])
+        return _flags([*(name for name in self.scan_files if name != "landmarks"), *self.arrays.given])
 
 
 def _flags(names: Iterable[str]) -> list[str]:
@@ -147,12 +148,14 @@ def _import_scan(source: Path, output: Path, request: ImportRequest) -> list[str
     if source.suffix.lower() == ".mcap":
         file = read_scan_report(source)
         scan, lost, truth = file.scan, file.lost, file.truth
+        if (landmarks := request.scan_files.get("landmarks")) is not None:
+            scan = replace(scan, landmarks=imports.touched_landmarks(landmarks))
     else:
         parts = []
         for name, path in request.scan_files.items():
-            part = pose_source(path, request.arrays) if name == "poses" else _SCAN_FILES[name](path)
+            part = imports.pose_source(path, request.arrays) if name == "poses" else _SCAN_FILES[name](path)
             parts.append(replace(part, path=str(path)))
-        scan, notes = import_arrays(source, request.arrays, parts)
+        scan, notes = imports.import_arrays(source, request.arrays, parts)
         notes.insert(0, _lengths(scan))
     settings = {"as": "scan", "lost": list(lost), "correct": list(request.corrections), **request.arrays.given}
     scan = corrected(with_session(scan, request.session_file), request.corrections)

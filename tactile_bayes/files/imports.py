@@ -137,14 +137,17 @@ def calibration_source(calibration: Path | scans.ElementCalibration) -> Source:
     return Source({name: np.asarray(getattr(calibration, name)) for name in names_of(calibration)})
 
 
+def touched_landmarks(path: Path) -> scans.Landmarks:
+    """Landmarks from a JSON file or another scan."""
+    landmarks = read_scan(path).landmarks if path.suffix.lower() == ".mcap" else read_landmarks(path)
+    if landmarks is None:
+        raise BadDataError("holds no landmarks", way_out="give another scan, or a JSON file", path=str(path))
+    return landmarks
+
+
 def landmark_source(landmarks: Path | scans.Landmarks) -> Source:
-    """Arrays of the landmarks, also from a JSON file or another scan."""
-    if isinstance(landmarks, Path):
-        path = landmarks
-        touched = read_scan(path).landmarks if path.suffix.lower() == ".mcap" else read_landmarks(path)
-        if touched is None:
-            raise BadDataError("holds no landmarks", way_out="give another scan, or a JSON file", path=str(path))
-        landmarks = touched
+    """Arrays of the landmarks."""
+    landmarks = touched_landmarks(landmarks) if isinstance(landmarks, Path) else landmarks
     nipple = {} if landmarks.nipple_mm is None else {"nipple_mm": landmarks.nipple_mm}
     return Source({"landmarks_mm": np.stack([landmarks.sternal_notch_mm, landmarks.xiphoid_mm]), **nipple})
 

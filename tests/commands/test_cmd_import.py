@@ -33,6 +33,17 @@ def test_arrays_become_a_scan(run_cli: Run, shared_data: Path, tmp_path: Path) -
     np.testing.assert_array_equal(read_scan(tmp_path / "a.mcap").frames.counts, np.load(source)["counts"])
 
 
+def test_landmarks_of_a_scan_are_corrected(run_cli: Run, tmp_path: Path) -> None:
+    """The caution on a lump on the other side of the body names this way, and the option was refused."""
+    marks = {"sternal_notch_mm": [0, 150, 0], "xiphoid_mm": [0, -50, 0]}
+    (tmp_path / "marks.json").write_text(json.dumps({"schema": "tactile-bayes/landmarks/1", **marks}))
+    done = run_cli("import", DEMO, "--landmarks", "marks.json", "-o", "new.mcap", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    landmarks = read_scan(tmp_path / "new.mcap").landmarks
+    assert landmarks is not None
+    assert [landmarks.sternal_notch_mm.tolist(), landmarks.xiphoid_mm.tolist()] == list(marks.values())
+
+
 def test_a_grid_becomes_a_map(run_cli: Run, tmp_path: Path) -> None:
     (tmp_path / "g.csv").write_text("1,1.1,1\n1,1.3,\n")
     done = run_cli("import", "g.csv", "-o", "g.nc", "--spacing-mm", 1.5, "--normalise", "mean", cwd=tmp_path)
