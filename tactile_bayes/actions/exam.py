@@ -6,7 +6,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Callable
-from datetime import UTC, datetime
+from datetime import date
 from pathlib import Path
 from typing import Final
 
@@ -50,7 +50,7 @@ def check_action(
             if check.too_short or check.findings or any(one.kind not in _RECORDING_FINDINGS for one in check.doubts):
                 fault = "the scan does not show that its head is right"
                 raise BadDataError(fault, way_out="scan a phantom with a lump")
-            day = datetime.now(tz=UTC).date().isoformat()
+            day = date.today().isoformat()
             write_head(output, replace(scan.head, checked_on=day), force=force)
             click.echo(f"{output}: the head, checked on {day}")
     click.echo(RESEARCH_USE)
