@@ -507,7 +507,7 @@ class SbcOptions(Options, kw_only=True):
     maps: Annotated[int, Meta(ge=1, le=MOST_ITEMS), "Maps to simulate."] = 200
     method: Annotated[
         Literal["laplace", "importance", "ensemble"],
-        "Method of the posterior draws, as in `estimate`; ensemble takes about 20 times as long.",
+        "Method of the posterior draws, as in `estimate`; ensemble takes 6 to 10 times as long.",
     ] = "importance"
     field_cosines: Annotated[
         FieldCosines, cli_meta("N|auto"), "Basis functions of the noise field, as field_cosines of `estimate`."

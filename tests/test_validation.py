@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
+from tactile_bayes.mapping.map import broken_assumptions
 from validation import agreement_coverage
 from validation.__main__ import NAMES
 from validation.common import RESULTS, Table, percent, pickled, share
@@ -42,6 +44,19 @@ def test_limits_and_lines_are_judged_by_three_kinds_of_intervals() -> None:
     corrected, jackknife, customary = agreement_coverage._three(one)
     assert set(corrected) == set(jackknife) == set(agreement_coverage.WANTED)
     assert {"ols_slope", "limit_low_mm"} <= set(customary) < set(corrected)
+
+
+def test_figures_in_texts_of_the_program_are_the_kept_ones() -> None:
+    """Sizes on convex skin were said to move by 7 %, exams of a simulated body to differ by 5 % and, on pages, by 3."""
+    kept = dict(re.findall(r'"convex skin, radius (\d+) mm","[^"]+",([\d.]+) %', (RESULTS / "stress.csv").read_text()))
+    (skin,) = broken_assumptions({"skin_curvature_per_m": 10.0, "skin_curvature_sd_per_m": 1.0})
+    assert f"moved by {float(kept['150']):.0f} and {float(kept['75']):.0f} %" in skin.text
+    solid = size_calibration_path("solid")
+    assert solid is not None
+    exams = read_size_calibration(solid).between_exams.sd
+    assert f"({exams:.3f} if solid)" in (ROOT / "docs" / "columns-and-keys.md").read_text(encoding="utf-8")
+    for page in ("how-a-size-comes-about.md", "guides/python.md", "accuracy.md"):
+        assert f" {100 * exams:.1f} %" in (ROOT / "docs" / page).read_text(encoding="utf-8").replace("\n", " ")
 
 
 def missing(text: str) -> list[str]:

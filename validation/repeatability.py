@@ -38,7 +38,7 @@ from validation.common import Table, parser, program, share
 SEED = 20261124
 MAP_SD, MAP_LOG_SD, BODY_SD = 0.03, 0.4, 0.07
 SIMULATED = BetweenMaps(0.03)
-"""About as the shipped `solid` has it for maps with figures by place."""
+"""About as the shipped `solid` has it: 2.5 %."""
 PAPER = BetweenMaps()
 BODIES = BODY_SD * ndtri((np.arange(64) + 0.5) / 64)
 

@@ -37,8 +37,8 @@ WhyNone = tuple[str, str]  #: Reason for widths without a size where no calibrat
 
 
 _LEAST_SQUARES: WhyNone = (
-    "optimise is the paper's least squares, and the shipped calibrations were learned with correlated errors (its "
-    "widths are up to 30 % wider, docs/decisions/0093); widths only",
+    "optimise is the paper's least squares, and the shipped calibrations were learned with correlated errors "
+    "and a free level, which make other widths; widths only",
     "--method laplace --size-calibration eq6 gives a size by Eq 6 as quickly; for least squares throughout, learn Eq 6 "
     "from phantoms fitted by --method optimise (`calibrate size`) and give that file",
 )

@@ -38,7 +38,7 @@ class Settings(FitSettings, kw_only=True):
         Annotated[float, Meta(ge=0, le=2)] | None,
         IN_FILE,
         "SD of ln size between maps of one mass, taken as known. Default: one interval for exams as the calibration's "
-        "(0.05 if solid), one as the paper's (0.15)",
+        "(0.025 if solid), one as the paper's (0.15)",
     ] = None
     repeatability: Annotated[
         Repeatability | None,

@@ -274,7 +274,7 @@ def default_errors(tactile_map: TactileMap) -> tuple[Background, Noise]:
 
 def check_background(tactile_map: TactileMap, options: SamplerSettings) -> None:
     """`UsageError` for a fixed background of a map whose level is not known: fixed at the map's median, intervals of
-    widths cover 4 to 29 % instead of 90 % (docs/coverage.md)."""
+    widths cover 0 to 49 % instead of 90 % (docs/coverage.md)."""
     if options.background == "fixed" and tactile_map.background is None:
         raise UsageError(
             f"the map's level far from a lump is not known (normalise {tactile_map.recipe.normalise}), so a background "
