@@ -60,7 +60,7 @@ bench-trial: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check statsmodels pingouin
 	$(BIN)/python -m benchmarks.trial
 
-# The size calibrations that come with the program, made again: an hour on two cores for the population's scans.
+# The size calibrations that come with the program, made again: an hour and a half on two cores for the population's scans.
 calibrations: $(VENV)/.installed
 	mkdir -p build
 	OPENBLAS_NUM_THREADS=1 $(BIN)/tactile-bayes population --masses 1500 --centred 750 --seed 7 --workers 2 \
