@@ -50,7 +50,7 @@ def fill_from_posteriors(table: Table) -> tuple[dict[str, list[Any]], list[Path]
     Relative paths start at the table's folder; ``batch.json#3`` is the third of a list.
     """
     filled = {name: list(values) for name, values in table.columns.items()}
-    folder, paths = table.path.parent, []
+    folder, first = table.path.parent, dict[tuple[Path, str], int]()
     for row, name in enumerate(filled.get("posterior", [])):
         if not name:
             continue
@@ -61,12 +61,14 @@ def fill_from_posteriors(table: Table) -> tuple[dict[str, list[Any]], list[Path]
         stem, mark, number = name.rpartition("#")
         if not (mark and number.isascii() and number.isdigit() and len(number) < 10) or (folder / name).exists():
             stem, number = name, ""
+        if (before := first.setdefault((folder / stem, number), row)) != row:
+            what = f"names the estimate of line {table.line_numbers[before]}"
+            raise table.error(row, "posterior", what, way_out="give each reading the estimate of its own exam")
         stated = read_stated_size(folder / stem, int(number) if number else None)
         _check_status(table, row, sized=stated is not None)
         for column, part in _COLUMNS.items():
             filled[column][row] = None if stated is None else getattr(stated, part)
-        paths.append(folder / stem)
-    return filled, list(dict.fromkeys(paths))
+    return filled, list(dict.fromkeys(path for path, _ in first))
 
 
 def _check_status(table: Table, row: int, *, sized: bool) -> None:

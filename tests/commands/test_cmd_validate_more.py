@@ -167,6 +167,11 @@ def test_a_posteriors_draws_are_read_directly(tmp_path: Path) -> None:
         (SIZE, ",detected,estimate.json#2", "holds one estimate, no list"),
         (SIZE, ",detected,gone.json", "cannot be read"),
         (SIZE, ",detected,t.csv", "neither JSON nor netCDF"),
+        (
+            SIZE,
+            ",detected,estimate.json\nP1,1,tactile,2,,detected,./estimate.json",
+            "line 3, column posterior: names the estimate of line 2",
+        ),
     ],
 )
 def test_a_posterior_that_contradicts_its_row_is_refused(tmp_path: Path, size: dict, cells: str, words: str) -> None:
