@@ -6,7 +6,7 @@ import json
 import sys
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
-from functools import cache, partial
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from time import monotonic
@@ -357,12 +357,7 @@ def sbc_action(
 
 def shipped_ranks(index: int, *, method: Method, seed: int, cosines: FieldCosines) -> sbc.MapRanks:
     """Ranks of one map by the shipped calibration, which each process reads once."""
-    return sbc.ranks_of_map(index, method=method, seed=seed, calibration=_shipped_calibration(), cosines=cosines)
-
-
-@cache
-def _shipped_calibration() -> BodyCalibration:
     path = size_calibration_path(DEFAULT)
     calibration = None if path is None else read_size_calibration(path)
     assert isinstance(calibration, BodyCalibration)
-    return calibration
+    return sbc.ranks_of_map(index, method=method, seed=seed, calibration=calibration, cosines=cosines)

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from tactile_bayes.actions.study import _shipped_calibration
 from tactile_bayes.declarations import as_dict, replace
+from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior import draw
 from tactile_bayes.posterior.draw import MapPosterior
@@ -179,6 +179,9 @@ def test_another_rise_is_one_that_neither_reaches() -> None:
 def size_ranks(n: int, *, wider: float = 1.0) -> np.ndarray:
     """Ranks of the size where truth and draws have one law, log-normal about an oval bump; `wider` spoils it."""
     ranks = []
+    path = size_calibration_path("solid")
+    assert path is not None
+    calibration = read_size_calibration(path)
     for i in range(n):
         rng = np.random.default_rng(i)
         middle = {"amplitude": 1.2, "sigma_x_mm": 8.0, "sigma_y_mm": 3.5}
@@ -187,7 +190,7 @@ def size_ranks(n: int, *, wider: float = 1.0) -> np.ndarray:
         true |= {name: wider * true[name] for name in ("sigma_x_mm", "sigma_y_mm")}
         rest = ("x_mm", "y_mm", "angle_rad", "background", "noise_sd")
         posterior = MapPosterior(**drawn, **dict.fromkeys(rest, np.zeros(1000)))
-        ranks.append(sbc._ranks_in(posterior, Truth(**as_dict(TRUTH) | true), rng, _shipped_calibration())[-1])
+        ranks.append(sbc._ranks_in(posterior, Truth(**as_dict(TRUTH) | true), rng, calibration)[-1])
     return np.array(ranks)
 
 
