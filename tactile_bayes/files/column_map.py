@@ -6,6 +6,7 @@ for and not found the mapping gives the table's word.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NamedTuple
@@ -63,6 +64,12 @@ class ColumnMap(Record):
     reading: Annotated[tuple[ReadingColumns, ...], Meta(min_length=1)] | None = None
     """One for each modality and replicate of a wide table of readings."""
     excision: ExcisionColumns | None = None
+
+    def __post_init__(self) -> None:
+        named = Counter(name for one in self.reading or () for name in (one.size, one.low, one.high) if name)
+        for name, times in named.items():
+            if times > 1:
+                raise BadDataError(f"column {name} is named {times} times", way_out="give each reading its own")
 
     def key_columns(self) -> list[str]:
         return [self.patient] if self.mass is None else [self.patient, self.mass]

@@ -95,6 +95,7 @@ def test_a_wide_table_is_read_by_its_mapping(tmp_path: Path) -> None:
         (WIDE.replace("P2", "P1"), MAPPING, "stands on line 2 already"),
         (WIDE.replace("P2", ""), MAPPING, "line 3"),
         (WIDE, MAPPING.replace("map2", "map3"), "column map3: is missing"),
+        (WIDE, MAPPING.replace("map2", "map1"), "map.toml: column map1 is named 2 times; give each reading its own"),
         (WIDE, MAPPING.replace("probability = 0.9", ""), "without probability"),
         (WIDE, MAPPING + "colour = 1\n", "map.toml"),
         (WIDE, "patient = [", "is not TOML"),
