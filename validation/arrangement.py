@@ -14,7 +14,8 @@ import numpy as np
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.imports import read_arrays
-from tactile_bayes.mapping.arrangement import check_scan, corrected
+from tactile_bayes.mapping.arrangement import check_scan
+from tactile_bayes.mapping.convention import corrected
 from tactile_bayes.presets import CORRECTIONS
 from tactile_bayes.scans import ElementCalibration, PressureFrames, Scan, TrackerPoses
 from validation.common import Table, parser

@@ -22,7 +22,8 @@ from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, array_template, rea
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.scan_mcap import read_scan_report, write_scan
 from tactile_bayes.findings import LEADS, finding_lines
-from tactile_bayes.mapping.arrangement import check_scan, corrected
+from tactile_bayes.mapping.arrangement import check_scan
+from tactile_bayes.mapping.convention import corrected
 from tactile_bayes.mapping.plausibility import MOST_SPAN_MM
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.map import describe_scan

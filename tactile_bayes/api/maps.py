@@ -36,9 +36,10 @@ from tactile_bayes.files.scan_text import kind_of_column
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.forward.scene import SimulatedScan
 from tactile_bayes.geometry import FloatArray
-from tactile_bayes.mapping.arrangement import ArrangementCheck, check_scan, corrected
+from tactile_bayes.mapping.arrangement import ArrangementCheck, check_scan
 from tactile_bayes.mapping.build import build_map as build
 from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS
+from tactile_bayes.mapping.convention import corrected
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.options import MapOptions
 from tactile_bayes.presets import CORRECTIONS, PRESSURE_WINDOW_KPA, RESEARCH_USE

@@ -6,11 +6,11 @@ error of spread s in each of n stretches of 0.2 s, the likelihood ratio of two a
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from itertools import product
 from math import exp, log
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -19,12 +19,12 @@ from tactile_bayes.findings import Finding, finding, finding_lines
 from tactile_bayes.geometry import FloatArray, apply, inverse, principal_axes
 from tactile_bayes.mapping import convention
 from tactile_bayes.mapping.cells import FramePoses, poses_at
-from tactile_bayes.mapping.convention import CoarseFrames
+from tactile_bayes.mapping.convention import CoarseFrames, corrected, reordered
 from tactile_bayes.mapping.latency import COMPARED_TOLERANCE, Cells, map_fit
 from tactile_bayes.mapping.plausibility import SURE_ODDS, scan_doubts
 from tactile_bayes.mapping.select import SelectedFrames, TaxelFault, scan_findings, select_frames
 from tactile_bayes.presets import CORRECTIONS, PRESSURE_WINDOW_KPA
-from tactile_bayes.scans import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import Scan
 
 _ARRAY_ORDERS: Final = ("rows-reversed", "columns-reversed", "half-turn", "quarter-turn", "quarter-turn-back")
 _ARRAY: Final = ((), *((name,) for name in _ARRAY_ORDERS))
@@ -63,6 +63,9 @@ LEAST_SWAY_MM, LEAST_SWAY_GAIN = 4.0, 0.25
 one of 842 right scans gains 0.19, all others 0.13 at most; breathing by 10 mm gains 0.31 to 1.0 (record 0136)."""
 _SWAYS_HZ: Final = (0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5)
 _SWAYS_TRIED, _SWAY_STEPS = 4, 5
+LEAST_LEVER_MM, LEAST_LEVER_GAIN = 8.0, 0.12
+"""Least error of a lever arm that is named, and its least gain over the stated one and over a body that the strokes
+drag along: one of 66 right scans by another simulator gains 0.04, all others 0.02 at most."""
 _LEAST_SWAY_FIRST_STEP: Final = 0.03
 """Least share of the squared errors that the first step removes, or no more are made: 22 of 88 right scans whose errors
 last reach it, and all of 32 that breathe."""
@@ -80,6 +83,7 @@ _DRIFTED: Final = (
     "have the scan taken again with the tracker warmed up and the breath held",
 )
 _SWAY_PARAMETERS: Final = 5  #: A rate, and cosine and sine along two axes.
+_LEVER_PARAMETERS: Final = 2  #: Along two axes.
 _LEAST_OTHERS: Final = 2  #: Fewest readings of other times that predict one.
 NOTHING_SHOWN: Final = "too little stands out to show that array, lever arm and quaternions are as stated"
 NOT_CHECKED: Final = finding(
@@ -90,49 +94,6 @@ NOT_CHECKED: Final = finding(
     "scan a phantom with a lump once and have it checked",
 )
 TOO_SHORT: Final = "too few frames to compare arrangements"
-_QUARTER: Final = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-
-
-def corrected(scan: Scan, corrections: Iterable[str]) -> Scan:
-    """Scan with the named `CORRECTIONS` made; each reading keeps its taxel's calibration."""
-    for name in corrections:
-        scan = _with_correction(scan, name)
-    return scan
-
-
-def _with_correction(scan: Scan, name: str) -> Scan:
-    head, poses = scan.head, scan.poses
-    lever = head.scanhead_from_tracker
-    levers = {
-        "lever-inverse": inverse(lever),
-        "lever-none": np.eye(4),
-        "quarter-turn": _QUARTER @ lever,
-        "quarter-turn-back": _QUARTER.T @ lever,
-    }
-    if name in levers:
-        return replace(scan, head=HeadGeometry(head.surface_mm, head.pitch_mm, levers[name]))
-    if name in _ROTATIONS[-1]:
-        wxyz = convention.corrected_quaternions(poses.quaternion_wxyz, [name])
-        return replace(scan, poses=TrackerPoses(poses.time_s, poses.position_mm, wxyz))
-    calibration = scan.element_calibration
-    counts, gain, offset = (
-        _reordered(array, name)
-        for array in (scan.frames.counts, calibration.gain_kpa_per_count, calibration.offset_kpa)
-    )
-    return replace(
-        scan,
-        frames=PressureFrames(scan.frames.time_s, counts),
-        element_calibration=ElementCalibration(gain, offset, calibration.saturation_count),
-    )
-
-
-def _reordered(array: Any, name: str) -> Any:
-    """(..., rows, columns) values in the order of taxels that a correction makes."""
-    if name == "transposed":
-        rows, columns = array.shape[-2:]
-        return np.ascontiguousarray(array.reshape(*array.shape[:-2], columns, rows).swapaxes(-1, -2))
-    axes = {"rows-reversed": (-2,), "columns-reversed": (-1,), "half-turn": (-2, -1)}[name]
-    return np.ascontiguousarray(np.flip(array, axes))
 
 
 class Arrangement(Record, eq=False):
@@ -149,6 +110,7 @@ class Arrangement(Record, eq=False):
     sway_mm: float = 0.0
     sways_a_minute: float = 0.0
     """`sway_mm`, `sways_a_minute`: Distance and rate of the body's motion to and fro."""
+    lever_mm: float = 0.0  #: How far the lever arm's end lies from where it is stated.
     poses: tuple[str, ...] = ()  #: How the poses are made, if otherwise than as stated, and what to do then.
 
     @property
@@ -158,6 +120,8 @@ class Arrangement(Record, eq=False):
             often = f"{self.sways_a_minute:.0f} times a minute"
             cause = "a tracker that drifts or slow breathing moves" if self.slow else "breathing moves"
             return f"the body moved to and fro by {self.sway_mm:.0f} mm, {often}, as {cause} it"
+        if self.lever_mm:
+            return f"the head lies about {self.lever_mm:.0f} mm from where the lever arm puts it"
         if self.late_ms:
             way = "late" if self.late_ms > 0 else "early"
             return f"the poses' times are {abs(self.late_ms):.0f} ms too {way} against the frames'"
@@ -254,10 +218,14 @@ class ArrangementCheck(Record, eq=False):
             )
         if self.best.sway_mm:
             return words, finding("frames_contradict", *(_DRIFTED if self.best.slow else _BREATHED))
+        if self.best.lever_mm:
+            remedy = "measure the lever arm again; where it is right, the body moved: have the breath held"
+        else:
+            remedy = self.best.poses[1] if self.best.poses else convention.import_again(self.best.corrections)
         return words, finding(
             "wrong_arrangement",
             "the sensor array or the tracker seems not to be mounted as stated; size and place may be wrong",
-            self.best.poses[1] if self.best.poses else convention.import_again(self.best.corrections),
+            remedy,
             "have it checked how the array and the tracker are mounted",
         )
 
@@ -402,18 +370,22 @@ def _compared(overlap: _Overlap, judged: Sequence[Arrangement], *, tried: int) -
 
 
 def _with_sway(overlap: _Overlap, check: ArrangementCheck) -> ArrangementCheck:
-    """The check, with a body that moved as the best arrangement where the frames agree with that."""
-    stated, stretches = check.stated, overlap.stretches
+    """The check, with a body that moved or another lever arm as the best arrangement where frames agree with that."""
+    stated = check.stated
     if stated.lasting < MOST_LASTING:
         return check
-    moved = overlap.fit_sway()
-    if moved is None or moved.sway_mm < LEAST_SWAY_MM or moved.gain_over(stated) < LEAST_SWAY_GAIN:
-        return check
-    gain = min(moved.gain_over(stated), moved.gain_over(overlap.fit_drag()))
-    log_odds = stretches * gain - _SWAY_PARAMETERS
-    if gain < LEAST_SWAY_GAIN or log_odds < log(LIKELY_ODDS):
-        return check
-    return replace(check, best=moved, log_odds=log_odds, contradicting=False)
+    tried = (
+        (overlap.fit_sway(), LEAST_SWAY_GAIN, _SWAY_PARAMETERS),
+        (overlap.fit_turn(), LEAST_LEVER_GAIN, _LEVER_PARAMETERS),
+    )
+    for moved, least, parameters in tried:
+        if moved is None or moved.gain_over(stated) < least:
+            continue
+        gain = min(moved.gain_over(stated), moved.gain_over(overlap.fit_drag()))
+        log_odds = overlap.stretches * gain - parameters
+        if gain >= least and log_odds >= max(check.log_odds, log(LIKELY_ODDS)):
+            check = replace(check, best=moved, log_odds=log_odds, contradicting=False)
+    return check
 
 
 def check_scan(
@@ -484,7 +456,7 @@ class _Overlap(Record, eq=False, dict=True):
     @cached_property
     def transposed(self) -> CoarseFrames:
         """The frames with rows and columns of the array read in the other order."""
-        bad = np.argwhere(~_reordered(self.selection.good_taxels, "transposed")).tolist()
+        bad = np.argwhere(~reordered(self.selection.good_taxels, "transposed")).tolist()
         faults = tuple(TaxelFault(row, column, "left out") for row, column in bad)
         scan = corrected(self.selection.scan, ["transposed"])
         return CoarseFrames.of(replace(self.selection, scan=scan, faults=faults), self.array.frames)
@@ -507,7 +479,7 @@ class _Overlap(Record, eq=False, dict=True):
         return replace(delayed.judge(corrections), late_ms=late_ms)
 
     def fit_sway(self) -> Arrangement | None:
-        """Stated arrangement of a body that moves to and fro at the best rate; None where a first step gains little."""
+        """Stated arrangement of a body that moves to and fro at the best rate; None where it hardly moves."""
         array, (_, cells, levelled, error) = self.array, self.stated_fit
         time_s = convention.block_means(self.selection.scan.frames.time_s[array.frames, None], array.first)
         slope = cells.gradient(levelled)
@@ -519,7 +491,21 @@ class _Overlap(Record, eq=False, dict=True):
         for rate in sorted(gains, key=gains.__getitem__)[-_SWAYS_TRIED:]:
             fit, amplitudes = self._fit_motion(waves[rate], least=_LEAST_SWAY_GAINS)
             fits.append(replace(fit, sway_mm=2 * float(np.linalg.norm(amplitudes, 2)), sways_a_minute=60 * rate))
-        return min(fits, key=lambda one: one.spread)
+        best = min(fits, key=lambda one: one.spread)
+        return best if best.sway_mm >= LEAST_SWAY_MM else None
+
+    def fit_turn(self) -> Arrangement | None:
+        """Stated arrangement with another lever arm, whose end swings as the head turns; None where it gains little."""
+        places, (_, cells, levelled, error) = self.stated_placement[0], self.stated_fit
+        along = places[:, -1] - places[:, 0]  # turns with the head
+        turn = np.unwrap(np.arctan2(along[:, 1], along[:, 0]))[:, None]
+        turn -= turn.mean()
+        first = _gauss_newton_step(turn, cells.gradient(levelled), error)[0]
+        if first < _LEAST_SWAY_FIRST_STEP * float(error @ error):
+            return None
+        fit, lever_mm = self._fit_motion(turn, least=_LEAST_SWAY_GAINS)
+        fit = replace(fit, lever_mm=float(np.linalg.norm(lever_mm)))
+        return fit if fit.lever_mm >= LEAST_LEVER_MM else None
 
     def fit_drag(self) -> Arrangement:
         """Stated arrangement of a body that the strokes drag along: slow strokes make it look like breathing."""
@@ -573,7 +559,7 @@ class _Overlap(Record, eq=False, dict=True):
         array, scan = self.transposed if "transposed" in corrections else self.array, self.selection.scan
         surface = scan.head.surface_mm
         for name in set(corrections) & {"rows-reversed", "columns-reversed", "half-turn"}:
-            surface = np.stack([_reordered(surface[..., i], name) for i in range(3)], axis=-1)
+            surface = np.stack([reordered(surface[..., i], name) for i in range(3)], axis=-1)
         mounted = corrected(scan, (name for name in corrections if name.startswith(("lever", "quarter"))))
         tracker_from_head = inverse(mounted.head.scanhead_from_tracker)
         taxels = array.weight.T @ apply(tracker_from_head, surface.reshape(-1, 3)[array.taxels])

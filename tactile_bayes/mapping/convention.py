@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise, permutations, product
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from tactile_bayes.findings import Finding, finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, inverse, rotation_from_quaternion
 from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, FramePoses, Projection
 from tactile_bayes.mapping.select import SelectedFrames, chunks
-from tactile_bayes.scans import TrackerPoses
+from tactile_bayes.scans import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
 
 # --- Frames averaged over 20 ms and over 2 x 2 taxels: enough to find shifts of a millimetre, in a tenth of the time.
 
@@ -209,6 +209,50 @@ def corrected_quaternions(wxyz: FloatArray, corrections: Iterable[str]) -> Float
     for name in corrections:
         wxyz = wxyz[:, [3, 0, 1, 2]] if name == "scalar-last" else wxyz * [1.0, -1.0, -1.0, -1.0]
     return wxyz
+
+
+_QUARTER: Final = np.array([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+
+def corrected(scan: Scan, corrections: Iterable[str]) -> Scan:
+    """Scan with the named `CORRECTIONS` made; each reading keeps its taxel's calibration."""
+    for name in corrections:
+        scan = _with_correction(scan, name)
+    return scan
+
+
+def _with_correction(scan: Scan, name: str) -> Scan:
+    head, poses = scan.head, scan.poses
+    lever = head.scanhead_from_tracker
+    levers = {
+        "lever-inverse": inverse(lever),
+        "lever-none": np.eye(4),
+        "quarter-turn": _QUARTER @ lever,
+        "quarter-turn-back": _QUARTER.T @ lever,
+    }
+    if name in levers:
+        return replace(scan, head=HeadGeometry(head.surface_mm, head.pitch_mm, levers[name]))
+    if name in ("scalar-last", "inverse-rotation"):
+        wxyz = corrected_quaternions(poses.quaternion_wxyz, [name])
+        return replace(scan, poses=TrackerPoses(poses.time_s, poses.position_mm, wxyz))
+    calibration = scan.element_calibration
+    counts, gain, offset = (
+        reordered(array, name) for array in (scan.frames.counts, calibration.gain_kpa_per_count, calibration.offset_kpa)
+    )
+    return replace(
+        scan,
+        frames=PressureFrames(scan.frames.time_s, counts),
+        element_calibration=ElementCalibration(gain, offset, calibration.saturation_count),
+    )
+
+
+def reordered(array: Any, name: str) -> Any:
+    """(..., rows, columns) values in the order of taxels that a correction makes."""
+    if name == "transposed":
+        rows, columns = array.shape[-2:]
+        return np.ascontiguousarray(array.reshape(*array.shape[:-2], columns, rows).swapaxes(-1, -2))
+    axes = {"rows-reversed": (-2,), "columns-reversed": (-1,), "half-turn": (-2, -1)}[name]
+    return np.ascontiguousarray(np.flip(array, axes))
 
 
 _LEFT_HANDED: Final = (

@@ -10,7 +10,7 @@ from campaign_files import arrays_of
 from in_process import run_here
 
 import tactile_bayes as tb
-from tactile_bayes.mapping.arrangement import corrected
+from tactile_bayes.mapping.convention import corrected
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
+import mapping_scans as scans
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -22,8 +23,8 @@ from tactile_bayes.mapping.arrangement import (
     _screened,
     check_arrangement,
     check_scan,
-    corrected,
 )
+from tactile_bayes.mapping.convention import corrected
 from tactile_bayes.mapping.select import SelectedFrames, select_frames
 from tactile_bayes.presets import CORRECTIONS
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
@@ -245,6 +246,24 @@ def test_a_body_that_breathes_is_named_and_a_still_one_is_not():
         assert check.best.sway_mm == pytest.approx(10.0, abs=3.0)
         assert check.best.sways_a_minute == pytest.approx(15.0, abs=3.1)
         assert not check.refused
+
+
+@pytest.mark.parametrize(("off_mm", "named"), [(0.0, False), (20.0, True)])
+def test_a_lever_arm_that_is_off_shows_where_the_head_turned(off_mm: float, named: bool) -> None:
+    """It smeared a lump of 15 mm to 20.2 without a word, in an exam whose head turned by 4 degrees."""
+    wide, faint = scans.gaussian(sigma_x=4, sigma_y=6, x=3), scans.gaussian(amplitude=0.25, sigma_x=4, sigma_y=4, x=-9)
+    scan = scans.make_scan(
+        scans.strokes(lines=4, per_line=90, reach_mm=25.0, spacing_mm=6.0),
+        field=lambda u, v: wide(u, v) + faint(u, v - 7) - 1,
+        head=scans.flat_head(rows=10, columns=14, lever_mm=(5.0, -30.0, -60.0)),
+        yaw_deg=5 * np.sin(np.arange(360) / 30),
+    )
+    lever = scan.head.scanhead_from_tracker.copy()
+    lever[1, 3] += off_mm
+    check = checked(replace(scan, head=HeadGeometry(scan.head.surface_mm, scan.head.pitch_mm, lever)))
+    assert check.best.lever_mm == pytest.approx(off_mm, abs=4.0)
+    assert ["measure the lever arm again" in one.remedy for one in check.findings] == [True] * named
+    assert not check.refused
 
 
 @pytest.mark.parametrize(("rate", "drift"), [(6.0, True), (15.0, False)])
