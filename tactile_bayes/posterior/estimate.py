@@ -249,6 +249,7 @@ def estimate_map(
     estimate = _estimate_of_map(EstimationTask(tactile_map, calibration, options, rng, progress))
     if estimate.code in NO_LUMP and options.scene != "none":
         reason = verdict.no_verdict(tactile_map) or verdict.hiding_settings(options)
+        reason = reason or verdict.cut_by_rim(tactile_map, estimate.candidates)
         estimate = estimate if reason is None else no_estimate(reason, estimate.candidates)
     of_map = (*map_findings(tactile_map), *tactile_map.findings)
     return replace(estimate, findings=by_severity((*of_map, *estimate.findings)))

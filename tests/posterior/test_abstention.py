@@ -46,6 +46,12 @@ def cut(*, right: int) -> np.ndarray:
         (STEP, "empty", "go over the place again"),
         (1 + WHITE, "undetected", "go over the place again"),
         (cut(right=1), "window", "mm to the picture's right (+x)"),
+        # half a lump beyond the rim, by whose probability there was no lump; to the left nothing is to be extended
+        (
+            bump_values(x=27.0, y=0.0, sigma_x=7.0, sigma_y=7.0) + WHITE,
+            "window",
+            "strokes 13 mm to the picture's right",
+        ),
     ],
 )
 def test_the_reason_has_a_code_and_a_way_out(values: np.ndarray, code: str, advice: str) -> None:
