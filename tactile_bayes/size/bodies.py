@@ -34,7 +34,6 @@ from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, Supposition
 from tactile_bayes.size.eq6 import Eq6Law, Power, Powers, eq6_coefficients, eq6_log_size, eq6_terms
 from tactile_bayes.size.terms import SiteShift
 
-UNLIKE: Final = "is unlike the bodies of the table"
 NO_PROFILE: Final = "the phantoms that correct the calibration have no pressure profile of the head"
 FARTHEST_LEVERAGE: Final = 3.0  #: Beyond this multiple there is no size.
 UNLIKE_SD: Final = 0.1
@@ -153,8 +152,8 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         sigma_mm = mean_width_mm(sigma_x_mm, sigma_y_mm)
         if self.fat_mm is None or self.leverage(amplitude, sigma_mm) <= terms.MOST_LEVERAGE:
             return self
-        what = f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm over {self.fat_mm:.3g} mm of fat"
-        return self._without_depth(f"{what} {UNLIKE}").widened_for_atypical_body()
+        why = f"{_pair(amplitude, sigma_mm)} over {self.fat_mm:.3g} mm of fat is unlike the bodies of the table"
+        return self._without_depth(why).widened_for_atypical_body()
 
     def for_maps(self, maps: Sequence[ShapeDraws]) -> BodyCalibration:
         """The calibration at the depth of fat estimated from a mass's maps, if all lie in its table there."""
@@ -275,10 +274,10 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         sigma_mm = mean_width_mm(sigma_x_mm, sigma_y_mm)
         texts = terms.outside_domain(self.domain, amplitude, sigma_mm, far=far)
         most = FARTHEST_LEVERAGE if far else terms.MOST_LEVERAGE
+        pair = _pair(amplitude, sigma_mm)
         if not texts and (leverage := self.leverage(amplitude, sigma_mm)) > most:
-            pair = f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm, a pair unlike those of the table"
-            texts = [f"{pair} (leverage {leverage:.1f} times the limit)"]
-        if not far and self.fat_note.endswith(UNLIKE):
+            texts = [f"{pair}, a pair unlike those of the table (leverage {leverage:.1f} times the limit)"]
+        if not far and self.fat_note.startswith(pair):  # of this map, not of another one of the mass
             texts.append(f"{self.fat_note}, so that depth is not used")
         return texts
 
@@ -338,6 +337,10 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
 def mean_width_mm(sigma_x_mm: float, sigma_y_mm: float | None) -> float:
     """The geometric mean of two widths; one alone stands for both."""
     return float(np.sqrt(sigma_x_mm * (sigma_x_mm if sigma_y_mm is None else sigma_y_mm)))
+
+
+def _pair(amplitude: float, sigma_mm: float) -> str:
+    return f"amplitude {amplitude:.3g} with sigma {sigma_mm:.3g} mm"
 
 
 def known_body(

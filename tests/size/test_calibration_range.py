@@ -50,6 +50,7 @@ def test_a_depth_that_no_body_goes_with_is_not_used(shipped: BodyCalibration) ->
     (words,) = used.outside(*BUMP)
     assert "mm of fat is unlike the bodies of the table, so that depth is not used" in words
     assert used.outside(*BUMP, far=True) == []
+    assert used.outside(0.323, 5.1) == []  # another map of the mass, which had these figures as its own
 
 
 def test_a_depth_that_goes_with_the_map_stays(shipped: BodyCalibration) -> None:
