@@ -204,9 +204,9 @@ def no_bump_reason(
             return _unmeasured(tactile_map, candidate)
         if likeliest.detection.log_bayes_factor > 0:
             rise = f"what rises {_near_text(candidate.centre_mm)} is a ridge"
-            why = _reason_for_fault(tactile_map, candidate, f"no lump found {where}: {rise}")
-            if why.code == "ridge":
-                return why
+            ridge = _reason_for_fault(tactile_map, candidate, f"no lump found {where}: {rise}")
+            if ridge.code == "ridge":
+                return ridge
     first = candidates[0]
     if likeliest is None and first.fault.startswith(FEW_CELLS):
         if tactile_map.recipe.cell_mm > COARSEST_MM and (why := no_verdict(tactile_map)) is not None:
