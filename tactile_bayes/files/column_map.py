@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from tactile_bayes.declarations import Meta, Record
 from tactile_bayes.errors import BadDataError, in_file
-from tactile_bayes.files.documents import parse_record, parse_toml
+from tactile_bayes.files.documents import load_schema, parse_record, parse_toml
 from tactile_bayes.files.reading import TOML_BYTES, read_text
 from tactile_bayes.files.tables import RawTable, Table, check_unique, composed, read_raw
 from tactile_bayes.presets import MM_PER_UNIT
@@ -96,9 +96,9 @@ def read_wide_excision(path: Path, mapping: ColumnMap, excision: ExcisionColumns
         {
             **row.key(mapping),
             "ex_vivo_mm": row.size(excision.size, factor, "was the mass not measured? then leave the cell blank"),
-            "ex_vivo_second_mm": row.number(excision.second, factor),
-            "sd_mm": row.number(excision.sd, factor),
-            "date": row.value(excision.date, "date"),
+            "ex_vivo_second_mm": row.number(excision.second, factor, "excision", "ex_vivo_second_mm"),
+            "sd_mm": row.number(excision.sd, factor, "excision", "sd_mm"),
+            "date": row.value(excision.date, "excision", "date"),
         }
         for row in rows
     ]
@@ -134,20 +134,21 @@ class _Row(NamedTuple):
         mass = "1" if mapping.mass is None else self.cells[mapping.mass]
         return {"patient": self.cells[mapping.patient], "mass": mass}
 
-    def value(self, column: str | None, kind: Literal["number", "date"]) -> Any:
-        """A number or date; None without its column or cell."""
-        return self.table.cell(self.line, column, self.cells[column], kind) if column else None
+    def value(self, column: str | None, schema: str, name: str) -> Any:
+        """A value by the rules of the field `name` in ``SCHEMA.table.json``; None without its column or cell."""
+        field = next(one for one in load_schema(f"{schema}.table.json")["fields"] if one["name"] == name)
+        return self.table.cell(self.line, column, self.cells[column], field) if column else None
 
-    def number(self, column: str | None, factor: float) -> float | None:
-        """A number in mm; None without its column or cell."""
-        value = self.value(column, "number")
+    def number(self, column: str | None, factor: float, schema: str, name: str) -> float | None:
+        """A number in mm; see `value`."""
+        value = self.value(column, schema, name)
         return None if value is None else factor * value
 
     def size(self, column: str, factor: float, ask: str) -> float:
         """A size in mm, which is above 0; `ask` is the way out of 0 and of a word."""
         text = self.cells[column]
         is_word = not any(map(str.isdigit, text))
-        value: float = 0.0 if is_word else self.value(column, "number")
+        value: float = 0.0 if is_word else self.table.cell(self.line, column, text, {"type": "number"})
         if is_word or value == 0:
             raise self.table.error(self.line, column, f"is {text}", way_out=ask)
         if value < 0:
@@ -177,7 +178,8 @@ def _reading(row: _Row, reading: ReadingColumns, mapping: ColumnMap) -> dict[str
         ask = f'does {text} mean that the mass was not found? then add not_detected = ["{text}"] to the mapping'
         ask += f'; that it was not looked for? not_done = ["{text}"]'
         status, size = "detected", row.size(reading.size, factor, ask)
-    spread = {f"{name}_mm": row.number(getattr(reading, name), factor) for name in ("sd", "low", "high")}
+    ends = {"sd_mm": reading.sd, "low_mm": reading.low, "high_mm": reading.high}
+    spread = {name: row.number(column, factor, "trial", name) for name, column in ends.items()}
     probability = None if spread["low_mm"] is None else reading.probability
     if status == "detected" and reading.low and spread["low_mm"] is not None and probability is None:
         what = "is an interval's end without probability"
@@ -192,7 +194,7 @@ def _reading(row: _Row, reading: ReadingColumns, mapping: ColumnMap) -> dict[str
         "probability": probability,
         "reader": (row.cells[reading.reader] or None) if reading.reader else None,
         "visit": reading.visit,
-        "date": row.value(reading.date, "date"),
+        "date": row.value(reading.date, "trial", "date"),
         "posterior": None,
         "synthetic": mapping.synthetic,
     }

@@ -13,7 +13,7 @@ import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, date, datetime
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 
@@ -208,10 +208,10 @@ class RawTable(Record):
         """Error for a cell; lines count from 1."""
         return _fault(line, column, what, way_out=way_out).with_path(self.path)
 
-    def cell(self, line: int, column: str, text: str, kind: Literal["number", "date"]) -> Any:
-        """Parse a cell as a finite number or a date; None where it is blank."""
+    def cell(self, line: int, column: str, text: str, field: Mapping[str, Any]) -> Any:
+        """Parse a cell by a field of a schema, which this table calls `column`; None where it is blank."""
         with in_file(self.path):
-            return _cell(line, text, {"name": column, "type": kind}, decimal_comma=self.decimal_comma)
+            return _cell(line, text, {**field, "name": column}, decimal_comma=self.decimal_comma)
 
 
 def read_raw(path: Path) -> RawTable:
