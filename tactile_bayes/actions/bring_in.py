@@ -20,7 +20,7 @@ from tactile_bayes.files.grids import import_grid
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, array_template, read_array_map
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.scan_mcap import read_scan_report, write_scan
+from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, refuse_other_exam, write_scan
 from tactile_bayes.findings import LEADS, finding_lines
 from tactile_bayes.mapping.arrangement import check_scan
 from tactile_bayes.mapping.convention import corrected
@@ -160,6 +160,8 @@ def _import_scan(source: Path, output: Path, request: ImportRequest) -> list[str
         notes.insert(0, _lengths(scan))
     settings = {"as": "scan", "lost": list(lost), "correct": list(request.corrections), **request.arrays.given}
     scan = corrected(with_session(scan, request.session_file), request.corrections)
+    if (landmarks := request.scan_files.get("landmarks")) is not None and landmarks.suffix.lower() == ".mcap":
+        refuse_other_exam(landmarks, read_scan(landmarks).session, scan.session)
     inputs = hash_inputs(source=source, session=request.session_file, **request.scan_files)
     write_scan(output, scan, provenance=Provenance("import", settings, inputs), truth=truth, force=request.force)
     return [*describe_scan(scan), *notes, *(f"lost: {line}" for line in lost), *_arrangement_lines(scan)]

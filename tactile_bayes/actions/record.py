@@ -27,7 +27,7 @@ from tactile_bayes.files.atomic import refuse_existing, unwritable
 from tactile_bayes.files.documents import check_session, read_session
 from tactile_bayes.files.instrument import read_array_calibration, read_head_geometry, read_landmarks
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.scan_mcap import RecordingWriter, create_exclusive, full_disk, read_scan
+from tactile_bayes.files.scan_mcap import RecordingWriter, create_exclusive, full_disk, read_scan, refuse_other_exam
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.ports import SILENT_S, Port, read_in_process
@@ -134,13 +134,7 @@ def _landmarks(request: Request) -> Landmarks | None:
     if bool(reference) != bool(request.reference):
         frame = f"relative to the tool {reference!r}" if reference else "of the tracker's own frame"
         raise UsageError(f"the landmarks of {request.landmarks} are {frame}; record with the same --reference")
-    facts = request.facts()
-    for name in ("subject", "visit"):
-        theirs, ours = scan.session.get(name), facts.get(name)
-        if theirs and ours and theirs != ours:
-            raise UsageError(
-                f"the landmarks of {request.landmarks} are of {name} {theirs}, this is {ours}; touch them anew"
-            )
+    refuse_other_exam(request.landmarks, scan.session, request.facts())
     return scan.landmarks
 
 

@@ -228,6 +228,14 @@ def read_scan(path: Path) -> scans.Scan:
     return file.scan
 
 
+def refuse_other_exam(path: Path, theirs: Mapping[str, str], ours: Mapping[str, str]) -> None:
+    """Refuse the landmarks of a scan whose session names another patient or visit than ours."""
+    for name in ("subject", "visit"):
+        if theirs.get(name) and ours.get(name) and theirs[name] != ours[name]:
+            fault = f"the landmarks of {path} are of {name} {theirs[name]}, this is {ours[name]}"
+            raise UsageError(f"{fault}; touch them anew, or leave them out")
+
+
 class ScanFile(Record, eq=False):
     """A scan and the report on its file."""
 

@@ -42,6 +42,12 @@ def test_landmarks_of_a_scan_are_corrected(run_cli: Run, tmp_path: Path) -> None
     landmarks = read_scan(tmp_path / "new.mcap").landmarks
     assert landmarks is not None
     assert [landmarks.sternal_notch_mm.tolist(), landmarks.xiphoid_mm.tolist()] == list(marks.values())
+    for subject in ("P1", "P2"):
+        (tmp_path / "s.toml").write_text(f'subject = "{subject}"\n')
+        words = ("-o", f"{subject}.mcap", "--session", "s.toml", "--landmarks", "P1.mcap" if subject == "P2" else DEMO)
+        done = run_cli("import", DEMO, *words, cwd=tmp_path)
+    assert "the landmarks of P1.mcap are of subject P1, this is P2" in done.stderr
+    assert not (tmp_path / "P2.mcap").exists()
 
 
 def test_a_grid_becomes_a_map(run_cli: Run, tmp_path: Path) -> None:
