@@ -7,10 +7,12 @@ import json
 import pytest
 
 from benchmarks.cold_start import CASES, DEMO, MEASURED_ELSEWHERE, PEERS
+from benchmarks.forward import HARD, ReusedBody
 from benchmarks.last import LAST, MARGIN, Comparison, read_figures
 from benchmarks.measure import CommandFailedError, run_once
 from benchmarks.run import main
 from tactile_bayes.cli import COMMANDS
+from tactile_bayes.presets import MEAN_KPA
 
 
 def test_one_case_is_measured_against_its_peer(tmp_path, capsys):
@@ -61,6 +63,11 @@ def test_a_ratio_that_got_worse_is_flagged_and_others_are_not(tmp_path):
         "memory": 2.38,
         "new": 9.0,
     }
+
+
+def test_a_peer_of_the_plane_model_presses_a_body_with_fewer_nodes_than_cells():
+    """`make bench-forward` ended in a traceback: the compliance of its cells is singular."""
+    assert ReusedBody(HARD).press(10.0).mean() == pytest.approx(MEAN_KPA)
 
 
 def test_make_bench_compares_with_the_last_kept_ratios(tmp_path, capsys):
