@@ -132,7 +132,7 @@ def _eq6(table: Path | Sheet, options: LearnOptions, progress: Progress | None) 
 
 
 def table_cautions(columns: Mapping[str, Sequence[Any]], *, least_stiffness_ratio: float = 0.0) -> tuple[str, ...]:
-    """Cautions on sizes by Eq 6 from a table of lumps; see docs/decisions/0093 for the figures."""
+    """Cautions on sizes by Eq 6 from a table of lumps."""
     cautions, seats, largest_mm = [], set(columns["seat"]), max(columns["d_mm"])
     if largest_mm < TINY_MM:
         cautions.append(f"its largest lump has {largest_mm:g} mm; if its diameters are in cm, sizes come out as cm too")

@@ -43,8 +43,7 @@ INVERTED: Final = ("stiffness_ratio",)
 MOST_SHARE: Final = 0.9
 """Share of B's variance that all properties together tell at most.
 
-In the second moments it comes out above 1, because SD(B) is learned apart from them. They explain 95 % of held-out
-bodies' departures without and 76 % with the depth of fat, with the exams' own errors in the rest (record 0118).
+In the second moments it comes out above 1, because SD(B) is learned apart from them (record 0118).
 """
 
 

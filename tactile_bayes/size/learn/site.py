@@ -37,11 +37,10 @@ SHARED = ("seat", "stiffness_ratio", "fat_kpa", "gland_ratio", "thickness_mm")
 """Properties that phantoms of one set may have in common: those made alike, or of one block of material."""
 LACK = 0.5
 """Share of what all properties leave of B that phantoms of a set have in common: B is not linear in its properties, and
-two sets of the same sizes in two seats differ by 7 % (record 0102)."""
+two sets of the same sizes in two seats differ by 7 to 11 % (record 0102)."""
 _GRID = np.geomspace(0.1, 10.0, 81)
 FAR = 3.0  #: Standard deviations of the prior beyond which a shift is named.
-APART = 3.5
-"""The same of the prediction for a phantom; one of 20 phantoms is named by chance in 1 site of 30 (record 0102)."""
+APART = 3.5  #: The same of the prediction for a phantom.
 SLOPE_OPEN, ALIKE = 0.8, 0.2
 """A slope is open where it keeps this share of the prior's SD, and the SD of the phantoms' ln sigma is below this."""
 MOST_SPREAD = 2.0
