@@ -173,39 +173,6 @@ def _interval(
     return Interval(low_mm, high_mm, probability)
 
 
-def gather(readings: Iterable[Reading], ex_vivo_mm: Mapping[MassKey, float]) -> dict[str, ModalitySizes]:
-    """Sizes of each modality: the mean over each mass's detected replicates. Tactile comes first, then by name.
-
-    Readings come in any order; each mass must be in `ex_vivo_mm`.
-    """
-    ordered = sorted(readings, key=lambda r: (r.modality != "tactile", r.modality, r.key, r.replicate))
-    patient_number = {patient: index for index, patient in enumerate(sorted({patient for patient, _ in ex_vivo_mm}))}
-    mass_number = mass_numbers(ex_vivo_mm)
-    sizes = dict[str, ModalitySizes]()
-    for name, group in groupby(ordered, key=lambda r: r.modality):
-        rows = list(group)
-        keys, done = {r.key for r in rows}, [r for r in rows if r.status != "not_done"]
-        by_mass = {
-            key: np.array([r.size_mm for r in of_mass if r.size_mm is not None], dtype=np.float64)
-            for key, of_mass in groupby(done, key=lambda r: r.key)
-        }
-        with np.errstate(over="ignore"):  # figures refuse an infinite mean
-            # equal readings are their own mean, to the last bit: rounding would be an error beside excision
-            means = [np.clip(mm.mean(), mm.min(), mm.max()) if len(mm) else 0.0 for mm in by_mass.values()]
-        sizes[name] = ModalitySizes(
-            name=name,
-            patient=np.array([patient_number[patient] for patient, _ in by_mass], dtype=np.int64),
-            ex_vivo_mm=np.array([ex_vivo_mm[key] for key in by_mass], dtype=np.float64),
-            size_mm=np.array(means),
-            replicates_mm=tuple(by_mass.values()),
-            readings=len(done),
-            masses_not_done=len(keys) - len(by_mass),
-            masses_without_reading=len(ex_vivo_mm) - len(keys),
-            mass=np.array([mass_number[key] for key in by_mass], dtype=np.int64),
-        )
-    return sizes
-
-
 def mass_numbers(masses: Iterable[MassKey]) -> dict[MassKey, int]:
     """Number of each mass, in order of patient and mass."""
     return {key: index for index, key in enumerate(sorted(masses))}
@@ -301,8 +268,34 @@ class Trial(Record, eq=False):
     files: Mapping[str, Path] = field(default_factory=dict)  #: Files that they were read from, by role.
 
     def sizes(self) -> dict[str, ModalitySizes]:
-        """The sizes by each modality."""
-        return gather(self.readings, self.ex_vivo_mm)
+        """Sizes of each modality: the mean over each mass's detected replicates. Tactile comes first, then by name."""
+        ordered = sorted(self.readings, key=lambda r: (r.modality != "tactile", r.modality, r.key, r.replicate))
+        ex_vivo_mm, mass_number = self.ex_vivo_mm, mass_numbers(self.ex_vivo_mm)
+        patients = sorted({patient for patient, _ in ex_vivo_mm})
+        patient_number = {patient: index for index, patient in enumerate(patients)}
+        sizes = dict[str, ModalitySizes]()
+        for name, group in groupby(ordered, key=lambda r: r.modality):
+            rows = list(group)
+            keys, done = {r.key for r in rows}, [r for r in rows if r.status != "not_done"]
+            by_mass = {
+                key: np.array([r.size_mm for r in of_mass if r.size_mm is not None], dtype=np.float64)
+                for key, of_mass in groupby(done, key=lambda r: r.key)
+            }
+            with np.errstate(over="ignore"):  # figures refuse an infinite mean
+                # equal readings are their own mean, to the last bit: rounding would be an error beside excision
+                means = [np.clip(mm.mean(), mm.min(), mm.max()) if len(mm) else 0.0 for mm in by_mass.values()]
+            sizes[name] = ModalitySizes(
+                name=name,
+                patient=np.array([patient_number[patient] for patient, _ in by_mass], dtype=np.int64),
+                ex_vivo_mm=np.array([ex_vivo_mm[key] for key in by_mass], dtype=np.float64),
+                size_mm=np.array(means),
+                replicates_mm=tuple(by_mass.values()),
+                readings=len(done),
+                masses_not_done=len(keys) - len(by_mass),
+                masses_without_reading=len(ex_vivo_mm) - len(keys),
+                mass=np.array([mass_number[key] for key in by_mass], dtype=np.int64),
+            )
+        return sizes
 
     def sized_readings(self, modality: str) -> list[Reading]:
         """Readings of a modality that have a size, in order of mass and replicate."""

@@ -12,7 +12,7 @@ from tactile_bayes.trial import lines
 from tactile_bayes.trial.accuracy import mape_figure, mape_ratios, share_interval
 from tactile_bayes.trial.figures import JACKKNIFE, Intervals, effective_number, interval_from_values, kurtosis_freedom
 from tactile_bayes.trial.method_comparison import compare_methods, limit_figures, limits, limits_unlinked
-from tactile_bayes.trial.readings import ModalitySizes, Reading, gather
+from tactile_bayes.trial.readings import ModalitySizes, Reading, Trial
 from validation.simulated_trials import ErrorModel, check_intervals
 
 CORRECTED = Intervals(0.95, method="corrected")
@@ -156,7 +156,7 @@ def test_ratios_are_over_common_masses_only() -> None:
     tactile = [11.0, 11.0, 15.0, 15.0, 15.0, 15.0]
     readings = [Reading(key, "tactile", 1, "detected", size) for key, size in zip(ex_vivo, tactile, strict=True)]
     readings += [Reading(key, "ultrasound", 1, "detected", 11.0) for key in list(ex_vivo)[:2]]
-    found = mape_ratios(gather(readings, ex_vivo), intervals=JACKKNIFE)["ultrasound"]
+    found = mape_ratios(Trial(readings, ex_vivo).sizes(), intervals=JACKKNIFE)["ultrasound"]
     assert found.masses == found.masses_detected == 2
     assert found.ratio == pytest.approx(1.0)
     assert found.ratio_detected == pytest.approx(1.0)

@@ -14,7 +14,7 @@ from tactile_bayes.declarations import to_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.tables import Table
 from tactile_bayes.trial.figures import JACKKNIFE
-from tactile_bayes.trial.readings import ModalitySizes, Reading, Trial, gather, readings_from_columns
+from tactile_bayes.trial.readings import ModalitySizes, Reading, Trial, readings_from_columns
 from tactile_bayes.trial.summary import FAMILIES, TrialReport, summarise
 
 COLUMNS = ("patient", "mass", "modality", "replicate", "size_mm", "status", "low_mm", "high_mm", "probability")
@@ -75,7 +75,7 @@ def test_gather_averages_found_replicates_and_counts_the_rest() -> None:
         Reading(("A", "2"), "tactile", 1, "not_done"),
         Reading(("A", "1"), "cbe", 1, "detected", 9.0),
     ]
-    gathered = gather(readings, ex_vivo)
+    gathered = Trial(readings, ex_vivo).sizes()
     assert list(gathered) == ["tactile", "cbe"]
     tactile = gathered["tactile"]
     assert tactile.size_mm.tolist() == [10.0, 0.0]
