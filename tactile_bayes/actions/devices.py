@@ -7,7 +7,6 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -131,8 +130,7 @@ def devices_action(
 
 def _pivot(url: str, protocol: str, tool: str | None, duration_s: float) -> None:
     driver = TRACKERS[protocol]
-    port = open_tracker(protocol, url)
-    try:
+    with contextlib.closing(open_tracker(protocol, url)) as port:
         answer = driver.check(port, tool=tool)
         click.echo("turn it", err=True)
         port.write(driver.start)
@@ -143,8 +141,6 @@ def _pivot(url: str, protocol: str, tool: str | None, duration_s: float) -> None
             followed = [one for reading in readings for one, _ in follower.take(reading, 0)]
             poses += [one for one in followed if isinstance(one, PoseReading) and not one.flags]
         port.write(driver.stop)
-    finally:
-        port.close()
     positions = np.array([pose.position_mm for pose in poses]).reshape(-1, 3)
     sense = rotation_sense(positions, np.array([pose.quaternion_wxyz for pose in poses]).reshape(-1, 4))
     click.echo(f"{len(poses)} poses, turned by {sense.turn_deg:.0f} degrees: {sense}")
@@ -162,7 +158,7 @@ def replay_action(*, scan: Path, output: Path | None, speed: float, **record_opt
         return record_action(output or Path(folder) / "replayed.mcap", **options)
 
 
-@contextmanager
+@contextlib.contextmanager
 def _emulated(scan: Path, speed: float, *, poses: bool) -> Iterator[dict[str, str]]:
     """Start a process of emulated devices that play one scan together; yields their URLs by role."""
     words = ["emulate", "both" if poses else "head", str(scan), "--speed", str(speed)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import select
 import signal
@@ -10,7 +9,7 @@ import sys
 import termios
 import tty
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import KW_ONLY, dataclass
 from datetime import date
 from pathlib import Path
@@ -138,7 +137,7 @@ def _landmarks(request: Request) -> Landmarks | None:
     return scan.landmarks
 
 
-@contextlib.contextmanager
+@contextmanager
 def noted_signals() -> Iterator[list[str]]:
     """List the names of `ENDING` signals, which are to end the recording, in place of their effect."""
     names: list[str] = []
@@ -169,7 +168,7 @@ class Keys:
         self._terminal = sys.stdin.isatty()
         self.waiting, self._printed_landmarks = self.wait and self._terminal, 0
 
-    @contextlib.contextmanager
+    @contextmanager
     def listening(self) -> Iterator[None]:
         """Take keys one by one; starts the recording, or the tracker alone where space starts it."""
         settings = termios.tcgetattr(sys.stdin) if self._terminal else None

@@ -85,8 +85,7 @@ def grouped_netcdf_bytes(groups: Mapping[str, Contents]) -> bytes:
         written = 0
         for group, contents in groups.items():
             place = file if group == "/" else file.create_group(group, track_order=True)
-            for name, value in contents.attributes.items():
-                place.attrs[name] = value
+            place.attrs.update(contents.attributes)
             scales = _write_dimensions(place, contents.variables, first=written)
             written += len(scales)
             for name, variable in contents.variables.items():
@@ -122,8 +121,7 @@ def _write_values(place: Any, name: str, variable: Variable) -> Any:
     written = place.create_dataset(name, data=variable.values, fillvalue=variable.fill, track_order=True, **_PACKING)
     if variable.fill is not None:
         written.attrs["_FillValue"] = np.array([variable.fill], written.dtype)
-    for key, text in variable.attributes.items():
-        written.attrs[key] = text
+    written.attrs.update(variable.attributes)
     written.flush()  # else its chunks get their place when its last reference goes, and a profiler may hold one
     return written
 
