@@ -10,8 +10,9 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.documents import load_json, parse_record
+from tactile_bayes.files.documents import load_json, parse_json, parse_record
 from tactile_bayes.files.netcdf import open_netcdf
+from tactile_bayes.files.provenance import scans_of
 from tactile_bayes.files.reading import first_bytes, is_json
 from tactile_bayes.files.reports import AnotherExam, EstimateReport, Interval, MassReport, PooledReport
 from tactile_bayes.files.tables import Table
@@ -33,6 +34,10 @@ def read_stated_size(path: Path, number: int | None = None) -> StatedSize | None
 
     `number` is the estimate's place in a list, from 1; a list of one needs none.
     """
+    return _size_and_provenance(path, number)[0]
+
+
+def _size_and_provenance(path: Path, number: int | None) -> tuple[StatedSize | None, object]:
     head = first_bytes(path, 8)
     if is_json(head):
         return _from_json(path, number)
@@ -64,7 +69,12 @@ def fill_from_posteriors(table: Table) -> tuple[dict[str, list[Any]], list[Path]
         if (before := first.setdefault((folder / stem, number), row)) != row:
             what = f"names the estimate of line {table.line_numbers[before]}"
             raise table.error(row, "posterior", what, way_out="give each reading the estimate of its own exam")
-        stated = read_stated_size(folder / stem, int(number) if number else None)
+        stated, provenance = _size_and_provenance(folder / stem, int(number) if number else None)
+        subjects = {scan["subject"] for scan in scans_of(provenance) if "subject" in scan}
+        known = subjects.intersection(filled["patient"])  # codes of another study may be others
+        if known and filled["patient"][row] not in known:
+            what = f"names an estimate of patient {', '.join(sorted(known))}"
+            raise table.error(row, "posterior", what, way_out="give one of this row's mass")
         _check_status(table, row, sized=stated is not None)
         for column, part in _COLUMNS.items():
             filled[column][row] = None if stated is None else getattr(stated, part)
@@ -86,7 +96,7 @@ def _check_status(table: Table, row: int, *, sized: bool) -> None:
     raise table.error(row, column, what, way_out=way_out)
 
 
-def _from_json(path: Path, number: int | None) -> Quantity | None:
+def _from_json(path: Path, number: int | None) -> tuple[Quantity | None, object]:
     document = load_json(path, way_out="give `estimate --json`")
     if isinstance(document, list):
         number = 1 if number is None and len(document) == 1 else number
@@ -99,19 +109,22 @@ def _from_json(path: Path, number: int | None) -> Quantity | None:
         raise BadDataError("holds one estimate, no list", way_out=f"leave out #{number}", path=str(path))
     pooled = isinstance(document, dict) and str(document.get("schema", "")).startswith("tactile-bayes/pooled/")
     kind: type[EstimateReport | PooledReport] = PooledReport if pooled else EstimateReport
-    return parse_record(document, kind, path=path).max_size_mm
+    report = parse_record(document, kind, path=path)
+    return report.max_size_mm, report.provenance
 
 
-def _from_netcdf(path: Path) -> Interval:
+def _from_netcdf(path: Path) -> tuple[Interval, object]:
     with open_netcdf(path, way_out="give what `estimate` wrote with --json or -o") as file:
         group = file.group("posterior")
+        attributes = {} if group is None else group.attributes()
         values = None if group is None else group.array("max_size_mm", kind="f8", dimensions=("chain", "draw"))
     values = np.zeros(0) if values is None else values.ravel()[np.isfinite(values.ravel()) & (values.ravel() > 0)]
     if len(values) < 2:
         way_out = "estimate with --size-calibration, so that the posterior holds sizes"
         raise BadDataError("holds no draws of max_size_mm", way_out=way_out, path=str(path))
     low, median, high = np.quantile(values, [0.5 - PROBABILITY / 2, 0.5, 0.5 + PROBABILITY / 2])
-    return Interval(float(median), float(low), float(high), PROBABILITY)
+    size = Interval(float(median), float(low), float(high), PROBABILITY)
+    return size, parse_json(attributes.get("provenance", "{}"))
 
 
 # --- Checks of an estimate beyond its declaration: sizes that can be one lump's, in their order.

@@ -183,6 +183,18 @@ def test_a_posterior_that_contradicts_its_row_is_refused(tmp_path: Path, size: d
     assert words in refusal(*with_posterior(tmp_path, cells))
 
 
+def test_an_estimate_of_another_patient_of_the_trial_is_refused(tmp_path: Path) -> None:
+    """Exchanged files gave each patient the other's size; codes that the trial does not have say nothing."""
+    one = json.loads(estimates(tmp_path, SIZE).read_text())
+    for subject in ("P2", "P1", "X7"):
+        made = one | {"provenance": {"scans": [{"subject": subject}]}}
+        (tmp_path / f"{subject}.json").write_text(json.dumps(made))
+    words = "line 2, column posterior: names an estimate of patient P2; give one of this row's mass"
+    assert words in refusal(*with_posterior(tmp_path, ",detected,P2.json"))
+    for subject in ("P1", "X7"):
+        assert document(*with_posterior(tmp_path, f",detected,{subject}.json"))["counts"]["readings"] == 2
+
+
 def test_an_estimate_of_a_batch_is_named_by_its_number(tmp_path: Path) -> None:
     one = json.loads(estimates(tmp_path, SIZE).read_text())
     other = json.loads(estimates(tmp_path, SIZE | {"median": 13.0}).read_text())
