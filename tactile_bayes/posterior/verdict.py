@@ -115,8 +115,9 @@ ENCLOSED_IN_WIDTHS = 1.6
 """Distance in widths that the map must reach on every side of a bump wide for its window: all 46 lumps wider than 8 mm
 in 800 simulated exams were enclosed so."""
 HIGH_AT_RIM: Final = 0.2
-"""Height, in the map's scale, from which a rise cut by the rim is told in place of "no lump": the probability, learned
-from lumps on the map, is below 0.5 for half of a lump. Of 38 empty bodies none rises there by more than 0.13."""
+"""Height, in the map's scale, from which a rise cut by the rim is told in place of "no lump", and the share of it that
+the map must show: the probability, learned from lumps on the map, is below 0.5 for half of a lump. Of 38 empty bodies
+none rises there by more than 0.13."""
 LEAST_SEEN = 0.25  #: Least share of a sector's breadth that must be covered for it to reach as far.
 LEAST_READ = 0.25
 """Least share of the map's median count in the cells of a bump: 134 lumps had 1.8 and more, a spot of noise 0.16."""
@@ -221,7 +222,8 @@ def no_bump_reason(
 def cut_by_rim(tactile_map: TactileMap, candidates: Sequence[Candidate]) -> Abstention | None:
     """Reason why a map excludes no lump, where its rim cuts a rise as high as lumps are; None without one."""
     for one in candidates:
-        high = one.fit is not None and one.fit.theta[0] >= HIGH_AT_RIM * one.fit.bump.scale
+        fit = one.fit
+        high = fit is not None and min(fit.theta[0] / fit.bump.scale, fit.covered_share) >= HIGH_AT_RIM
         if high and one.fault.startswith(AT_RIM) and (why := _unmeasured(tactile_map, one)).code == "window":
             return why
     return None
