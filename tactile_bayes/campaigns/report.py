@@ -451,15 +451,15 @@ def _visit_entry(
     """A visit with its size: the pooled one where there is one, else that of its one exam; without one the reason."""
     code = rows[0].exam.visit
     words = code if day is None or day.isoformat() == code else f"{code}, {day.isoformat()}"
-    if report is not None:
+    reasons, pooled = list(filter(None, dict.fromkeys(row.on_paper for row in rows))), 0
+    if report is None:
+        size = exams[0].size if len(exams) == 1 else None
+    else:
         size = report.leading.max_size_mm
-        if len(rows) == 1:
-            return VisitEntry(words, exams, size, why="" if size else rows[0].on_paper)
-        estimated = sum(one.status == "estimate" for one in report.maps)
-        return VisitEntry(words, exams, size, estimated, "" if size else report.reason)
-    size = exams[0].size if len(exams) == 1 else None
-    reasons = dict.fromkeys(row.on_paper for row in rows)
-    return VisitEntry(words, exams, size, why="" if size else "; ".join(filter(None, reasons)) or "not pooled")
+        if len(rows) > 1:
+            pooled = sum(one.status == "estimate" for one in report.maps)
+            reasons.insert(0, report.reason)
+    return VisitEntry(words, exams, size, pooled, "" if size else "; ".join(reasons) or "not pooled")
 
 
 def _exam_entry(campaign: Campaign, row: ExamRow, *, inline: bool) -> ExamEntry:

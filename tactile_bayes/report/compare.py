@@ -308,6 +308,9 @@ def compare_summary(report: CompareReport) -> str:
         lines += [*_change_lines(report.changes[-1]), *rate_sentences(report)[:1], *_site_line(report)]
         lines += [*map(_visit_line, shown), *_place_line(report.places[-1])]
         more = [MORE]
+    else:
+        bare = [(visit.visit, one.reason) for visit in visits for one in visit.maps if one.status != "estimate"]
+        lines += [f"Visit {number}: {reason}." for number, reason in bare[:4]]
     return "\n".join([*lines, *finding_summary(report.findings, "check", most=2), *more, RESEARCH_USE]) + "\n"
 
 

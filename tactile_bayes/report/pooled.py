@@ -200,6 +200,7 @@ def pooled_summary(report: PooledReport) -> str:
     lines += finding_summary(findings, "check", most=2)
     if largest is None:
         lines.append(_no_size_line(report))
+        lines += [f"Map {i}: {one.reason}." for i, one in enumerate(report.maps, 1) if one.max_size_mm is None][:4]
     else:
         lines += estimate_text.size_table(report) + estimate_text.width_lines(report.leading.variance_share or {})
         parts = [

@@ -373,6 +373,9 @@ def test_the_index_gives_the_reason_of_a_visits_one_exam_not_a_count_of_maps() -
     page = index_html(run, [row], pooled, (), counts="0 sized", links={})
     assert "no lump found within 20 mm" in page
     assert "0 of 1 maps" not in page
+    run.exams *= 2  # of several exams it gives both
+    page = index_html(run, [row], pooled, (), counts="0 sized", links={})
+    assert "0 of 1 maps; no lump found within 20 mm" in page
 
 
 @pytest.mark.long

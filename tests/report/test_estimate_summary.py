@@ -72,7 +72,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["level.nc"], 0, " ", "No size: the "),
         (["clear.nc", "--size-calibration", "none"], 0, " ", "No size: no size calibration"),
         (["clear.nc", "again.nc", "--pool"], 0, "A lump was found on 2 of 2 maps", "the maps of this mass differ by"),
-        (["empty.nc", "--pool"], 6, "No estimate: a lump was found on 0 of 1", ""),
+        (["empty.nc", "--pool"], 6, "No estimate: a lump was found on 0 of 1", "Map 1: no lump found on"),
     ],
     ids=["clear", "two masses", "empty", "outside", "level unknown", "no calibration", "pooled", "pooled nothing"],
 )
