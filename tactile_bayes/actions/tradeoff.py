@@ -150,7 +150,11 @@ def tradeoff_forward_action(
     default_rules = {tradeoffs.PLANE: "plane-strain", tradeoffs.SOLID: "solid-mean"}
     rules = {model: _rule(case, model, size_calibration or name) for model, name in default_rules.items()}
     share = tolerance_percent / 100
-    by_model = {model: _measure_forward(case, model, rule, share, runs) for model, rule in rules.items()}
+    by_model = {}
+    for model, rule in rules.items():
+        with progress_bar(f"settings, {model}") as progress:
+            work = StudyRun(time.process_time, share, runs, progress=progress)
+            by_model[model] = tradeoffs.measure_forward(case, model, rule, share=share, work=work)
     plane = by_model[tradeoffs.PLANE]
     notes = (*plane.notes, tradeoffs.dimensions_note(case, plane, by_model[tradeoffs.SOLID], rules))
     warning = outside_range(case.d_mm, case.depth_ratio)
@@ -166,14 +170,6 @@ def tradeoff_forward_action(
         settings |= {"tolerance_percent": tolerance_percent, "runs": runs}
         provenance.append(Provenance("tradeoff forward", settings, inputs))
     return _show(by_title, varied="forward", figure=figure, as_json=as_json, force=force, provenance=provenance)
-
-
-def _measure_forward(
-    case: tradeoffs.LumpCase, model: str, rule: tradeoffs.SizeRule, share: float, runs: int
-) -> Tradeoff:
-    with progress_bar(f"settings, {model}") as progress:
-        work = StudyRun(time.process_time, share, runs, progress=progress)
-        return tradeoffs.measure_forward(case, model, rule, share=share, work=work)
 
 
 def _rule(case: tradeoffs.LumpCase, model: str, name: str) -> tradeoffs.SizeRule:

@@ -182,7 +182,9 @@ def combine_sources(sources: Sequence[Source], options: Stated) -> tuple[scans.S
     _arrange_poses(arrays, stated, notes, findings)
     _arrange_frames(arrays, stated, notes, findings)
     _arrange_times(arrays, stated)
-    _check_largest(arrays)
+    for name, array in arrays.items():
+        if (largest := float(np.abs(array, dtype=np.float64).max(initial=0.0))) > _LARGEST:
+            raise BadDataError(f"{name} holds {largest:.3g}", way_out="give mm, kPa and s; the file may be damaged")
     pressure = stated.unit not in (None, "counts")
     if pressure:
         _as_counts(arrays, stated, notes, findings)
@@ -479,12 +481,6 @@ def _check_numbers(arrays: Arrays) -> None:
             if name in ("frames", "counts"):
                 way_out = "leave such frames out; write 0 in all frames of an element that does not work"
             raise BadDataError(what, way_out=way_out)
-
-
-def _check_largest(arrays: Arrays) -> None:
-    for name, array in arrays.items():
-        if (largest := float(np.abs(array, dtype=np.float64).max(initial=0.0))) > _LARGEST:
-            raise BadDataError(f"{name} holds {largest:.3g}", way_out="give mm, kPa and s; the file may be damaged")
 
 
 def _check_units(arrays: Arrays, *, calibrated: bool) -> None:

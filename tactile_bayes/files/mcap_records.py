@@ -229,7 +229,10 @@ def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:
         body = stream.read(min(length, size))
         complete = len(head) == _RECORD.size and len(body) == length
         if complete and opcode == Opcode.DATA_END:
-            _end_data(records, body, checksum)
+            declared = _CHECKSUM.unpack_from(body)[0] if length >= _CHECKSUM.size else 0
+            if declared not in (0, checksum) and not records.damaged:  # a damaged chunk was told already
+                records.add_loss("a record outside the chunks changed (the checksum of the whole does not match)")
+            records.all_data = True
         if complete and opcode == Opcode.FOOTER:
             complete = records.finished = stream.read(len(MCAP_MAGIC)) == MCAP_MAGIC
             if complete:
@@ -255,14 +258,6 @@ def _collect(records: McapRecords, stream: IO[bytes], *, size: int) -> None:
             if opcode == Opcode.MESSAGE:  # in no chunk, as writers leave it that do not index their files
                 records.last_ns = max(records.last_ns, record[2])
             records.add(record, memoryview(body))
-
-
-def _end_data(records: McapRecords, body: bytes, checksum: int) -> None:
-    """Compare the checksum over the whole data section, where there is one."""
-    declared = _CHECKSUM.unpack_from(body)[0] if len(body) >= _CHECKSUM.size else 0
-    if declared not in (0, checksum) and not records.damaged:  # a damaged chunk was told already: it is a description
-        records.add_loss("a record outside the chunks changed (the checksum of the whole does not match)")
-    records.all_data = True
 
 
 def _parse_record(opcode: int, data: bytes, start: int = 0, end: int | None = None) -> Any:

@@ -322,7 +322,10 @@ def _parse_cell(text: str, field: Mapping[str, Any], *, decimal_comma: bool) -> 
         what = f"{_shown(text)} has blanks or unprintable characters around or in it"
         raise BadDataError(what, way_out="remove them")
     if decimal_comma and field["type"] == "number":
-        text = _with_decimal_point(text)
+        if "." in text:  # thousands?
+            what = f"{_shown(text)} has a point, and other numbers have decimal commas"
+            raise BadDataError(what, way_out="write all numbers one way")
+        text = text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
     value = _parse_by_type(text, field)
     rules = field.get("constraints", {})
     if value == 0 and "exclusiveMinimum" in rules and "ifZero" in field:
@@ -395,14 +398,6 @@ def _parse_number(text: str, field: Mapping[str, Any]) -> float:
         raise BadDataError(f"{_shown(text)} has a percent sign", way_out=way_out)
     unit = " in mm" if field["name"].endswith("_mm") else ""
     raise BadDataError(f"{_shown(text)} is not a number", way_out=f"write digits only{unit}; {_blank_advice(field)}")
-
-
-def _with_decimal_point(text: str) -> str:
-    """Number with a decimal point, in a table of decimal commas; one that has a point is refused: thousands?"""
-    if "." in text:
-        what = f"{_shown(text)} has a point, and other numbers have decimal commas"
-        raise BadDataError(what, way_out="write all numbers one way")
-    return text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
 
 
 def _keys(table: Table, fields: Sequence[str]) -> list[tuple[Any, ...]]:

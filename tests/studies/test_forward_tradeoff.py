@@ -145,7 +145,7 @@ def test_the_head_without_its_edge_is_another_head(head: str | None, edge: str) 
 @pytest.mark.parametrize("head", [None, *HEADS])
 def test_the_command_hands_its_head_on_and_names_it(head: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     made = by_model()
-    monkeypatch.setattr(tradeoff_forward, "_measure_forward", lambda _case, model, *_: made[model])
+    monkeypatch.setattr(tradeoff_forward.tradeoffs, "measure_forward", lambda _case, model, *_, **__: made[model])
     words = [] if head is None else ["--head", head]
     found = {form: CliRunner().invoke(tradeoff_forward_command, [*words, *form]) for form in ((), ("--json",))}
     case, documents = (
