@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from datetime import date
 from pathlib import Path
 from typing import Any, Final
@@ -371,7 +371,8 @@ def check_inputs(exams: Sequence[Exam], settings: CampaignSettings) -> dict[tupl
     settings_by(settings.protocol)
     table = read_excision(settings.excision, settings.columns)
     _check_spelling(table, exams)
-    excised_on = dict(zip(_masses_of(table), table.columns["date"], strict=True))
+    patients, masses, days = (table.columns[name] for name in ("patient", "mass", "date"))
+    excised_on = dict(zip(zip(patients, masses, strict=True), days, strict=True))
 
     def fault(row: int, column: str, words: str, /, *, way_out: str) -> BadDataError:
         where = f"table of exams, line {exams[row].line}, column {column}"
@@ -381,15 +382,10 @@ def check_inputs(exams: Sequence[Exam], settings: CampaignSettings) -> dict[tupl
     return excised_on
 
 
-def _masses_of(table: Table) -> Iterator[tuple[str, str]]:
-    """Patient and mass of each row."""
-    return zip(table.columns["patient"], table.columns["mass"], strict=True)
-
-
 def _check_spelling(table: Table, exams: Iterable[Exam]) -> None:
     """Refuse a row that is of a mass of the exams by `same_code`: the mass would be left out of the trial."""
     known = {(same_code(exam.patient), same_code(exam.mass)): exam for exam in exams}
-    for row, (patient, mass) in enumerate(_masses_of(table)):
+    for row, (patient, mass) in enumerate(zip(table.columns["patient"], table.columns["mass"], strict=True)):
         exam = known.get((same_code(patient), same_code(mass)))
         if exam is None:
             continue

@@ -271,7 +271,7 @@ class Campaign:
         """Task of the estimate, or of its figures."""
         settings = self.settings.of(exam)
         key = {"map": self._file("map", exam.name, MAP), **self._settings_key(settings, self._normalise(exam))}
-        named, match = self._exams_with_places(exam), None
+        named, match = self._breasts.exams_with_places(exam, of=self.keys["map"]), None
         if named:
             match = Match(exam.mass, tuple(named), self.settings.match_mm)
             places = [[one.mass, one.name, self._file("map", one.name, MAP), one.centre_mm] for one in named]
@@ -284,16 +284,16 @@ class Campaign:
 
     def _with_known_place(self, mapped: Sequence[Exam]) -> list[Exam]:
         """The exams except those whose mass is placed on a map that could not be made; these fail."""
-        lost = [exam for exam in mapped if self._breasts.exams_with_places(exam) and not self._exams_with_places(exam)]
-        for exam in lost:
-            named = ", ".join(place.name for place in self._breasts.exams_with_places(exam) if place.mass == exam.mass)
-            reason = f"the place of its mass is on the map of {named}, which was not made"
-            self.faults[exam.name] = Fault("estimate", reason)
-        return [exam for exam in mapped if exam not in lost]
-
-    def _exams_with_places(self, exam: Exam) -> list[Exam]:
-        """Exams with a map that place the breast's masses, if this one places none."""
-        return self._breasts.exams_with_places(exam, of=self.keys["map"])
+        known = []
+        for exam in mapped:
+            places = self._breasts.exams_with_places(exam)
+            if places and not self._breasts.exams_with_places(exam, of=self.keys["map"]):
+                named = ", ".join(place.name for place in places if place.mass == exam.mass)
+                reason = f"the place of its mass is on the map of {named}, which was not made"
+                self.faults[exam.name] = Fault("estimate", reason)
+            else:
+                known.append(exam)
+        return known
 
     def _settings_key(self, settings: Settings, normalise: str) -> dict[str, Any]:
         """Inputs of an estimate besides its map: settings, and the digests of the files that they name."""

@@ -39,12 +39,6 @@ class ExamEntry(Record, eq=False):
         return FAILED if self.failed else UNSIZED if self.size is None else SIZED
 
     @property
-    def alt(self) -> str:
-        """Alternative text of the picture."""
-        ring = "no lump ringed" if self.size is None else f"a ring around the lump of {self.size.median:.1f} mm"
-        return f"Map of {self.words}, {ring}"
-
-    @property
     def source(self) -> str:
         """Address of the picture; empty without one."""
         if self.thumbnail is None or isinstance(self.thumbnail, str):
@@ -122,11 +116,6 @@ class MassEntry(Record, eq=False):
         """Width of the last size's interval in parts of the size; 0 without one."""
         size = self.last.size
         return 0.0 if size is None else (size.high - size.low) / size.median
-
-    @property
-    def change(self) -> Quantity | None:
-        """Change of the diameter in percent; None where it is not known."""
-        return None if self.growth is None else self.growth.percent
 
 
 WORST_FIRST: Final = (

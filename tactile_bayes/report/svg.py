@@ -294,10 +294,9 @@ def small_pictures(maps: Sequence[ExamMap], *, room_mm: tuple[float, float]) -> 
     """Small pictures of repeat maps, all to one scale, by which each has room in a width and a height."""
     sizes = [Frame(_map_of(one), 1.0).size_mm for one in maps]
     scale = min(1.0, *(room / size for one in sizes for room, size in zip(room_mm, one, strict=True)))
-    frames = [Frame(_map_of(one), scale) for one in maps]
     return [
-        exam_picture(one, frame, label=f"Repeat map {number}", small=True)
-        for number, (one, frame) in enumerate(zip(maps, frames, strict=True), start=1)
+        exam_picture(one, Frame(_map_of(one), scale), label=f"Repeat map {number}", small=True)
+        for number, one in enumerate(maps, start=1)
     ]
 
 

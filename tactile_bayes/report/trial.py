@@ -337,12 +337,3 @@ def _reasons(name: str, report: ModalityReport, keys: Sequence[str]) -> Iterator
         for reason in dict.fromkeys(missing.values()):
             affected = ", ".join(words.get(key, key.replace("_", " ")) for key, why in missing.items() if why == reason)
             yield f"{name}: no {lead}{affected}: {reason}"
-
-
-def found_share(report: ModalityReport) -> str:
-    """Number of detected masses of those looked for, with the interval of their share."""
-    share = f"{report.detected}/{report.n}"
-    if report.detected_interval is None:
-        return share
-    low, high = report.detected_interval
-    return f"{share} [{100 * low:.0f}, {100 * high:.0f} %]"
