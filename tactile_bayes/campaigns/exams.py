@@ -161,23 +161,12 @@ def _files_of(folder: Path, table: Path, listing: FolderExams) -> dict[str, Path
     if not Path(os.path.realpath(folder)).is_relative_to(base):
         way_out = "write the table beside the scans"
         raise UsageError(f"{folder} is not inside {table.parent}, the table's folder; {way_out}")
-
-    def note(error: OSError) -> None:
-        if error.filename == os.fspath(folder):
-            raise UsageError(f"{folder} cannot be read ({error.strerror}); give a folder that can")
-        listing.skipped.append(f"{error.filename}: cannot be read ({error.strerror})")
-
     paths: dict[str, Path] = {}
-    for place, folders, names in os.walk(folder, onerror=note):
-        if JOURNAL in names:
-            folders.clear()
-            continue
-        folders.sort()
-        for path in (Path(place) / name for name in sorted(names) if not name.startswith(_ASIDE)):
-            if path.name.lower().endswith(_ENDINGS):
-                paths[os.path.relpath(os.path.realpath(path.parent) + os.sep + path.name, base)] = path
-            elif Path(os.path.realpath(path)) != table_file:
-                listing.others[path.suffix.lower() or "no ending"] += 1
+    for path in _walk(folder, listing.skipped):
+        if path.name.lower().endswith(_ENDINGS):
+            paths[os.path.relpath(os.path.realpath(path.parent) + os.sep + path.name, base)] = path
+        elif Path(os.path.realpath(path)) != table_file:
+            listing.others[path.suffix.lower() or "no ending"] += 1
     return paths
 
 
@@ -214,6 +203,22 @@ def _duplicates(
             words = "was made from" if second == made else "was made into"
             reasons.setdefault(second, f"{words} {first}, which is an exam")
     return reasons
+
+
+def _walk(folder: Path, closed: list[str]) -> Iterator[Path]:
+    """Files in a fixed order, without those that systems leave beside others; folders that cannot be read are noted."""
+
+    def skip(error: OSError) -> None:
+        if error.filename == os.fspath(folder):
+            raise UsageError(f"{folder} cannot be read ({error.strerror}); give a folder that can")
+        closed.append(f"{error.filename}: cannot be read ({error.strerror})")
+
+    for place, folders, names in os.walk(folder, onerror=skip):
+        if JOURNAL in names:
+            folders.clear()
+            continue
+        folders.sort()
+        yield from (Path(place) / name for name in sorted(names) if not name.startswith(_ASIDE))
 
 
 # --- A table of exams from a folder of scans and what they carry, new or added to one that is there.

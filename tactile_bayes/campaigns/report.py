@@ -87,19 +87,11 @@ def _status(report: EstimateReport | PooledReport) -> str:
 
 def exam_rows(campaign: Campaign, pooled: Pooled) -> list[ExamRow]:
     """Every exam of the table, in its order; `pooled` are the masses by their names."""
-    pooled_of, rows = _pooled_findings(pooled.values()), list[ExamRow]()
+    pooled_of, rows = _pooled_findings(pooled.values()), [_exam_row(campaign, exam) for exam in campaign.exams]
     of_scan: dict[Path, list[ExamRow]] = defaultdict(list)
-    for exam in campaign.exams:
-        fault, mapped = campaign.faults.get(exam.name), campaign.result("map", exam.name)
-        facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "synthetic": mapped.get("synthetic")}
-        if fault is not None and fault.step not in ("figures", "page"):
-            reason = f"{fault.step} failed: {fault.reason}"
-            rows.append(ExamRow(exam, "not_done", reason, reason, failed=True, **facts))
-            continue
-        by_site = layout.SIZED in campaign.files("size", exam.name)
-        place = campaign.folder / layout.EXAMS / exam.name / (layout.SIZED if by_site else layout.ESTIMATE)
-        rows.append(ExamRow.of(exam, read_record(place, EstimateReport), **facts))
-        of_scan[exam.path].append(rows[-1])
+    for row in rows:
+        if not row.failed:
+            of_scan[row.exam.path].append(row)
     unnamed_of = {path: unnamed_masses([row.masses for row in some]) for path, some in of_scan.items()}
     for index, row in enumerate(rows):
         if not row.failed:
@@ -119,6 +111,18 @@ def _pooled_findings(pooled: Iterable[PooledReport]) -> dict[str, tuple[Finding,
         for report in pooled
         for number, name in enumerate((one.map for one in report.maps), start=1)
     }
+
+
+def _exam_row(campaign: Campaign, exam: Exam) -> ExamRow:
+    fault = campaign.faults.get(exam.name)
+    mapped = campaign.result("map", exam.name)
+    facts: dict[str, Any] = {"scans": tuple(mapped.get("scans", ())), "synthetic": mapped.get("synthetic")}
+    if fault is not None and fault.step not in ("figures", "page"):
+        reason = f"{fault.step} failed: {fault.reason}"
+        return ExamRow(exam, "not_done", reason, reason, failed=True, **facts)
+    by_site = layout.SIZED in campaign.files("size", exam.name)
+    place = campaign.folder / layout.EXAMS / exam.name / (layout.SIZED if by_site else layout.ESTIMATE)
+    return ExamRow.of(exam, read_record(place, EstimateReport), **facts)
 
 
 def pooled_reports(campaign: Campaign) -> Pooled:

@@ -217,13 +217,7 @@ class Campaign:
     def _size(self, exams: Sequence[Exam]) -> None:
         """Maps, estimates and figures of some exams."""
         known = [exam for exam in exams if exam.path in self._digests]  # a plan fetches nothing from a store
-        tasks = []
-        for exam in known:
-            arguments: dict[str, Any] = {"expected": self._expected(exam), "normalise": self.settings.normalise}
-            digest = self._digests[exam.path]
-            make = partial(steps.make_map, exam.path, source_sha256=digest, address=exam.address, **arguments)
-            tasks.append(self._task("map", exam.name, {"scan": digest, **arguments}, make))
-        self._run("map", tasks, of=len(exams))
+        self._run("map", [self._map_task(exam) for exam in known], of=len(exams))
         exams = self._recorded_once(exams)
         mapped = [exam for exam in exams if exam.name in self.keys["map"]]
         mapped = mapped if self.dry else self._with_known_place(mapped)
@@ -266,6 +260,12 @@ class Campaign:
         """A step of an exam or mass; `key` is all that its files depend on."""
         folder = self.folder / (kind or _KINDS.get(step, EXAMS)) / name
         return steps.Task(step, name, folder, steps.digest_of(key), make)
+
+    def _map_task(self, exam: Exam) -> steps.Task:
+        arguments: dict[str, Any] = {"expected": self._expected(exam), "normalise": self.settings.normalise}
+        digest = self._digests[exam.path]
+        make = partial(steps.make_map, exam.path, source_sha256=digest, address=exam.address, **arguments)
+        return self._task("map", exam.name, {"scan": digest, **arguments}, make)
 
     def _estimate_task(self, exam: Exam, step: str) -> steps.Task:
         """Task of the estimate, or of its figures."""
@@ -351,18 +351,18 @@ class Campaign:
     def _make_pages(self, sound: Sequence[Exam]) -> None:
         """The page of every exam that was estimated, with its size by the repeatability where it has one."""
         for block in _blocks(sound, self._block):
-            tasks = []
-            for exam in [] if self._sizes_unknown else self._with_estimate(block):
-                sized = self._file("size", exam.name, SIZED)
-                day = "" if exam.day is None else exam.day.isoformat()
-                facts = self._expected(exam) | {"replicate": str(exam.replicate), "date": day}
-                size = sized or self._file("estimate", exam.name, ESTIMATE)
-                key = {"map": self._file("map", exam.name, MAP), "size": size, "told": facts}
-                report = ESTIMATE if sized is None else SIZED
-                make = partial(steps.make_page, self._folder_of(exam), facts, report=report)
-                tasks.append(self._task("page", exam.name, key, make))
-            self._run("page", tasks, of=len(block))
+            known = [] if self._sizes_unknown else self._with_estimate(block)
+            self._run("page", [self._page_task(exam) for exam in known], of=len(block))
             self._copy(EXAMS, [exam.name for exam in block], made_by=("size", "page"))
+
+    def _page_task(self, exam: Exam) -> steps.Task:
+        sized = self._file("size", exam.name, SIZED)
+        day = "" if exam.day is None else exam.day.isoformat()
+        facts = self._expected(exam) | {"replicate": str(exam.replicate), "date": day}
+        size = sized or self._file("estimate", exam.name, ESTIMATE)
+        key = {"map": self._file("map", exam.name, MAP), "size": size, "told": facts}
+        make = partial(steps.make_page, self._folder_of(exam), facts, report=ESTIMATE if sized is None else SIZED)
+        return self._task("page", exam.name, key, make)
 
     def _expected(self, exam: Exam) -> dict[str, str]:
         """Facts of the exam in the table, by column; blank ones are left out."""

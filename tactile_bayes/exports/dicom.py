@@ -17,6 +17,7 @@ from tactile_bayes.exports import exam
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.findings import finding_lines
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import TactileMap, orientation_of
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import no_estimate_line
@@ -417,12 +418,10 @@ def _group(
         "measurements": list(_measurements(finding, evidence)),
         "qualitative_evaluations": [sr.QualitativeEvaluation(coded(exam.OUTCOME), coded(finding.outcome))],
     }
-    transform = lps_of_map(maps[0]) if len(maps) == 1 else None  # the frame of reference is one map's own
-    if transform is None or finding.centre_mm is None:
+    region = _region(finding, maps)
+    if region is None:
         group = sr.MeasurementsAndQualitativeEvaluations(**content)
     else:
-        centre = np.array([exam.lps_point(transform, finding.centre_mm)])
-        region = sr.ImageRegion3D("POINT", centre, frame_of_reference(maps[0]))
         group = sr.PlanarROIMeasurementsAndQualitativeEvaluations(**content, referenced_region=region)
     for text in (finding.reason, finding.narrower):
         if text:
@@ -440,34 +439,49 @@ def _sites(estimate: exam.EstimateFile, maps: Sequence[exam.MapFile]) -> list[An
     return [site(anatomic_location=coded(exam.BREAST), laterality=coded(exam.SIDES[side]))]
 
 
+def _region(finding: exam.ExportedMass, maps: Sequence[exam.MapFile]) -> Any | None:
+    """The lump's centre as a point in the map's frame of reference; None for several maps or an unknown position."""
+    transform = lps_of_map(maps[0]) if len(maps) == 1 else None
+    if transform is None or finding.centre_mm is None:
+        return None
+    centre = exam.lps_point(transform, finding.centre_mm)
+    return exam.import_extra("highdicom").sr.ImageRegion3D("POINT", np.array([centre]), frame_of_reference(maps[0]))
+
+
 def _measurements(finding: exam.ExportedMass, evidence: Sequence[Any]) -> Iterator[Any]:
-    """Sizes, each with its interval as properties, and certainty; all refer to the maps' values, or else pictures."""
+    """Sizes and certainty, with references to the maps' values, or to their pictures where no values are exported."""
     sr = exam.import_extra("highdicom").sr
     values = [one for one in evidence if one.SOPClassUID == PARAMETRIC_MAP]
     images = [sr.SourceImageForMeasurement(value.SOPClassUID, value.SOPInstanceUID) for value in values or evidence]
     for name, size in ((exam.LONG_AXIS, finding.largest), (exam.SHORT_AXIS, finding.smallest)):
-        if size is None:
-            continue
-        median = {"derivation": coded(exam.MEDIAN), "referenced_images": images}
-        measurement = sr.Measurement(coded(name), size.median, coded(_MM), **median)
-        for concept, value, unit in (
-            (exam.UPPER_RANGE, size.high - size.median, _MM),
-            (exam.LOWER_RANGE, size.median - size.low, _MM),
-            (exam.INTERVAL_LOW, size.low, _MM),
-            (exam.INTERVAL_HIGH, size.high, _MM),
-            (exam.INTERVAL_PROBABILITY, 100 * size.probability, _PERCENT),
-        ):
-            number = sr.NumContentItem(
-                name=coded(concept),
-                value=float(f"{value:.9g}"),
-                unit=coded(unit),
-                relationship_type=sr.RelationshipTypeValues.HAS_PROPERTIES,
-            )
-            measurement[0].ContentSequence.append(number)
-        yield measurement
+        if size is not None:
+            yield _sized(name, size, images)
     if finding.probability is not None:
         percent = float(f"{100 * finding.probability:.9g}")
         yield sr.Measurement(coded(exam.CERTAINTY), percent, coded(_PERCENT), referenced_images=images)
+
+
+def _sized(name: exam.Code, size: Quantity, images: Sequence[Any]) -> Any:
+    """A size's median, with its interval as properties of that measurement."""
+    sr = exam.import_extra("highdicom").sr
+    measurement = sr.Measurement(
+        coded(name), size.median, coded(_MM), derivation=coded(exam.MEDIAN), referenced_images=images
+    )
+    for concept, value, unit in (
+        (exam.UPPER_RANGE, size.high - size.median, _MM),
+        (exam.LOWER_RANGE, size.median - size.low, _MM),
+        (exam.INTERVAL_LOW, size.low, _MM),
+        (exam.INTERVAL_HIGH, size.high, _MM),
+        (exam.INTERVAL_PROBABILITY, 100 * size.probability, _PERCENT),
+    ):
+        number = sr.NumContentItem(
+            name=coded(concept),
+            value=float(f"{value:.9g}"),
+            unit=coded(unit),
+            relationship_type=sr.RelationshipTypeValues.HAS_PROPERTIES,
+        )
+        measurement[0].ContentSequence.append(number)
+    return measurement
 
 
 def _comment(text: str) -> Any:

@@ -21,7 +21,7 @@ from tactile_bayes.report.estimate_document import share_words
 from tactile_bayes.report.estimate_text import spread_percent
 from tactile_bayes.report.pages import Growth, signed
 from tactile_bayes.size.pooling import Repeatability
-from tactile_bayes.size.visits import VOLUME, Change, VisitComparison, straight_line
+from tactile_bayes.size.visits import VOLUME, Change, JointSizes, VisitComparison, straight_line
 
 # --- The report, as `compare --json` prints it.
 
@@ -206,12 +206,7 @@ def compare_report(
     """Report of a comparison from what `estimate` says of each visit's maps; `repeatability`: the site's, if used."""
     joint, days = compared.joint, comparing.days
     dated = [None] * len(visits) if days is None else days
-    later, trend = () if joint is None else range(1, len(visits)), None
-    if joint is not None and days is not None and len(visits) > 2:
-        line = straight_line(*joint.moments, days)
-        half = float(ndtri(0.5 + probability / 2)) * line.sd
-        rates = growth_rates([VOLUME * (line.per_day + one) for one in (0.0, -half, half)], probability)
-        trend = TrendReport(len(days), days[-1] - days[0], *rates, line.departure)
+    later = () if joint is None else range(1, len(visits))
     return CompareReport(
         schema=COMPARE,
         status=compared.status,
@@ -239,7 +234,7 @@ def compare_report(
             for visit, one in enumerate(compared.shifts, start=2)
         ),
         changes=tuple(_change_report(compared, number, comparing, probability) for number in later),
-        trend=trend,
+        trend=None if joint is None or days is None or len(visits) < 3 else _trend_report(joint, days, probability),
         between_map_sd=None if joint is None else joint.between_map_sd,
         repeatability=UNSET if repeatability is None else repeatability.words(),
         left_out=() if joint is None else tuple(joint.calibrations[0].omissions()),
@@ -291,6 +286,13 @@ def growth_rates(growth: Sequence[float], probability: float) -> tuple[Rate, Dou
     median, low, high = (100.0 * one for one in growth)
     times = Doubling(*(float(np.log(2.0) / growth[i]) if growth[i] > 0 else None for i in (0, 2, 1)))
     return Rate(median, low, high, probability), times
+
+
+def _trend_report(joint: JointSizes, days: Sequence[float], probability: float) -> TrendReport:
+    line = straight_line(*joint.moments, days)
+    half = float(ndtri(0.5 + probability / 2)) * line.sd
+    rates = growth_rates([VOLUME * (line.per_day + one) for one in (0.0, -half, half)], probability)
+    return TrendReport(len(days), days[-1] - days[0], *rates, line.departure)
 
 
 # --- A comparison of visits as text.

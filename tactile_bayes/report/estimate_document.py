@@ -128,17 +128,20 @@ def touching_masses(masses: Sequence[SizedMass]) -> dict[reports.Touching, str]:
     """
     pairs = {}
     for (first, centre, sizes), (second, beside, others) in combinations(masses, 2):
-        apart_mm, lengths = math.dist(centre, beside), list[reports.Interval]()
+        apart_mm = math.dist(centre, beside)
         if apart_mm <= (sizes[0].high + others[0].high) / 2:
-            for one, other in zip(sizes, others, strict=True):
-                # errors in one body go together: the ends are of the same ends of both; one may lie within the other
-                ends = ((one.median, other.median), (one.low, other.low), (one.high, other.high))
-                median, low, high = (max(apart_mm + (a + b) / 2, a, b) for a, b in ends)
-                lengths.append(reports.Interval(median, low, high, one.probability))
-            length, leading = lengths
+            length, leading = (_together(apart_mm, *pair) for pair in zip(sizes, others, strict=True))
             words = f"together {leading.median:.1f} mm long ({leading.low:.1f} to {leading.high:.1f})"
             pairs[reports.Touching((first, second), apart_mm, length)] = words
     return pairs
+
+
+def _together(apart_mm: float, one: Quantity, other: Quantity) -> reports.Interval:
+    """Length over two masses in one body: errors go together, so its ends are made of the same ends of both sizes."""
+    ends = zip((one.median, one.low, one.high), (other.median, other.low, other.high), strict=True)
+    # one may lie within the other's outline
+    median, low, high = (max(apart_mm + (a + b) / 2, a, b) for a, b in ends)
+    return reports.Interval(median, low, high, one.probability)
 
 
 def touching_findings(masses: Sequence[SizedMass]) -> list[Finding]:
@@ -166,14 +169,18 @@ LEAST_CHANGE_SD = 0.05  #: A change of a width by one more structure below this 
 
 def scene_lines(choice: SceneChoice) -> list[str]:
     """Scene of the fit window with odds: structures supported, other structures kept, and those left out."""
+
+    def odds(one: Structure) -> str:
+        return f"(odds {odds_text(one)}){_width_changes(one, 'without' if one.used else 'with')}"
+
     named = _named_structures(choice)
     names = [SHAPE_WORDS[choice.supported], *(f"{STRUCTURE_WORDS[one.name]} {one.place}".rstrip() for one in named)]
     window = f"the fit window of {choice.fit.target.problem.radius_mm:g} mm about the lump"
     lines = [f"Scene in {window}: {' and '.join(names)}, the simplest that the map supports."]
-    lines += [f"{capitalised(STRUCTURE_WORDS[one.name])} is in the model {odds_words(one)}." for one in named]
+    lines += [f"{capitalised(STRUCTURE_WORDS[one.name])} is in the model {odds(one)}." for one in named]
     unnamed = [one for one in choice.structures if one.used and not one.supported and not one.place]
-    lines += [f"Also in the model: {STRUCTURE_WORDS[one.name]} {odds_words(one)}." for one in unnamed]
-    out = [f"{STRUCTURE_WORDS[one.name]} {odds_words(one)}" for one in choice.structures if not one.used]
+    lines += [f"Also in the model: {STRUCTURE_WORDS[one.name]} {odds(one)}." for one in unnamed]
+    out = [f"{STRUCTURE_WORDS[one.name]} {odds(one)}" for one in choice.structures if not one.used]
     return [*lines, f"Not in the model: {'; '.join(out)}."] if out else lines
 
 
@@ -190,19 +197,21 @@ def _named_structures(choice: SceneChoice) -> list[Structure]:
     return [one for one in choice.structures if one.used and (one.place or (one.name == "tilt" and one.supported))]
 
 
-def odds_words(one: Structure) -> str:
-    """A Bayes factor with no more digits than it is worth, and how the widths would change by the other choice."""
-    odds = f"{'at most ' if one.odds_are_a_bound else ''}{one.odds:.2g} to 1"
+def odds_text(one: Structure) -> str:
+    """Format a Bayes factor with no more digits than it is worth."""
     if one.odds < 0.01:
-        odds = "below 0.01 to 1"
-    elif one.odds > 1000:
-        odds = "above 1000 to 1"
+        return "below 0.01 to 1"
+    if one.odds > 1000:
+        return "above 1000 to 1"
+    return f"{'at most ' if one.odds_are_a_bound else ''}{one.odds:.2g} to 1"
+
+
+def _width_changes(one: Structure, word: str) -> str:
     if one.change_sigma_x_sd is None or one.change_sigma_y_sd is None:
-        return f"(odds {odds})"
+        return ""
     changes = {"sigma_x": one.change_sigma_x_sd, "sigma_y": one.change_sigma_y_sd}
     parts = [f"{name} would change by {by:+.1f} SD" for name, by in changes.items() if abs(by) >= LEAST_CHANGE_SD]
-    instead = f"{'without' if one.used else 'with'} it {' and '.join(parts) or 'the widths would not change'}"
-    return f"(odds {odds}): {instead}"
+    return f": {word} it {' and '.join(parts) or 'the widths would not change'}"
 
 
 def sensitivity_line(sensitivity: Sensitivity) -> str:

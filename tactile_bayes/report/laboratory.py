@@ -153,12 +153,8 @@ def tables_text(
     `nearest` is the head nearest to the printed tables, `beside` its ten lumps; None where there is none, or it is
     `head`.
     """
-    heads, means = [cases] if beside is None else [cases, beside], []
-    for words, name in (("frames", "centred_frame"), ("maps", "map")):
-        near = "" if beside is None else f"nearest head {_mean(beside, name):.1f}, "
-        printed = np.mean([*_PRINTED[name].values()])
-        means.append(f"{words} {_mean(cases, name):.1f} % ({near}printed {printed:.1f})")
-    lines = [f"mean MSD: {', '.join(means)}", "", model_comparison.DEFINITION, "", f"head: {head_words(head)}"]
+    heads = [cases] if beside is None else [cases, beside]
+    lines = [f"mean MSD: {_mean_msd_words(heads)}", "", model_comparison.DEFINITION, "", f"head: {head_words(head)}"]
     if nearest is not None and beside is not None:
         lines.append(f"after the slash the head nearest to the print: {head_words(nearest)}")
     lines += ["in brackets the printed figure", ""]
@@ -205,6 +201,16 @@ def _span(shares: Sequence[float], to: str = " to ") -> str:
 def _mean(cases: Rows, name: str) -> float:
     """In percent."""
     return float(sum(100 * getattr(case, name) for case in cases) / len(cases))
+
+
+def _mean_msd_words(heads: Sequence[Rows]) -> str:
+    """Mean MSD of frames and of maps, beside the nearest head's and the printed ones."""
+    parts = []
+    for words, name in (("frames", "centred_frame"), ("maps", "map")):
+        nearest = "".join(f"nearest head {_mean(beside, name):.1f}, " for beside in heads[1:])
+        printed = np.mean([*_PRINTED[name].values()])
+        parts.append(f"{words} {_mean(heads[0], name):.1f} % ({nearest}printed {printed:.1f})")
+    return ", ".join(parts)
 
 
 def _other_definitions(cases: Rows) -> list[str]:

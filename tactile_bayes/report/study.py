@@ -313,30 +313,35 @@ def figure_8(rows: Sequence[StudyRow], path: Path, *, force: bool = False) -> No
     """Width change against amplitude and width against diameter, each with its line, for the axes that rows have."""
     seat, kind = rows[0].seat if rows else "no cases", ", balls" if len(_axes_of(rows)) > 1 else ""
     text = f"Figure 8{kind}: {seat}, E2/E1 = {HARD_RATIO:g}, amplitude at least {DETECTABLE:g}."
-    hard = hard_cases(rows)
-    amplitude, d = np.array([row.amplitude for row in hard]), np.array([row.d_mm for row in hard])
-    level = np.array([abs(row.depth_ratio - 1.0) < 1e-9 for row in hard], dtype=bool)
     with _panels(path, text, force=force) as (left, right):
         for i, (axis, words) in enumerate(_axes_of(rows).items()):
-            change, sigma = width_changes(hard, axis=axis), widths(hard, axis=axis)
-            if words:
-                left.plot(amplitude, change, MARKS[i], color=COLOURS[i], label=words)
-            for k, diameter in enumerate(() if words else dict.fromkeys(d.tolist())):  # a colour for each
-                mine = d == diameter
-                left.plot(amplitude[mine], change[mine], MARKS[k % 6], color=COLOURS[k % 6], label=f"d {diameter:g} mm")
-            right.plot(sigma[level], d[level], MARKS[i], color=COLOURS[i], label=words or None)
-            if (learned := learn_as_printed(hard, axis=axis)) is not None:
-                colour = COLOURS[i] if words else "k"
-                a = np.geomspace(amplitude.min(), amplitude.max(), 100)
-                left.plot(a, learned.e * a**learned.f, color=colour, label=f"{learned.e:.2f} a^{learned.f:.2f}")
-                line = np.linspace(0.0, float(np.nanmax(sigma[level])) * 1.1, 2)
-                label = f"d = {learned.m:.2f} sigma {learned.b_mm:+.2f} mm"
-                right.plot(line, learned.m * line + learned.b_mm, color=colour, label=label)
+            _draw_printed_eq6(left, right, hard_cases(rows), axis, words, i)
         left.set_xscale("log")
         right.set_ylim(bottom=0)
         right.set_xlim(left=0)
         finish(left, "(a) width change, referenced to h/d 1", "amplitude a", "sigma / sigma at h/d 1")
         finish(right, "(b) at one diameter depth", "sigma (mm)", "diameter d (mm)")
+
+
+def _draw_printed_eq6(left: Axes, right: Axes, hard: Sequence[StudyRow], axis: str, words: str, i: int) -> None:
+    """Points and lines of one axis of the head; the points of a line's one axis have a colour for each diameter."""
+    learned, change, sigma = learn_as_printed(hard, axis=axis), width_changes(hard, axis=axis), widths(hard, axis=axis)
+    amplitude, d = np.array([row.amplitude for row in hard]), np.array([row.d_mm for row in hard])
+    level = np.array([abs(row.depth_ratio - 1.0) < 1e-9 for row in hard], dtype=bool)
+    if words:
+        left.plot(amplitude, change, MARKS[i], color=COLOURS[i], label=words)
+    for k, diameter in enumerate(() if words else dict.fromkeys(d.tolist())):
+        mine = d == diameter
+        left.plot(amplitude[mine], change[mine], MARKS[k % 6], color=COLOURS[k % 6], label=f"d {diameter:g} mm")
+    right.plot(sigma[level], d[level], MARKS[i], color=COLOURS[i], label=words or None)
+    if learned is None:
+        return
+    colour = COLOURS[i] if words else "k"
+    a = np.geomspace(amplitude.min(), amplitude.max(), 100)
+    left.plot(a, learned.e * a**learned.f, color=colour, label=f"{learned.e:.2f} a^{learned.f:.2f}")
+    line = np.linspace(0.0, float(np.nanmax(sigma[level])) * 1.1, 2)
+    text = f"d = {learned.m:.2f} sigma {learned.b_mm:+.2f} mm"
+    right.plot(line, learned.m * line + learned.b_mm, color=colour, label=text)
 
 
 # --- Fig 8 of the paper for any table of lumps: Eq 6 with the points that it was learned from.

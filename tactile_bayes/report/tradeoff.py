@@ -262,6 +262,7 @@ def _notes(tradeoff: Tradeoff) -> Iterator[str]:
 _MARKS = ("o", "^", "s", "D", "v", "P")
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 _LETTER, _LINE = 3.95, 9.0  #: Width of a letter and height of a line of a name, points.
+Box = tuple[float, float, float, float]
 _LEAST_MM = 1e-3  #: Smaller distances are drawn here: below rounding of what anybody reads.
 
 
@@ -336,16 +337,21 @@ def _draw_names(figure: Figure, axes: Axes, shown: Sequence[MeasuredSetting], tr
     right = axes.get_window_extent().x1 * scale
     points = zip(*_points(shown, tradeoff), strict=True)
     places = [[float(v) * scale for v in axes.transData.transform(point)] for point in points]
-    occupied = [(x - 4, y - 4, x + 4, y + 4) for x, y in places]
+    occupied: list[Box] = [(x - 4, y - 4, x + 4, y + 4) for x, y in places]
     patch = {"facecolor": "w", "edgecolor": "none", "alpha": 0.7, "pad": 0.3}
     for one, (x, y) in sorted(zip(shown, places, strict=True), key=lambda pair: pair[1][1]):
         text, point = one.label.removeprefix("--method ").removeprefix("--"), (one.seconds, _height(one, tradeoff))
-        wide = _LETTER * len(text)
-        begin = x - 8 - wide if x + wide + 8 > right else x + 8  # at the left where the picture ends
-        for step in (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6):
-            low, end = y - 4.5 + step * _LINE, begin + wide
-            if not any(x0 < end and begin < x1 and y0 < low + _LINE and low < y1 for x0, y0, x1, y1 in occupied):
-                break
-        occupied.append((begin, low, end, low + _LINE))
-        place = (begin - x, low + 2 - y)
-        axes.annotate(text, point, xytext=place, textcoords="offset points", fontsize=7, zorder=5, bbox=patch)
+        occupied.append(_free_place(x, y, _LETTER * len(text), occupied, right=right))
+        offset = (occupied[-1][0] - x, occupied[-1][1] + 2 - y)
+        axes.annotate(text, point, xytext=offset, textcoords="offset points", fontsize=7, zorder=5, bbox=patch)
+
+
+def _free_place(x: float, y: float, wide: float, occupied: list[Box], *, right: float) -> Box:
+    """Where a name of so many points of width goes: at the right of its point, or the left where the picture ends."""
+    begin = x - 8 - wide if x + wide + 8 > right else x + 8
+    for step in (0, 1, -1, 2, -2, 3, -3, 4, -4, 5, -5, 6, -6):
+        low = y - 4.5 + step * _LINE
+        box = (begin, low, begin + wide, low + _LINE)
+        if not any(x0 < box[2] and box[0] < x1 and y0 < box[3] and low < y1 for x0, y0, x1, y1 in occupied):
+            break
+    return box

@@ -84,6 +84,17 @@ _LINES = {
 }
 
 
+def method_lines(report: TrialReport) -> Iterator[str]:
+    """Text lines, none longer than 150 characters."""
+    yield "Detected masses as measurements (size on ex vivo; differences are size - ex vivo):"
+    for name, one in report.modalities.items():
+        lines = list(_modality_lines(name, one))
+        yield from lines or [f"{name}: no lines or limits: too few masses were found, or their sizes do not differ"]
+    if growing := growing_line(report):
+        yield growing
+    yield from map(_pair_line, report.paired_comparisons)
+
+
 def _modality_lines(name: str, report: ModalityReport) -> Iterator[str]:
     methods = report.method_comparison
     for key, words in _LINES.items():
@@ -208,23 +219,24 @@ def trial_text(report: TrialReport, *, notes: Sequence[str] = (), methods: bool 
 
 def comparison_sentences(report: TrialReport) -> list[str]:
     """A sentence for each modality that the tactile one is compared with; for every pair where it has no reading."""
-    pairs, percent, sentences = report.paired_comparisons, f"{100 * report.interval_probability:g} %", []
-    for pair in [one for one in pairs if REFERENCE in (one.first, one.second)] or pairs:
-        quotient, first, second = pair.figure("ratio"), pair.first, pair.second
-        if second == REFERENCE:
-            first, second = second, first
-            quotient = quotient.mapped(lambda ratio: 1 / ratio) if quotient.value else replace(quotient, value=None)
-        other, masses = SPELLED.get(second, second), counted(pair.masses, "mass")
-        if quotient.value is None:
-            why = quotient.reason or "an error is 0"
-            sentences.append(f"{first} and {other} are not compared on {masses}: {why}")
-            continue
-        interval = f"no interval: {quotient.interval_reason}"
-        if quotient.interval is not None:
-            interval = f"{percent} {_between(quotient.interval, '.2f')}"
-        p = "" if pair.p_holm is None else f", p {_short_p(pair.p_holm)}"
-        sentences.append(f"{first} errs {quotient.value:.2f} times as much as {other}, {interval}{p}, {masses}")
-    return sentences
+    pairs = report.paired_comparisons
+    led = [pair for pair in pairs if REFERENCE in (pair.first, pair.second)] or pairs
+    return [_comparison_sentence(pair, f"{100 * report.interval_probability:g} %") for pair in led]
+
+
+def _comparison_sentence(pair: PairedComparison, percent: str) -> str:
+    quotient, first, second = pair.figure("ratio"), pair.first, pair.second
+    if second == REFERENCE:
+        first, second = second, first
+        quotient = quotient.mapped(lambda ratio: 1 / ratio) if quotient.value else replace(quotient, value=None)
+    other, masses = SPELLED.get(second, second), counted(pair.masses, "mass")
+    if quotient.value is None:
+        return f"{first} and {other} are not compared on {masses}: {quotient.reason or 'an error is 0'}"
+    interval = f"no interval: {quotient.interval_reason}"
+    if quotient.interval is not None:
+        interval = f"{percent} {_between(quotient.interval, '.2f')}"
+    p = "" if pair.p_holm is None else f", p {_short_p(pair.p_holm)}"
+    return f"{first} errs {quotient.value:.2f} times as much as {other}, {interval}{p}, {masses}"
 
 
 def _short_p(p: float) -> str:
@@ -267,13 +279,7 @@ def _methods(report: TrialReport) -> Iterator[str]:
         yield from _reasons(name, one, [key for key in one.reasons if key.removesuffix("_interval") not in _FIRST])
     for name, quotient in report.mape_ratio_to_tactile.items():
         yield ratio_line(name, quotient)
-    yield "Detected masses as measurements (size on ex vivo; differences are size - ex vivo):"
-    for name, one in report.modalities.items():
-        lines = list(_modality_lines(name, one))
-        yield from lines or [f"{name}: no lines or limits: too few masses were found, or their sizes do not differ"]
-    if growing := growing_line(report):
-        yield growing
-    yield from map(_pair_line, report.paired_comparisons)
+    yield from method_lines(report)
     percent = f"{100 * report.interval_probability:g} %"
     yield f"In brackets: {percent} intervals. MAPE: mean absolute percentage error. ICC: intraclass correlation."
     yield (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from itertools import combinations, starmap
+from itertools import combinations
 from typing import Annotated
 
 import numpy as np
@@ -318,28 +318,7 @@ class PairedComparison(Figures):
 
 def paired_comparisons(sizes: Mapping[str, ModalitySizes], *, intervals: Intervals) -> list[PairedComparison]:
     """Compare every pair of modalities on their common masses, with Holm's correction of p values."""
-    pairs = []
-    for first, second in starmap(on_common_masses, combinations(sizes.values(), 2)):
-        difference = resampled(_error_sample(first, second, np.subtract), scale="linear", intervals=intervals)
-        quotient = resampled(_error_sample(first, second, ratio), scale="log", intervals=intervals)
-        patients = first.patients
-        with np.errstate(all="ignore"):
-            off = np.abs(first.size_mm / first.ex_vivo_mm - 1) - np.abs(second.size_mm / second.ex_vivo_mm - 1)
-        sums = np.zeros(len(patients))
-        np.add.at(sums, np.searchsorted(patients, first.patient), off)
-        pairs.append(
-            PairedComparison(
-                first=first.name,
-                second=second.name,
-                masses=len(first.size_mm),
-                patients=len(patients),
-                first_percent=figure(mape_percent, first).value,
-                second_percent=figure(mape_percent, second).value,
-                p_value=sign_flip(sums, seed=intervals.seed) if len(patients) and np.all(np.isfinite(sums)) else None,
-                p_holm=None,
-                **fields_of({"difference_percent": difference, "ratio": quotient}),
-            )
-        )
+    pairs = [_paired_comparison(sizes[first], sizes[second], intervals) for first, second in combinations(sizes, 2)]
     corrected = holm([pair.p_value for pair in pairs])
     return [replace(pair, p_holm=p) for pair, p in zip(pairs, corrected, strict=True)]
 
@@ -383,3 +362,26 @@ def sign_flip(by_patient: FloatArray, *, seed: int, flips: int = FLIPS) -> float
         signs = 1 - 2 * rng.integers(0, 2, (min(_FLIPS_AT_ONCE, flips - start), len(differences)), dtype=np.int8)
         beyond += int(np.sum(np.abs(signs @ differences) >= observed))
     return beyond / (flips + 1)
+
+
+def _paired_comparison(first: ModalitySizes, second: ModalitySizes, intervals: Intervals) -> PairedComparison:
+    """Difference and ratio of the errors of two modalities on their common masses, and the test."""
+    first, second = on_common_masses(first, second)
+    difference = resampled(_error_sample(first, second, np.subtract), scale="linear", intervals=intervals)
+    quotient = resampled(_error_sample(first, second, ratio), scale="log", intervals=intervals)
+    patients = first.patients
+    with np.errstate(all="ignore"):
+        off = np.abs(first.size_mm / first.ex_vivo_mm - 1) - np.abs(second.size_mm / second.ex_vivo_mm - 1)
+    sums = np.zeros(len(patients))
+    np.add.at(sums, np.searchsorted(patients, first.patient), off)
+    return PairedComparison(
+        first=first.name,
+        second=second.name,
+        masses=len(first.size_mm),
+        patients=len(patients),
+        first_percent=figure(mape_percent, first).value,
+        second_percent=figure(mape_percent, second).value,
+        p_value=sign_flip(sums, seed=intervals.seed) if len(patients) and np.all(np.isfinite(sums)) else None,
+        p_holm=None,
+        **fields_of({"difference_percent": difference, "ratio": quotient}),
+    )

@@ -39,12 +39,7 @@ class PairAngles:
             self._upright = _pairs_of_equals(self._x[:, None]) - self._coincident
             self.number = len(x) * (len(x) - 1) // 2 - self._coincident
         else:
-            first, second = np.triu_indices(len(x), 1)
-            dx, dy = _difference(x[second], x[first]), _difference(y[second], y[first])
-            distinct = (dx != 0) | (dy != 0)
-            dx, dy = dx[distinct], dy[distinct]
-            is_vertical = dx == 0
-            self._angles = np.sort(np.where(is_vertical, vertical, np.arctan(dy / np.where(is_vertical, 1.0, dx))))
+            self._angles = _sorted_angles(x, y, vertical)
             self.number = len(self._angles)
 
     def below(self, angle: float, *, inclusive: bool) -> int:
@@ -80,6 +75,16 @@ def kendall_sign(x: FloatArray, y: FloatArray) -> int:
     """Sign of Kendall's tau: concordant less discordant pairs."""
     concordant, discordant = (_count_inversions(x, z, ties=False) for z in (-y, y))
     return (concordant > discordant) - (concordant < discordant)
+
+
+def _sorted_angles(x: FloatArray, y: FloatArray, vertical: float) -> FloatArray:
+    """Ascending angles of all pairs of points that do not coincide."""
+    first, second = np.triu_indices(len(x), 1)
+    dx, dy = _difference(x[second], x[first]), _difference(y[second], y[first])
+    distinct = (dx != 0) | (dy != 0)
+    dx, dy = dx[distinct], dy[distinct]
+    is_vertical = dx == 0
+    return np.sort(np.where(is_vertical, vertical, np.arctan(dy / np.where(is_vertical, 1.0, dx))))
 
 
 def _difference(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -238,12 +243,8 @@ def weighted_deming(
     line = deming(x, y, error_ratio=error_ratio)
     intercept, slope = line.intercept, line.slope
     for _ in range(max_iterations):
-        residual = y - intercept - slope * x
-        y_correction = residual / (1 + error_ratio * slope**2)
-        size = (x + error_ratio * slope * y_correction + error_ratio * (y - y_correction)) / (1 + error_ratio)
-        if np.any(size == 0):
-            raise UndefinedError("the line gives one pair the size 0, which has no weight")
-        mean_x, mean_y, u, q, p = _weighted_moments(x, y, size**-2.0)
+        weights = _size_weights(x, y, intercept, slope, error_ratio)
+        mean_x, mean_y, u, q, p = _weighted_moments(x, y, weights)
         previous = intercept, slope
         slope = deming_slope(u, q, p, error_ratio)
         intercept = mean_y - slope * mean_x
@@ -303,6 +304,16 @@ def centred(values: FloatArray, mean: float) -> FloatArray:
 def student(freedom: float, *, confidence: float) -> float:
     """Quantile of Student's t for a two-sided interval."""
     return float(stdtrit(freedom, 0.5 + 0.5 * confidence))
+
+
+def _size_weights(x: FloatArray, y: FloatArray, intercept: float, slope: float, error_ratio: float) -> FloatArray:
+    """1 over the squared size at each pair by the line."""
+    residual = y - intercept - slope * x
+    y_correction = residual / (1 + error_ratio * slope**2)
+    size = (x + error_ratio * slope * y_correction + error_ratio * (y - y_correction)) / (1 + error_ratio)
+    if np.any(size == 0):
+        raise UndefinedError("the line gives one pair the size 0, which has no weight")
+    return np.asarray(size**-2.0)
 
 
 def _weighted_moments(x: FloatArray, y: FloatArray, w: FloatArray) -> tuple[float, float, float, float, float]:

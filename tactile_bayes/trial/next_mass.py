@@ -248,14 +248,17 @@ class LogModel:
         variance = variance + omega2[:, None] / self._number
         off = (self._y - mean) / variance
         log_like = -0.5 * np.sum((self._y - mean) * off + np.log(variance), axis=1)
-        # the shared effect of a patient (Woodbury, patient by patient)
-        sums = np.zeros((2, len(rho2), self._patients))
-        for row, values in enumerate((off, 1 / variance)):
-            np.add.at(sums[row].T, self._patient, values.T)
-        within = 1 + rho2[:, None] * sums[1]
-        log_like += 0.5 * np.sum(rho2[:, None] * sums[0] ** 2 / within - np.log(within), axis=1)
+        log_like += self._patients_part(rho2, off, 1 / variance)
         log_like -= 0.5 * (self._within / omega2 + self._freedom * np.log(omega2))
         return np.asarray(log_like + log_prior(theta, spread=self.spread, caliper=self.caliper))
+
+    def _patients_part(self, rho2: FloatArray, off: FloatArray, precision: FloatArray) -> FloatArray:
+        """Log-likelihood contribution of the shared patient effect (Woodbury, patient by patient)."""
+        sums = np.zeros((2, len(rho2), self._patients))
+        for row, values in enumerate((off, precision)):
+            np.add.at(sums[row].T, self._patient, values.T)
+        within = 1 + rho2[:, None] * sums[1]
+        return np.asarray(0.5 * np.sum(rho2[:, None] * sums[0] ** 2 / within - np.log(within), axis=1))
 
 
 def variances(theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -24,7 +24,7 @@ from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.fit import Structure
 from tactile_bayes.posterior.result import Estimate, Mass, Sensitivity
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.report.estimate_document import odds_words, sensitivity_line, supposed_line
+from tactile_bayes.report.estimate_document import _width_changes, sensitivity_line, supposed_line
 from tactile_bayes.report.estimate_text import (
     MOST_LINES,
     decimals,
@@ -225,9 +225,9 @@ def test_no_report_says_that_something_changed_by_nothing(folder: Path) -> None:
         text = run_here("estimate", *words, "-v", cwd=folder).stdout
         assert not re.search(r"[-+]0\.0+ (of|SD)", text)
     still = Structure("tilt", 0.1, supported=False, used=False, change_sigma_x_sd=-0.04, change_sigma_y_sd=0.03)
-    assert odds_words(still).endswith("): with it the widths would not change")
+    assert _width_changes(still, "with") == ": with it the widths would not change"
     moved = replace(still, change_sigma_x_sd=-0.04, change_sigma_y_sd=0.3)
-    assert odds_words(moved).endswith("): with it sigma_y would change by +0.3 SD")
+    assert _width_changes(moved, "with") == ": with it sigma_y would change by +0.3 SD"
     shifted = sensitivity_line(Sensitivity(median={"sigma_x_mm": -0.001}, ends={"sigma_x_mm": 0.02}, pareto_k=0.1))
     assert "-0.00" not in shifted
 
