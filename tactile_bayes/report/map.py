@@ -228,7 +228,7 @@ _HATCHES = 60  #: Lines of hatching across the longer side of the map.
 # The colours span at least this share of the level below and above it, so that noise alone does not look like a lump.
 _LEAST_COLOURS = (0.9, 1.3)
 # With a fit they end so many amplitudes above the level, so that a rib beside the lump does not take them all.
-_AMPLITUDES_SHOWN = 1.25
+AMPLITUDES_SHOWN = 1.25
 _AXIS_WORDS: Final = {"x": "across the head, x (mm)", "y": "along the head, y (mm)"}
 # Words above a mark, so many points away.
 _ABOVE: Final[dict[str, Any]] = {
@@ -332,7 +332,7 @@ def _draw_values(axes: Axes, tactile_map: TactileMap, view: Orientation, report:
     top = highest
     if report is not None and report.background is not None and report.amplitude is not None:
         level = report.background.median
-        top = min(highest, max(_LEAST_COLOURS[1] * level, level + _AMPLITUDES_SHOWN * report.amplitude.median))
+        top = min(highest, max(_LEAST_COLOURS[1] * level, level + AMPLITUDES_SHOWN * report.amplitude.median))
     cells = np.ma.masked_where(~tactile_map.covered, tactile_map.mean)
     image = _draw_map(axes, cells, tactile_map, view, cmap="viridis", vmin=lowest, vmax=top)
     _colour_bar(axes, image, tactile_map.recipe.value_words, extend="max" if top < highest else "neither")

@@ -19,6 +19,7 @@ from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import Orientation, TactileMap, orientation_of
 from tactile_bayes.presets import VIRIDIS
 from tactile_bayes.report.exam_words import ExamMap, ExamMass
+from tactile_bayes.report.map import AMPLITUDES_SHOWN
 
 # --- Parts of all drawings: lengths are mm, x to the right and y downwards.
 
@@ -178,10 +179,9 @@ _MOST_PIXELS: Final = 1200
 _CELL_PX: Final = 4
 _STRIPES_PX: Final = 8
 _NO_DATA: Final = (222, 222, 222)
-# The colours' ends: shares of the well-read cells outside, the least span of the level, amplitudes shown of a lump.
+# The colours' ends: shares of the well-read cells outside, and the least span of the level.
 _ENDS: Final = (0.01, 0.995)
 _LEAST_SPAN: Final = 0.35
-_AMPLITUDES_SHOWN: Final = 1.25
 _POINTS: Final = 73
 _SCALE_BARS_MM: Final = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0)
 _BAR_MM: Final = 40.0
@@ -243,7 +243,7 @@ def colour_limits(exam: ExamMap) -> tuple[float, float]:
     values = tactile_map.mean[well if well.any() else tactile_map.covered]
     if report.amplitude is None or report.background is None:
         return spread_limits(values)
-    return spread_limits(values, report.background.median + _AMPLITUDES_SHOWN * report.amplitude.median)
+    return spread_limits(values, report.background.median + AMPLITUDES_SHOWN * report.amplitude.median)
 
 
 def exam_picture(

@@ -69,14 +69,8 @@ class ModalitySizes(Record, eq=False):
     """(n,) array, the number of each mass among the excised ones; counted from 0 when not given."""
 
     def __post_init__(self) -> None:
-        n = len(self.ex_vivo_mm)
-        if len(self.mass) != n:
-            set_fields(self, mass=np.arange(n))
-        shapes = self.patient.shape, self.ex_vivo_mm.shape, self.size_mm.shape, (len(self.replicates_mm),)
-        if set(shapes) != {(n,)}:
-            raise ValueError(f"{self.name}: patient, ex_vivo_mm, size_mm and replicates_mm must be of one length ({n})")
-        if not (np.all(self.ex_vivo_mm > 0) and np.all(self.size_mm >= 0)):
-            raise ValueError(f"{self.name}: ex_vivo_mm must be above 0 and size_mm must not be below it")
+        if len(self.mass) != len(self.ex_vivo_mm):
+            set_fields(self, mass=np.arange(len(self.ex_vivo_mm)))
 
     @property
     def detected(self) -> npt.NDArray[np.bool_]:
