@@ -172,7 +172,7 @@ def population_command() -> None:
 
     Each body has a ball of its own size, depth, stiffness and seat, its own moduli and thickness; each exam its own
     pressure, strokes, head yaw, tilt, noise, tracker errors and latency. The solid model makes the scans; maps are
-    built and fitted as `map` and `estimate` do it. A mass takes about two seconds. An interrupted run goes on where it
+    built and fitted as `map` and `estimate` do it. A mass takes 3 to 5 s of CPU. An interrupted run goes on where it
     stopped. `calibrate size` learns Eq 6 from the table, or with --form eq6-residual a calibration of the default's
     kind. The table names its head: a calibration learned from it sizes maps of such a head only.
 
