@@ -6,19 +6,18 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import combinations
-from typing import Annotated
 
 import numpy as np
 from scipy.special import betaincinv
 
-from tactile_bayes.declarations import Meta, replace
+from tactile_bayes.declarations import replace
+from tactile_bayes.options import NonNegative
 from tactile_bayes.trial.figures import (
     Count,
     Ends,
     Figure,
     Figures,
     Intervals,
-    NotNegative,
     Reasons,
     Sample,
     Scale,
@@ -247,11 +246,11 @@ REFERENCE = "tactile"
 class ModalityRatio(Figures):
     """Percent error of one modality over the tactile one's on common masses."""
 
-    masses: Annotated[int, Meta(ge=0)]  #: Masses that both modalities looked for.
-    masses_detected: Annotated[int, Meta(ge=0)]  #: Masses that both detected.
-    ratio: NotNegative | None  #: On the masses that both looked for; masses not detected counted as size 0.
+    masses: Count  #: Masses that both modalities looked for.
+    masses_detected: Count  #: Masses that both detected.
+    ratio: NonNegative | None  #: On the masses that both looked for; masses not detected counted as size 0.
     ratio_interval: Ends | None
-    ratio_detected: NotNegative | None  #: On the masses that both detected.
+    ratio_detected: NonNegative | None  #: On the masses that both detected.
     ratio_detected_interval: Ends | None
     reasons: Reasons
 

@@ -262,8 +262,6 @@ class Figure(Record):
 
 Ends = tuple[float, float]
 Count = Annotated[int, Meta(ge=0)]
-NotNegative = Annotated[float, Meta(ge=0)]
-Share = Annotated[float, Meta(ge=0, le=1)]
 Reasons = Annotated[dict[str, Annotated[str, Meta(min_length=1)]], described("Why a figure or an interval is null.")]
 
 

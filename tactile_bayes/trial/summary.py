@@ -13,6 +13,7 @@ import numpy.typing as npt
 from scipy.special import chdtri, kolmogi, ndtr, ndtri
 
 from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType
+from tactile_bayes.options import NonNegative, Share
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.trial import accuracy
 from tactile_bayes.trial.figures import (
@@ -22,9 +23,7 @@ from tactile_bayes.trial.figures import (
     Ends,
     Figures,
     Intervals,
-    NotNegative,
     Reasons,
-    Share,
     clopper_pearson,
     effective_number,
     fields_of,
@@ -268,7 +267,7 @@ CONVENTIONS: dict[str, str] = {
 class ModalityReport(Figures):
     """Counts, figures and coverage of one modality on its `n` masses."""
 
-    n: Annotated[int, Meta(ge=0)]  #: Masses looked for.
+    n: Count  #: Masses looked for.
     detected: Count
     detected_interval: Ends | None
     patients: Count
@@ -276,43 +275,43 @@ class ModalityReport(Figures):
     readings_detected: Count
     masses_not_done: Count
     masses_without_reading: Count
-    mape_percent: NotNegative | None
+    mape_percent: NonNegative | None
     """Mean absolute error in percent of the ex-vivo size; a mass not detected has size 0."""
     mape_percent_interval: Ends | None
-    mape_detected_percent: NotNegative | None  #: The same over detected masses.
+    mape_detected_percent: NonNegative | None  #: The same over detected masses.
     mape_detected_percent_interval: Ends | None
-    mae_mm: NotNegative | None  #: Mean absolute error in mm; a mass not detected has size 0.
+    mae_mm: NonNegative | None  #: Mean absolute error in mm; a mass not detected has size 0.
     mae_mm_interval: Ends | None
-    mae_detected_mm: NotNegative | None  #: The same over detected masses.
+    mae_detected_mm: NonNegative | None  #: The same over detected masses.
     mae_detected_mm_interval: Ends | None
-    weighted_mape_percent: NotNegative | None  #: Sum of absolute errors over the sum of ex-vivo sizes, percent.
+    weighted_mape_percent: NonNegative | None  #: Sum of absolute errors over the sum of ex-vivo sizes, percent.
     weighted_mape_percent_interval: Ends | None
-    median_error_percent: NotNegative | None  #: Median absolute error in percent of the ex-vivo size.
+    median_error_percent: NonNegative | None  #: Median absolute error in percent of the ex-vivo size.
     bias_percent: Annotated[float, Meta(ge=-100)] | None
     """100 (geometric mean of size over ex-vivo size - 1), over detected masses."""
     bias_percent_interval: Ends | None
-    slope_through_origin: NotNegative | None
+    slope_through_origin: NonNegative | None
     """Slope of sizes on ex-vivo sizes without intercept; a mass not detected has size 0."""
     slope_through_origin_interval: Ends | None
     r2_centred: AtMostOne | None  #: 1 - SSE0 / SST; a mass not detected has size 0.
     r2_uncentred: AtMostOne | None  #: 1 - SSE0 / sum of squared sizes; a mass not detected has size 0.
     r2_pearson: Share | None  #: Squared correlation coefficient; a mass not detected has size 0.
     pearson_r: Correlation | None  #: Correlation coefficient; a mass not detected has size 0.
-    slope_through_origin_detected: NotNegative | None
+    slope_through_origin_detected: NonNegative | None
     """Slope of sizes on ex-vivo sizes without intercept, over detected masses."""
     slope_through_origin_detected_interval: Ends | None
     r2_centred_detected: AtMostOne | None  #: 1 - SSE0 / SST, over detected masses.
     r2_uncentred_detected: AtMostOne | None  #: 1 - SSE0 / sum of squared sizes, over detected masses.
     r2_pearson_detected: Share | None  #: Squared correlation coefficient, over detected masses.
     pearson_r_detected: Correlation | None  #: Correlation coefficient, over detected masses.
-    within_mass_sd_mm: NotNegative | None  #: Mean over masses of the SD of detected replicates, mm.
+    within_mass_sd_mm: NonNegative | None  #: Mean over masses of the SD of detected replicates, mm.
     within_mass_sd_mm_interval: Ends | None
-    within_mass_sd_rms_mm: NotNegative | None
+    within_mass_sd_rms_mm: NonNegative | None
     """Root of the mean variance of detected replicates, by degrees of freedom, mm."""
     within_mass_sd_rms_mm_interval: Ends | None
-    within_mass_cv_percent: NotNegative | None  #: Mean over masses of SD over mean of detected replicates, percent.
+    within_mass_cv_percent: NonNegative | None  #: Mean over masses of SD over mean of detected replicates, percent.
     within_mass_cv_percent_interval: Ends | None
-    within_mass_cv_rms_percent: NotNegative | None  #: Root mean square of SD over mean, by degrees of freedom, percent.
+    within_mass_cv_rms_percent: NonNegative | None  #: Root mean square of SD over mean, by degrees of freedom, percent.
     within_mass_cv_rms_percent_interval: Ends | None
     reasons: Reasons
     coverage: tuple[Coverage, ...]
