@@ -16,7 +16,7 @@ from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.npz import CheckpointFile
 from tactile_bayes.files.provenance import Provenance, hash_inputs
 from tactile_bayes.files.size_json import SHIPPED, default_for, read_size_calibration, size_calibration_path
-from tactile_bayes.findings import by_severity
+from tactile_bayes.findings import by_severity, finding
 from tactile_bayes.mapping.map import TactileMap, many_cells, side_findings
 from tactile_bayes.options import PRIORS, FitSettings
 from tactile_bayes.posterior.draw import SamplerSettings
@@ -29,6 +29,7 @@ from tactile_bayes.presets import FIT_RADIUS_MM
 from tactile_bayes.progress import Progress
 from tactile_bayes.report import estimate_document
 from tactile_bayes.report.calibration import calibration_line, site_words
+from tactile_bayes.scans import DEFAULT_HEAD
 from tactile_bayes.size.bodies import BodyCalibration, mean_width_mm
 from tactile_bayes.size.pooling import Calibration
 
@@ -132,10 +133,8 @@ def estimate_one(
         on_paper = "a size needs a calibration that fits this map"
         estimate = replace(estimate, reason=reason, advice=advice, on_paper=on_paper)
     if estimate.code in NO_LUMP and tactile_map.covered.any():
-        smallest = smallest_lumps(tactile_map, fat_mm=None if calibration is None else calibration.fat_mm)
-        hidden = shows_no_lump(smallest)
-        fields = {"smallest": smallest} if hidden is None else as_dict(hidden) | {"weighed": None}
-        estimate = replace(estimate, **fields)
+        fat_mm = None if calibration is None else calibration.fat_mm
+        estimate = _with_smallest(estimate, tactile_map, fat_mm)
     posterior = estimate.map_posterior
     applied = None if posterior is None or calibration is None else calibration.at_depth_or_fallback(*posterior.medians)
     if posterior is not None and applied is not None and estimate.size is not None:
@@ -214,6 +213,19 @@ def choose_calibration(
         advice = OTHER_HEAD if calibration.recipe.head_differences(tactile_map.head) else ""
         return None, None, (f"the shipped calibration does not fit: {'; '.join(differs)}; widths only", advice)
     return path, calibration, None
+
+
+def _with_smallest(estimate: Estimate, tactile_map: TactileMap, fat_mm: float | None) -> Estimate:
+    """The answer "no lump" with the smallest one that the map would have shown, or that its errors hide any."""
+    smallest, head = smallest_lumps(tactile_map, fat_mm=fat_mm), tactile_map.head
+    if (hidden := shows_no_lump(smallest)) is not None:
+        return replace(estimate, **as_dict(hidden), weighed=None)
+    findings = estimate.findings
+    if head is not None and DEFAULT_HEAD.differences(head):
+        learned = f"from which diameters on a lump is seen was learned with another head ({DEFAULT_HEAD})"
+        other = finding("unusual_scan", f"{learned}; this one ({head}) may miss larger lumps")
+        findings = by_severity((other, *findings))
+    return replace(estimate, smallest=smallest, findings=findings)
 
 
 def _level_unknown(tactile_map: TactileMap, fit: SamplerSettings) -> WhyNone:

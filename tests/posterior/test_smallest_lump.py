@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from posterior_maps import bump_values, grid_map
 
+from tactile_bayes.api import estimating
 from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace
@@ -20,6 +21,7 @@ from tactile_bayes.posterior.verdict import (
     smallest_lumps,
 )
 from tactile_bayes.report.estimate_document import smallest_lump
+from tactile_bayes.scans import DEFAULT_HEAD, HeadShape
 
 FIELD = SamplerSettings(method="laplace", draws=400, background="free", noise="field")
 
@@ -53,6 +55,17 @@ def test_as_plain_data_a_lump_that_nothing_shows_is_null() -> None:
     told = smallest_lump(smallest_lumps(empty(1.0), fat_mm=30.0))
     assert told.worst_mm[-1] is None
     assert told.probability == 0.95
+
+
+def test_what_another_head_would_have_shown_is_to_be_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = SmallestLumps(np.zeros((1, 2)), np.array([8.0]), np.full((1, 1), 9.0), 12.0)
+    monkeypatch.setattr(estimating, "smallest_lumps", lambda *_, **__: shown)
+    small = grid_map(1.0 + noise()[:13, :13], cell_mm=2.0)
+    settings = Settings(size_calibration="none", method="optimise")
+    heads = DEFAULT_HEAD, HeadShape(8, 8, 4.0, None)
+    paper, other = (estimate_one(replace(small, head=head), settings).findings for head in heads)
+    assert paper == ()
+    assert other[0].text.endswith("this one (8 x 8 taxels, 4 mm apart, flat) may miss larger lumps")
 
 
 def test_a_lump_is_excluded_where_one_would_have_shown_somewhere() -> None:
