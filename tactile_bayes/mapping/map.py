@@ -232,7 +232,7 @@ def broken_assumptions(quality: Mapping[str, float], *, strokes_lengthwise: int 
         remedy = f"scan with {LEAST_STROKES} strokes or more, side by side"
         if strokes_lengthwise > strokes:
             text = f"the {strokes_lengthwise} strokes run along the head, and sizes were learned from strokes across it"
-            remedy = "scan with the head's long side square to the strokes"
+            remedy = "scan with the head turned by 90 degrees"
         yield finding("few_strokes", text, remedy, remedy)
 
 
