@@ -22,7 +22,7 @@ from typing import Any
 from unittest import mock
 
 import psutil
-from campaign_scale import PORT, Cluster, Watch, entries
+from campaign_scale import PORT, Cluster, entries
 
 from tactile_bayes.batch import open_executor, run_batch
 from tactile_bayes.campaigns import report as campaign_report
@@ -97,18 +97,17 @@ def nothing(item: int) -> int:
 def tasks(count: int) -> None:
     """Measure client, scheduler and workers."""
     with tempfile.TemporaryDirectory() as place:
-        watch = Watch(Path(place), Path(place) / "none")
-        cluster = Cluster(Path(place), watch)
+        cluster = Cluster(Path(place), port=PORT)
         cluster.start()
         try:
-            time.sleep(15)
+            cluster.wait()
             cluster.find_workers()
             with open_executor(cluster=f"tcp://127.0.0.1:{PORT}") as executor:
                 run_batch(nothing, range(500), key=str, executor=executor)
-                before = _cpu(watch)
+                before = _cpu(cluster)
                 began = time.monotonic()
                 run_batch(nothing, range(count), key=str, executor=executor)
-                wall, after = time.monotonic() - began, _cpu(watch)
+                wall, after = time.monotonic() - began, _cpu(cluster)
         finally:
             cluster.stop()
     print(f"{count} tasks in {wall:.1f} s wall, {count / wall:.0f} a second")
@@ -117,8 +116,8 @@ def tasks(count: int) -> None:
         print(f"{name}: {1e3 * each:.2f} ms CPU per task, {1 / each:.0f} tasks a second of one core")
 
 
-def _cpu(watch: Watch) -> dict[str, float]:
-    processes = {"client": psutil.Process(), **watch.processes}
+def _cpu(cluster: Cluster) -> dict[str, float]:
+    processes = {"client": psutil.Process(), **cluster.processes}
     return {name: sum(one.cpu_times()[:2]) for name, one in processes.items() if "nanny" not in name}
 
 
