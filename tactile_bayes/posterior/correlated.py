@@ -308,12 +308,6 @@ def _densest(choice: SceneChoice, scene: Scene, starts: FloatArray) -> FloatArra
     return np.asarray(starts[int(np.argmax(density))])
 
 
-def ridge_text(fit: FieldFit) -> str:
-    """Direction and width of a ridge in words."""
-    angle = (np.degrees(fit.at["along"]) + 90.0) % 180.0
-    return f"a ridge along {angle:.0f} deg, sigma {np.exp(fit.at['p']):.1f} mm"
-
-
 # --- Irregular outline: a bump more skewed, or rounder inside than outside, than a ball's.
 #
 # With :math:`z` the place in widths along the ellipse's axes and :math:`G = e^{-|z|^2/2}`, the columns are
@@ -524,7 +518,9 @@ def with_neighbours(
     ridge = best_ridge(choice, ridges)
     if ridge is not None and ridge.log_evidence >= choice.plain.target.null_log_evidence():
         against = ridge.log_evidence + _log_windows(choice.plain, tactile_map)
-        detection = Detection(choice.fit.log_evidence - against, ridge=ridge_text(ridge))
+        angle_deg = (np.degrees(ridge.at["along"]) + 90.0) % 180.0
+        words = f"a ridge along {angle_deg:.0f} deg, sigma {np.exp(ridge.at['p']):.1f} mm"
+        detection = Detection(choice.fit.log_evidence - against, ridge=words)
         if detection.probability < DETECTED and (with_rib := bump_beside_ridge(choice, ridge)) is not None:
             detection = Detection(with_rib.log_evidence - against, ridge=detection.ridge)
     return add_departure(choice), detection

@@ -344,11 +344,6 @@ class FatDepth(Record, eq=False):
         """(...) ln F, F in mm, of (..., 3) profiles."""
         return np.asarray(self.terms(profile) @ self.coefficients)
 
-    def relative_leverage(self, profile: FloatArray) -> FloatArray:
-        """(...) leverage over the table's largest; above 1 the profile lies outside the table."""
-        x = self.terms(profile)
-        return np.asarray(np.einsum("...i,ij,...j->...", x, self.information_inverse, x) / self.most_leverage)
-
     def without_profile(self, u: FloatArray, v: FloatArray, *, centre: float) -> FloatArray:
         """(5, ...) w at the rule's `NODES`, within the table's range, for w_0 in `centre`."""
         low, high = np.log(self.fat_mm) - centre
@@ -382,7 +377,9 @@ class FatDepth(Record, eq=False):
         """(n,) ln F of the profiles that resemble the table's."""
         known = np.array([profile for profile in profiles if profile is not None], dtype=np.float64)
         known = known.reshape(-1, len(self.centre))
-        return self.log_depth(known[self.relative_leverage(known) <= MOST_LEVERAGE])
+        x = self.terms(known)
+        leverage = np.einsum("...i,ij,...j->...", x, self.information_inverse, x) / self.most_leverage
+        return self.log_depth(known[leverage <= MOST_LEVERAGE])
 
 
 def profile_terms(z: FloatArray) -> FloatArray:
