@@ -436,7 +436,10 @@ def select_frames(
     """
     faults, taxels = find_faults(scan), scan.head.shape[0] * scan.head.shape[1]
     if len(faults) >= taxels > 0:
-        way_out = _counts_question([scan]) or "check the array's cable and its calibration"
+        look = "check the array's cable and its calibration"
+        if 2 * sum(one.fault == "saturated" for one in faults) > taxels:
+            look = "press less hard, or import it with the array's own --saturation"
+        way_out = _counts_question([scan]) or look
         raise BadDataError(f"none of the {taxels} taxels works ({_kinds(faults)})", way_out=way_out)
     fresh = cells.distinct_poses(scan.poses)
     poses = cells.poses_at(fresh, scan.frames.time_s, latency_ms=latency_ms, max_gap_ms=max_pose_gap_ms)

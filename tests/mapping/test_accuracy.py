@@ -143,7 +143,7 @@ NO_MAPS = {
         r"no frame's mean lies within 5 to 14 kPa .* would keep nine in ten",
     ),
     "every taxel dead": (dead, r"none of the 64 taxels works \(dead\); check the array's cable"),
-    "34 kPa everywhere": (saturated, r"none of the 64 taxels works \(saturated\)"),
+    "34 kPa everywhere": (saturated, r"none of the 64 taxels works \(saturated\); press less hard"),
 }
 
 
