@@ -186,10 +186,8 @@ def _geometry(part: SelectedFrames) -> Iterator[tuple[str, float]]:
 
 def _weakest_row(part: SelectedFrames, sample: NDArray[np.uint16]) -> Iterator[tuple[str, float]]:
     """Least reading of a row over the mean of the rows beside it, below `LEAST_OF_BESIDE`, in a sample of frames."""
-    good = part.good_taxels
-    level = (part.scan.element_calibration.linear_kpa(sample.mean(axis=0)) * good).sum(axis=1) / good.sum(axis=1).clip(
-        1
-    )
+    good, mean_kpa = part.good_taxels, part.scan.element_calibration.linear_kpa(sample.mean(axis=0))
+    level = (good * mean_kpa).sum(axis=1) / good.sum(axis=1).clip(1)
     row, beside = level[1:-1], (level[:-2] + level[2:]) / 2
     share = np.divide(row, beside, out=np.ones_like(row), where=(row > 0) & (beside > 0))  # 0 where all is left out
     if len(share) and share.min() < LEAST_OF_BESIDE:
