@@ -58,7 +58,8 @@ _SCANS = _Parts(
 )
 _AT_REST = "scan again, patient and tracker at rest"
 _ENDS = _Parts("the scan's first and last third", 0.15, 1 / 3, _AT_REST, _AT_REST)
-"""None of 79 right scans is told by its thirds, and 24 of 29 whose tracker moved by 20 mm along the head."""
+"""By its thirds 1 of 129 right scans is told, on skin of 75 mm radius, and of 264 whose tracker moved by 10 or 20 mm at
+once, along or across the head, 134."""
 
 
 def _rises(selections: Sequence[SelectedFrames], plane: Plane) -> tuple[CellSums, FloatArray]:
@@ -77,6 +78,12 @@ def _highest(sums: CellSums, rises: FloatArray) -> IndexArray:
     return np.add(sums.first, np.unravel_index(int(np.nanargmax(rises)), rises.shape))
 
 
+def _well_read(sums: CellSums, rises: FloatArray) -> FloatArray:
+    """Rises in the half of the cells with most readings; at a border, where only the head's rim was, they mislead."""
+    count = smooth(sums.count)
+    return np.where(count >= np.median(count[np.isfinite(rises)]), rises, np.nan)
+
+
 def _rise_at(sums: CellSums, rises: FloatArray, cell: IndexArray) -> float:
     """Rise in a cell of the lattice; NaN off the map."""
     row, column = (cell - sums.first).tolist()
@@ -91,7 +98,7 @@ def _moved(parts: Sequence[SelectedFrames], plane: Plane, told: _Parts) -> tuple
     """
     maps = [_rises([part], plane) for part in parts if part.used.sum() >= select.LEAST_FRAMES]
     for one, other in combinations(maps, 2):
-        cell, other_cell = _highest(*one), _highest(*other)
+        cell, other_cell = (_highest(sums, _well_read(sums, rises)) for sums, rises in (one, other))
         rise, other_rise = _rise_at(*one, cell), _rise_at(*other, other_cell)
         lower, below = min(rise, other_rise), told.none_below
         if lower <= told.least_rise:
