@@ -34,7 +34,7 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from benchmarks.measure import environment
-from tactile_bayes.forward.contact import ContactStiffness, HeadSection, solve_contact
+from tactile_bayes.forward.contact import FactoredCompliance, HeadSection, solve_contact
 from tactile_bayes.forward.mesh import Mesh, body_mesh
 from tactile_bayes.forward.plane import (
     build_line,
@@ -254,7 +254,7 @@ class ReusedBody:
         compliance = mine @ self.factor.solve(load)[self.skin]
         # there are fewer nodes than cells: without a little of their own the contact would not be settled
         compliance = 0.5 * (compliance + compliance.T) + 1e-4 * np.eye(len(mine))
-        return solve_contact(ContactStiffness.of(compliance), profile, mean_kpa=MEAN_KPA).pressure_kpa
+        return solve_contact(FactoredCompliance.of(compliance), profile, mean_kpa=MEAN_KPA).pressure_kpa
 
 
 def reused_seconds() -> dict[str, float]:

@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotrs
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, NotConvergedError, require
@@ -113,6 +114,29 @@ class Contact(Record, eq=False):
     touching: BoolArray  #: (n,) array of bool.
 
 
+class FactoredCompliance(Record, eq=False):
+    """Cholesky factor of a compliance that serves one frame, for which inverting it takes longer than the contact."""
+
+    lower: FloatArray  #: (n, n) array.
+
+    @classmethod
+    def of(cls, compliance: FloatArray) -> FactoredCompliance:
+        """Factorise a compliance: (n, n) in mm / kPa, symmetric positive definite."""
+        try:
+            return cls(np.asarray(np.linalg.cholesky(compliance)))
+        except np.linalg.LinAlgError:
+            what = "the compliance is not positive definite"
+            raise BadDataError(what, way_out="give a body with positive stiffness") from None
+
+    def times(self, right: FloatArray) -> FloatArray:
+        """Product of the stiffness with an (n, c) array."""
+        return np.asarray(dpotrs(self.lower.T, right)[0])
+
+    def columns(self, chosen: NDArray[np.intp]) -> FloatArray:
+        """(n, c) columns of the stiffness."""
+        return self.times(np.eye(len(self.lower))[:, chosen])
+
+
 class ContactStiffness(Record, eq=False):
     r"""Inverse of a compliance that is a fixed matrix less a low-rank change."""
 
@@ -123,11 +147,7 @@ class ContactStiffness(Record, eq=False):
     @classmethod
     def of(cls, compliance: FloatArray) -> ContactStiffness:
         """Invert a plain compliance: (n, n) in mm / kPa, symmetric positive definite."""
-        try:
-            np.linalg.cholesky(compliance)
-        except np.linalg.LinAlgError:
-            what = "the compliance is not positive definite"
-            raise BadDataError(what, way_out="give a body with positive stiffness") from None
+        FactoredCompliance.of(compliance)  # refuses what is not positive definite
         empty = np.zeros((len(compliance), 0))
         inverse = np.linalg.inv(compliance)
         return cls((inverse + inverse.T) / 2, empty, np.zeros((0, 0)))
@@ -157,7 +177,7 @@ class ContactStiffness(Record, eq=False):
 
 
 def solve_contact(
-    stiffness: ContactStiffness,
+    stiffness: ContactStiffness | FactoredCompliance,
     height_mm: FloatArray,
     *,
     mean_kpa: float,
@@ -180,20 +200,19 @@ def solve_contact(
         lowest = float(height_mm.min())
         return Contact(np.zeros(count), height_mm - lowest, lowest, np.zeros(count, dtype=bool))
     share = np.full(count, 1.0 / count) if counted is None else counted / np.count_nonzero(counted)
-    level, shaped = stiffness.times(np.stack([np.ones(count), height_mm], axis=-1)).T
-    usable = touching is not None and (touching & (share > 0)).any()
-    guess = touching.copy() if usable and touching is not None else np.ones(count, dtype=bool)
+    # one column for a unit of depth, one for the head's shape
+    held = stiffness.times(np.stack([np.ones(count), -height_mm], axis=-1))
+    guess = touching if touching is not None and (touching & (share > 0)).any() else np.ones(count, dtype=bool)
     fewest, patience = count + 1, _PATIENCE
 
     def solved(touching: BoolArray) -> tuple[Contact, BoolArray]:
         """Contact of exactly the `touching` squares, and a mask of the wrong signs of pressure or gap."""
         off = np.flatnonzero(~touching)
-        # one column for a unit of depth, one for the head's shape
-        pressure, gap = np.stack([level, -shaped], axis=-1), np.zeros((count, 2))
+        pressure, gap = held, np.zeros((count, 2))
         if len(off):
             columns = stiffness.columns(off)
-            gap[off] = -np.linalg.solve(columns[off], pressure[off])
-            pressure = pressure + columns @ gap[off]
+            gap[off] = -np.linalg.solve(columns[off], held[off])
+            pressure = held + columns @ gap[off]
             pressure[off] = 0.0
         by_depth, by_shape = share @ pressure
         depth = (mean_kpa - by_shape) / by_depth
@@ -210,11 +229,7 @@ def solve_contact(
             fewest, patience = wrong_count, _PATIENCE
         else:
             patience -= 1
-        if patience > 0:
-            guess = guess ^ wrong
-        else:
-            guess = guess.copy()
-            guess[np.flatnonzero(wrong)[-1]] ^= True
+        guess = guess ^ (wrong if patience > 0 else np.arange(count) == np.flatnonzero(wrong)[-1])
         if not (guess & (share > 0)).any():
             guess[int(np.argmin(np.where(share > 0, height_mm, np.inf)))] = True
     figures = {"wrong_signs": float(fewest)}

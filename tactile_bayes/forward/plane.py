@@ -12,7 +12,7 @@ from scipy.optimize import minimize_scalar
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.axisymmetric import skin_flexibility
-from tactile_bayes.forward.contact import ContactStiffness, HeadSection, solve_contact
+from tactile_bayes.forward.contact import FactoredCompliance, HeadSection, solve_contact
 from tactile_bayes.forward.mesh import CondensedHole, Mesh, PartStiffness, body_mesh, quadrature, stiffness_factor
 from tactile_bayes.forward.tissue import Body, Layers
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
@@ -242,7 +242,7 @@ def press(
     level = np.broadcast_to(np.asarray(mean_kpa, dtype=np.float64), (len(first),))
     pressure, touching = np.empty((len(first), int(senses.sum()))), None
     for i, (begin, kpa) in enumerate(zip(first.tolist(), level.tolist(), strict=True)):
-        stiffness = ContactStiffness.of(_window(matrix, begin, len(profile)))
+        stiffness = FactoredCompliance.of(_window(matrix, begin, len(profile)))
         contact = solve_contact(stiffness, profile, mean_kpa=kpa, counted=senses, touching=touching)
         pressure[i], touching = contact.pressure_kpa[senses], contact.touching
     return LineFrames(np.asarray(x_c_mm, dtype=np.float64), _cell_centres(pressure.shape[1], cell), pressure)
@@ -258,7 +258,7 @@ def press_layers(
     """Frames of a body without a lump, P1, one per mean pressure, wherever the head is."""
     profile, senses = head.cell_profile_mm(cell_mm), head.sensing_cells(cell_mm)
     row = surface_compliance(np.asarray(cell_mm * np.arange(len(profile))), cell_mm=cell_mm, layers=layers)
-    stiffness = ContactStiffness.of(np.asarray(toeplitz(row)))
+    stiffness = FactoredCompliance.of(np.asarray(toeplitz(row)))
     level = np.atleast_1d(np.asarray(mean_kpa, dtype=np.float64))
     contacts = [solve_contact(stiffness, profile, mean_kpa=kpa, counted=senses) for kpa in level.tolist()]
     pressure = np.stack([contact.pressure_kpa[senses] for contact in contacts])

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward import contact
-from tactile_bayes.forward.contact import Contact, ContactStiffness, HeadSection, solve_contact
+from tactile_bayes.forward.contact import Contact, FactoredCompliance, HeadSection, solve_contact
 from tactile_bayes.forward.plane import (
     SurfaceCompliance,
     build_line,
@@ -39,7 +39,7 @@ def toeplitz(count: int, cell_mm: float, layers: Layers = DEEP) -> np.ndarray:
 
 def pressed(compliance: np.ndarray, profile: np.ndarray, total_kpa: float) -> Contact:
     """The head under a sum of its cells' pressures."""
-    return solve_contact(ContactStiffness.of(compliance), profile, mean_kpa=total_kpa / len(profile))
+    return solve_contact(FactoredCompliance.of(compliance), profile, mean_kpa=total_kpa / len(profile))
 
 
 def test_a_cylinder_presses_as_hertz_says() -> None:

@@ -10,7 +10,7 @@ from scipy.optimize import nnls
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.axisymmetric import taxel_compliance
-from tactile_bayes.forward.contact import ContactStiffness, solve_contact
+from tactile_bayes.forward.contact import ContactStiffness, FactoredCompliance, solve_contact
 from tactile_bayes.forward.scene import Head
 from tactile_bayes.forward.simulate import head_face
 from tactile_bayes.forward.tissue import Layers
@@ -89,11 +89,12 @@ def test_every_contact_is_complementary_and_bears_its_force(
     np.testing.assert_allclose(compliance @ p + height - contact.depth_mm, gap, atol=1e-9 * scale)
 
 
-def test_the_answer_is_that_of_non_negative_least_squares() -> None:
+@pytest.mark.parametrize("kind", [ContactStiffness, FactoredCompliance])
+def test_the_answer_is_that_of_non_negative_least_squares(kind: type[ContactStiffness | FactoredCompliance]) -> None:
     """At its depth the contact minimises p C p / 2 - p (depth - height) over p >= 0: NNLS of a Cholesky factor."""
     rng = np.random.default_rng(3)
     compliance, height = small_body(), rng.uniform(0, 5, 49)
-    contact = solve_contact(ContactStiffness.of(compliance), height, mean_kpa=1.0)
+    contact = solve_contact(kind.of(compliance), height, mean_kpa=1.0)
     assert 0 < contact.touching.sum() < 49
     upper = np.linalg.cholesky(compliance).T
     other, _ = nnls(upper, np.linalg.solve(upper.T, contact.depth_mm - height))
