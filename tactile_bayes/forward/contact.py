@@ -225,10 +225,8 @@ def solve_contact(
         wrong_count = int(np.count_nonzero(wrong))
         if wrong_count == 0:
             return contact
-        if wrong_count < fewest:
-            fewest, patience = wrong_count, _PATIENCE
-        else:
-            patience -= 1
+        patience = _PATIENCE if wrong_count < fewest else patience - 1
+        fewest = min(fewest, wrong_count)
         guess = guess ^ (wrong if patience > 0 else np.arange(count) == np.flatnonzero(wrong)[-1])
         if not (guess & (share > 0)).any():
             guess[int(np.argmin(np.where(share > 0, height_mm, np.inf)))] = True
