@@ -34,7 +34,7 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from benchmarks.measure import environment
-from tactile_bayes.forward.contact import FactoredCompliance, HeadSection, solve_contact
+from tactile_bayes.forward.contact import FactoredCompliance, solve_contact
 from tactile_bayes.forward.mesh import Mesh, body_mesh
 from tactile_bayes.forward.plane import (
     build_line,
@@ -44,6 +44,7 @@ from tactile_bayes.forward.plane import (
     press,
     skin_average,
 )
+from tactile_bayes.forward.scene import HeadSection
 from tactile_bayes.forward.tissue import Body
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import MEAN_KPA

@@ -34,9 +34,8 @@ from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.size_json import DEFAULT, read_size_calibration, size_calibration_path
 from tactile_bayes.files.tables import csv_text, read_table
 from tactile_bayes.findings import finding_lines
-from tactile_bayes.forward.contact import HeadSection
 from tactile_bayes.forward.plane import outside_range
-from tactile_bayes.forward.scene import Head
+from tactile_bayes.forward.scene import Head, HeadSection
 from tactile_bayes.forward.tissue import parse_seat
 from tactile_bayes.mapping.select import scan_findings
 from tactile_bayes.options import CaseOptions, FieldCosines, SbcOptions, SectionOptions, StudyOptions

@@ -9,86 +9,8 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrs
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.errors import BadDataError, NotConvergedError, require
+from tactile_bayes.errors import BadDataError, NotConvergedError
 from tactile_bayes.geometry import BoolArray, FloatArray
-from tactile_bayes.presets import HEAD_PITCH_MM, HEAD_RADIUS_MM, HEAD_ROWS, HEADS, SHOULDER_MM, SHOULDERS_INSIDE
-
-# --- The head's cross-section.
-
-
-class HeadSection(Record):
-    """The head's cross-section: an arc with rounded shoulders.
-
-    The paper has "nearly a section of a circular cylinder" of 24 mm (section 2.1); radius and shoulders are assumed
-    (record 0075).
-    """
-
-    width_mm: float = HEAD_ROWS * HEAD_PITCH_MM  #: Width of the sensing part.
-    radius_mm: float = HEAD_RADIUS_MM  #: Radius of the arc; infinity for a flat head.
-    shoulder_mm: float = SHOULDER_MM  #: Radius of the round between arc and side, tangent to both; 0 for a sharp edge.
-    shoulders: str = SHOULDERS_INSIDE
-    """``"shoulders-inside"``: the rounds are cut into the sensing width, which is the whole face.
-    ``"shoulders-outside"``: the arc spans the sensing width, and the rounds lie around it, press and sense nothing."""
-
-    def __post_init__(self) -> None:
-        require(0 < self.width_mm < np.inf, "width_mm of the head", self.width_mm, "be above 0, in mm")
-        half = f"{self.half_width_mm:g} mm, half the head's width"
-        require(self.radius_mm > self.half_width_mm, "radius_mm of the head", self.radius_mm, f"be above {half}")
-        if self.shoulders not in HEADS:
-            what = f"shoulders of the head is {self.shoulders!r}"
-            raise BadDataError(what, way_out=f"it must be {' or '.join(HEADS)}")
-        shoulder, name = self.shoulder_mm, "shoulder_mm of the head"
-        fits = self.shoulders != SHOULDERS_INSIDE or 0 <= shoulder <= self.half_width_mm
-        require(fits, name, shoulder, f"be between 0 and {half}")
-        rule = f"be between 0 and below radius_mm, {self.radius_mm:g} mm"
-        require(0 <= shoulder < self.radius_mm, name, shoulder, rule)
-
-    @property
-    def half_width_mm(self) -> float:
-        """Half of the sensing width: w of Eq 1."""
-        return 0.5 * self.width_mm
-
-    @property
-    def half_face_mm(self) -> float:
-        """Half the width of the rigid face: the sensing width, plus the shoulders where they lie outside it."""
-        if self.shoulders == SHOULDERS_INSIDE:
-            return self.half_width_mm
-        return self.half_width_mm + self.shoulder_mm * (1 - self.half_width_mm / self.radius_mm)
-
-    def profile_mm(self, s_mm: FloatArray) -> FloatArray:
-        """Height of the head's face above its lowest point, at distances `s_mm` from its centre within the face."""
-        s = np.abs(np.asarray(s_mm, dtype=np.float64))
-        r, inner = self.shoulder_mm, self.half_face_mm - self.shoulder_mm
-        if np.isinf(self.radius_mm):
-            return np.where(s <= inner, 0.0, r - _circle(r, s - inner))
-        big = self.radius_mm
-        centre = float(_circle(big - r, np.array(inner)))
-        tangent = inner * big / (big - r)
-        return np.where(s <= tangent, big - _circle(big, s), big - centre - _circle(r, s - inner))
-
-    def cell_profile_mm(self, cell_mm: float) -> FloatArray:
-        """(n,) profile averaged over the cells of width `cell_mm` of the face, from left to right.
-
-        Cells around the sensing width belong to the face when their centres lie on a shoulder.
-        """
-        points, weights = np.polynomial.legendre.leggauss(6)
-        count = len(self.sensing_cells(cell_mm))
-        centres = cell_mm * (np.arange(count) - 0.5 * (count - 1))
-        return np.asarray(self.profile_mm(centres[:, None] + 0.5 * cell_mm * points) @ (0.5 * weights))
-
-    def sensing_cells(self, cell_mm: float) -> BoolArray:
-        """(n,) mask of the cells of the face, from left to right, that sense pressure; the others only press."""
-        count = round(self.width_mm / cell_mm)
-        fits = count >= 2 and abs(count * cell_mm - self.width_mm) <= 1e-9 * self.width_mm
-        require(fits, "cell_mm", cell_mm, f"divide the head's width of {self.width_mm:g} mm")
-        around = max(0, int(np.ceil((self.half_face_mm - self.half_width_mm) / cell_mm - 0.5 - 1e-9)))
-        return np.pad(np.ones(count, dtype=bool), around)
-
-
-def _circle(radius: float, x: FloatArray) -> FloatArray:
-    """Height of a circle about 0 at `x`; 0 beyond it."""
-    return np.sqrt(np.maximum(radius**2 - np.asarray(x) ** 2, 0.0))
-
 
 # --- Frictionless contact of a rigid head with an elastic surface, under a given force.
 #

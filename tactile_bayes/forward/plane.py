@@ -12,8 +12,9 @@ from scipy.optimize import minimize_scalar
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import BadDataError, require
 from tactile_bayes.forward.axisymmetric import skin_flexibility
-from tactile_bayes.forward.contact import FactoredCompliance, HeadSection, solve_contact
+from tactile_bayes.forward.contact import FactoredCompliance, solve_contact
 from tactile_bayes.forward.mesh import CondensedHole, Mesh, PartStiffness, body_mesh, quadrature, stiffness_factor
+from tactile_bayes.forward.scene import HeadSection
 from tactile_bayes.forward.tissue import Body, Layers
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray
 from tactile_bayes.presets import MEAN_KPA

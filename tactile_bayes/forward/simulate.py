@@ -13,9 +13,10 @@ from tactile_bayes.declarations import Record, as_dict, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward import mesh, plane
 from tactile_bayes.forward.axisymmetric import CondensedLump, condense_lump, skin_spline, taxel_compliance
-from tactile_bayes.forward.contact import Contact, ContactStiffness, HeadSection, solve_contact
+from tactile_bayes.forward.contact import Contact, ContactStiffness, solve_contact
 from tactile_bayes.forward.scene import (
     Head,
+    HeadSection,
     Scene,
     SimulatedScan,
     frame_times,
@@ -408,7 +409,7 @@ class HeadFace(Record, eq=False):
 def head_face(head: Head) -> HeadFace:
     """Taxels of a head, and squares whose centres lie on its rim: a quarter round, none with shoulders inside.
 
-    Across the head the face is a `contact.HeadSection` with its shoulders outside; along it the rim is tangent to a
+    Across the head the face is a `scene.HeadSection` with its shoulders outside; along it the rim is tangent to a
     line.
     """
     rows, columns, pitch_mm, radius_mm = head.rows, head.columns, head.pitch_mm, head.radius_mm

@@ -12,8 +12,8 @@ import numpy as np
 
 from tactile_bayes.declarations import as_dict, names_of
 from tactile_bayes.files.tables import csv_text
-from tactile_bayes.forward.contact import HeadSection
 from tactile_bayes.forward.plane import RANGE, outside_range
+from tactile_bayes.forward.scene import HeadSection
 from tactile_bayes.options import FieldCosines
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.figure_file import figure_file, finish

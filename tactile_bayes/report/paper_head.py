@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tactile_bayes.forward.contact import HeadSection
+from tactile_bayes.forward.scene import HeadSection
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE
 from tactile_bayes.report.figure_file import figure_file, finish, label

@@ -10,8 +10,7 @@ from tactile_bayes import presets
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward import plane
-from tactile_bayes.forward.contact import HeadSection
-from tactile_bayes.forward.scene import Scene
+from tactile_bayes.forward.scene import HeadSection, Scene
 from tactile_bayes.forward.simulate import felt_at_poses
 from tactile_bayes.geometry import FloatArray, inverse
 from tactile_bayes.mapping.build import build_map

@@ -13,7 +13,7 @@ from scipy.optimize import minimize_scalar
 from tactile_bayes.declarations import Record, as_dict, field, replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward import plane
-from tactile_bayes.forward.contact import HeadSection
+from tactile_bayes.forward.scene import HeadSection
 from tactile_bayes.forward.tissue import SEATS, Body, Layers
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.options import CaseOptions, TissueOptions

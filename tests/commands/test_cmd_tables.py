@@ -11,7 +11,7 @@ import pytest
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import EXIT_BAD_DATA
-from tactile_bayes.forward.contact import HeadSection
+from tactile_bayes.forward.scene import HeadSection
 from tactile_bayes.report.laboratory import heads_text, tables_document, tables_text
 from tactile_bayes.studies.model_comparison import (
     NEAREST_HEADS,

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward import contact
-from tactile_bayes.forward.contact import Contact, FactoredCompliance, HeadSection, solve_contact
+from tactile_bayes.forward.contact import Contact, FactoredCompliance, solve_contact
 from tactile_bayes.forward.plane import (
     SurfaceCompliance,
     build_line,
@@ -20,6 +20,7 @@ from tactile_bayes.forward.plane import (
     slide,
     surface_compliance,
 )
+from tactile_bayes.forward.scene import HeadSection
 from tactile_bayes.forward.tissue import Body, Layers
 
 DEEP = Layers(2000.0, 6000.0, gland_ratio=1.0)  # as good as a half-plane for loads of millimetres

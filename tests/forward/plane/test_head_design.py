@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 from tactile_bayes.cli import cli
 from tactile_bayes.errors import EXIT_USAGE, BadDataError, UsageError
-from tactile_bayes.forward.contact import HeadSection
+from tactile_bayes.forward.scene import HeadSection
 from tactile_bayes.presets import SHOULDERS_INSIDE, SHOULDERS_OUTSIDE
 from tactile_bayes.studies.paper import HomogeneousTissue, most_even, narrowest, search_heads, uniformity
 

@@ -14,9 +14,18 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.scan_mcap import read_scan_report
 from tactile_bayes.forward import scene as scene_types
-from tactile_bayes.forward.contact import HeadSection
 from tactile_bayes.forward.plane import condense, kappa, press, press_layers
-from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, Strokes, frame_times, head_poses, level_kpa
+from tactile_bayes.forward.scene import (
+    Background,
+    HeadSection,
+    Lump,
+    Noise,
+    Scene,
+    Strokes,
+    frame_times,
+    head_poses,
+    level_kpa,
+)
 from tactile_bayes.forward.simulate import PlaneSection, simulate
 from tactile_bayes.forward.tissue import Body, Layers, Rib, SceneBody, SolidLump
 

@@ -10,8 +10,8 @@ from tactile_bayes.actions.study import study_csv
 from tactile_bayes.cli import cli
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.forward.contact import HeadSection
 from tactile_bayes.forward.plane import TactileLine
+from tactile_bayes.forward.scene import HeadSection
 from tactile_bayes.inference.modes import fit_least_squares
 from tactile_bayes.posterior.bump import cell_mean_gaussian
 from tactile_bayes.presets import HEADS
