@@ -145,11 +145,11 @@ def _import(source: Path, output: Path, request: ImportRequest) -> list[str]:
 def _import_scan(source: Path, output: Path, request: ImportRequest) -> list[str]:
     lost: tuple[str, ...] = ()
     notes: list[str] = []
-    truth = None
+    truth, landmarks = None, request.scan_files.get("landmarks")
     if source.suffix.lower() == ".mcap":
         file = read_scan_report(source)
         scan, lost, truth = file.scan, file.lost, file.truth
-        if (landmarks := request.scan_files.get("landmarks")) is not None:
+        if landmarks is not None:
             scan = replace(scan, landmarks=imports.touched_landmarks(landmarks))
     else:
         parts = []
@@ -160,7 +160,7 @@ def _import_scan(source: Path, output: Path, request: ImportRequest) -> list[str
         notes.insert(0, _lengths(scan))
     settings = {"as": "scan", "lost": list(lost), "correct": list(request.corrections), **request.arrays.given}
     scan = corrected(with_session(scan, request.session_file), request.corrections)
-    if (landmarks := request.scan_files.get("landmarks")) is not None and landmarks.suffix.lower() == ".mcap":
+    if landmarks is not None and landmarks.suffix.lower() == ".mcap":
         refuse_other_exam(landmarks, read_scan(landmarks).session, scan.session)
     inputs = hash_inputs(source=source, session=request.session_file, **request.scan_files)
     write_scan(output, scan, provenance=Provenance("import", settings, inputs), truth=truth, force=request.force)
