@@ -143,6 +143,11 @@ def first_of(texts: Sequence[str], most: int, separator: str = ", ") -> str:
     return f"{separator.join(texts[:most])}{more}"
 
 
+def first_lines(lines: Sequence[str], most: int) -> list[str]:
+    """The first lines, and one with the number of the others."""
+    return [*lines[:most], *([f"And {len(lines) - most} more: -v."] if len(lines) > most else [])]
+
+
 def capitalised(text: str) -> str:
     """The text with a capital letter, to begin a sentence."""
     return f"{text[0].upper()}{text[1:]}"

@@ -11,7 +11,7 @@ from scipy.special import ndtri
 from tactile_bayes.declarations import UNSET, Meta, Record, UnsetType
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import Chance, EstimateReport, Findings, Interval, Judgement, Number1, Report
-from tactile_bayes.findings import capitalised, finding_lines, finding_summary
+from tactile_bayes.findings import capitalised, finding_lines, finding_summary, first_lines
 from tactile_bayes.findings import verdict as verdict_of
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.options import CompareOptions, NonNegative, Positive
@@ -312,7 +312,7 @@ def compare_summary(report: CompareReport) -> str:
         more = [MORE]
     else:
         bare = [(visit.visit, one.reason) for visit in visits for one in visit.maps if one.status != "estimate"]
-        lines += [f"Visit {number}: {reason}." for number, reason in bare[:4]]
+        lines += first_lines([f"Visit {number}: {reason}." for number, reason in bare], 4)
     return "\n".join([*lines, *finding_summary(report.findings, "check", most=2), *more, RESEARCH_USE]) + "\n"
 
 

@@ -9,7 +9,16 @@ import numpy as np
 from tactile_bayes.declarations import UNSET
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
 from tactile_bayes.files.reports import POOLED, EstimateReport, Interval, MassReport, PooledMap, PooledReport
-from tactile_bayes.findings import Finding, capitalised, finding, finding_lines, finding_summary, first_of, verdict
+from tactile_bayes.findings import (
+    Finding,
+    capitalised,
+    finding,
+    finding_lines,
+    finding_summary,
+    first_lines,
+    first_of,
+    verdict,
+)
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.presets import MATCH_MM, RESEARCH_USE
@@ -200,7 +209,8 @@ def pooled_summary(report: PooledReport) -> str:
     lines += finding_summary(findings, "check", most=2)
     if largest is None:
         lines.append(_no_size_line(report))
-        lines += [f"Map {i}: {one.reason}." for i, one in enumerate(report.maps, 1) if one.max_size_mm is None][:4]
+        bare = [f"Map {i}: {one.reason}." for i, one in enumerate(report.maps, 1) if one.max_size_mm is None]
+        lines += first_lines(bare, 4)
     else:
         lines += estimate_text.size_table(report) + estimate_text.width_lines(report.leading.variance_share or {})
         parts = [

@@ -120,6 +120,7 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
 
     fat_mm: float | None = None  #: Depth F of the mass that this calibration is for; None where it is not known.
     fat_note: str = ""  #: Why the depth is not used though the calibration could; empty otherwise.
+    unlike: tuple[float, float] | None = None  #: Amplitude and mean width in mm of the map that `fat_note` is of.
     site: SiteShift | None = None  #: Correction by a site's own phantoms.
 
     def __repr__(self) -> str:
@@ -153,7 +154,7 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         if self.fat_mm is None or self.leverage(amplitude, sigma_mm) <= terms.MOST_LEVERAGE:
             return self
         why = f"{_pair(amplitude, sigma_mm)} over {self.fat_mm:.3g} mm of fat is unlike the bodies of the table"
-        return self._without_depth(why).widened_for_atypical_body()
+        return replace(self._without_depth(why).widened_for_atypical_body(), unlike=(amplitude, sigma_mm))
 
     def for_maps(self, maps: Sequence[ShapeDraws]) -> BodyCalibration:
         """The calibration at the depth of fat estimated from a mass's maps, if all lie in its table there."""
@@ -274,10 +275,10 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         sigma_mm = mean_width_mm(sigma_x_mm, sigma_y_mm)
         texts = terms.outside_domain(self.domain, amplitude, sigma_mm, far=far)
         most = FARTHEST_LEVERAGE if far else terms.MOST_LEVERAGE
-        pair = _pair(amplitude, sigma_mm)
         if not texts and (leverage := self.leverage(amplitude, sigma_mm)) > most:
+            pair = _pair(amplitude, sigma_mm)
             texts = [f"{pair}, a pair unlike those of the table (leverage {leverage:.1f} times the limit)"]
-        if not far and self.fat_note.startswith(pair):  # of this map, not of another one of the mass
+        if not far and self.unlike == (amplitude, sigma_mm):
             texts.append(f"{self.fat_note}, so that depth is not used")
         return texts
 

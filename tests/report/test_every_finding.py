@@ -47,7 +47,7 @@ from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.mapping.select import scan_findings
 from tactile_bayes.report.campaign_page import ExamEntry, MassEntry, VisitEntry, campaign_html
-from tactile_bayes.report.compare import compare_summary, compare_text, growths
+from tactile_bayes.report.compare import VisitMap, compare_summary, compare_text, growths
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.growth_page import DrawnMap, draw_comparison
 from tactile_bayes.report.map import map_figure, map_summary, map_text
@@ -56,6 +56,7 @@ from tactile_bayes.report.pooled import pooled_summary, pooled_text
 
 FAST = Settings(method="laplace")
 SCANS = ({"sha256": "ab" * 32, "side": "right", "posture": "supine"},)
+NO_LUMP = VisitMap("b.nc", "no_estimate", "no lump found", 0.1)
 
 
 def one_of(kind: str) -> Finding:
@@ -377,6 +378,15 @@ def test_what_speaks_against_a_map_reaches_pool_comparison_and_campaign(tmp_path
         told = {row["file"]: (row["verdict"], sentence.format("") in row["findings"]) for row in csv.DictReader(lines)}
     assert told == {"1.nc": ("sound", False), "2.nc": ("doubtful", True)}
     assert "words for late_poses" in (tmp_path / "out" / "index.html").read_text()
+
+
+def test_maps_without_a_size_that_are_not_listed_are_counted() -> None:
+    _, pooled, compared = sound()
+    one, visit = pooled.pooled_report.maps[0], compared.report.visits[0]
+    bare = replace(pooled.pooled_report, max_size_mm=None, maps=(replace(one, max_size_mm=None),) * 6)
+    apart = replace(compared.report, status="no_estimate", visits=(replace(visit, maps=(NO_LUMP,) * 6),))
+    for text in (pooled_summary(bare), compare_summary(apart)):
+        assert "And 2 more: -v." in text
 
 
 def test_a_mass_whose_visits_were_not_compared_keeps_what_speaks_against_them() -> None:

@@ -169,9 +169,9 @@ def correct_calibration(
 
 def _misfit(applied: BodyCalibration, maps: Sequence[PhantomMap]) -> str:
     """Reason why a phantom is left out; empty where it is used."""
-    note = applied.fat_note  # beyond the depth's range it is sized without the depth, as any map is
+    applied = replace(applied, unlike=None)  # beyond the depth's range it is sized without the depth, as any map is
     for one in maps:
-        if outside := [text for text in applied.outside(*one.shape.middle) if not (note and text.startswith(note))]:
+        if outside := applied.outside(*one.shape.middle):
             return "; ".join(outside)
     return ""
 
