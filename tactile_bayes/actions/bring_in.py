@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,12 +15,12 @@ from tactile_bayes.errors import EXIT_DONE, BadDataError, TactileBayesError, Usa
 from tactile_bayes.files import imports
 from tactile_bayes.files.arrays_layout import ArrayMap, GridOptions, Stated
 from tactile_bayes.files.atomic import check_suffix, refuse_existing, refuse_same
-from tactile_bayes.files.documents import with_session
+from tactile_bayes.files.documents import read_session
 from tactile_bayes.files.grids import import_grid
 from tactile_bayes.files.map_nc import write_map
-from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, array_template, read_array_map
+from tactile_bayes.files.named_arrays import ARRAY_SUFFIXES, Source, array_template, read_array_map
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.scan_mcap import read_scan, read_scan_report, refuse_other_exam, write_scan
+from tactile_bayes.files.scan_mcap import read_scan_report, touched_landmarks, write_scan
 from tactile_bayes.findings import LEADS, finding_lines
 from tactile_bayes.mapping.arrangement import check_scan
 from tactile_bayes.mapping.convention import corrected
@@ -30,11 +30,8 @@ from tactile_bayes.report.map import describe_scan
 from tactile_bayes.scans import Scan
 from tactile_bayes.shell import progress_bar
 
-_SCAN_FILES: Final = {
-    "head_geometry": imports.head_source,
-    "array_calibration": imports.calibration_source,
-    "landmarks": imports.landmark_source,
-}
+_SCAN_FILES: Final = ("poses", "head_geometry", "array_calibration", "landmarks")
+"""Options of files beside the frames'; a later one stands for an earlier."""
 
 
 class ImportRequest(Record):
@@ -77,7 +74,7 @@ def import_action(
         raise UsageError(f"Missing {'option -o' if sources else 'argument SRC'}; `import --help` has examples")
     stated = Stated(**{name: options.pop(name) for name in names_of(Stated)})
     arrays = replace(ArrayMap() if columns is None else read_array_map(columns), **stated.given)
-    scan_files = {name: path for name in ("poses", *_SCAN_FILES) if (path := options.pop(name)) is not None}
+    scan_files = {name: path for name in _SCAN_FILES if (path := options.pop(name)) is not None}
     grid = GridOptions(**{name: options.pop(name) for name in names_of(GridOptions)})
     request = ImportRequest(**options, grid=grid, arrays=arrays, scan_files=scan_files)
     if len(sources) == 1 and not is_folder(output):
@@ -145,23 +142,24 @@ def _import(source: Path, output: Path, request: ImportRequest) -> list[str]:
 def _import_scan(source: Path, output: Path, request: ImportRequest) -> list[str]:
     lost: tuple[str, ...] = ()
     notes: list[str] = []
-    truth, landmarks = None, request.scan_files.get("landmarks")
+    truth, facts = None, read_session(request.session_file)
     if source.suffix.lower() == ".mcap":
         file = read_scan_report(source)
         scan, lost, truth = file.scan, file.lost, file.truth
-        if landmarks is not None:
-            scan = replace(scan, landmarks=imports.touched_landmarks(landmarks))
+        if landmarks := request.scan_files.get("landmarks"):
+            scan = replace(scan, landmarks=touched_landmarks(landmarks, {**scan.session, **facts}))
     else:
-        parts = []
-        for name, path in request.scan_files.items():
-            part = imports.pose_source(path, request.arrays) if name == "poses" else _SCAN_FILES[name](path)
-            parts.append(replace(part, path=str(path)))
+        readers: dict[str, Callable[[Path], Source]] = {
+            "poses": lambda path: imports.pose_source(path, request.arrays),
+            "head_geometry": imports.head_source,
+            "array_calibration": imports.calibration_source,
+            "landmarks": lambda path: imports.landmark_source(touched_landmarks(path, facts)),
+        }
+        parts = [replace(readers[name](path), path=str(path)) for name, path in request.scan_files.items()]
         scan, notes = imports.import_arrays(source, request.arrays, parts)
         notes.insert(0, _lengths(scan))
     settings = {"as": "scan", "lost": list(lost), "correct": list(request.corrections), **request.arrays.given}
-    scan = corrected(with_session(scan, request.session_file), request.corrections)
-    if landmarks is not None and landmarks.suffix.lower() == ".mcap":
-        refuse_other_exam(landmarks, read_scan(landmarks).session, scan.session)
+    scan = corrected(replace(scan, session={**scan.session, **facts}), request.corrections)
     inputs = hash_inputs(source=source, session=request.session_file, **request.scan_files)
     write_scan(output, scan, provenance=Provenance("import", settings, inputs), truth=truth, force=request.force)
     return [*describe_scan(scan), *notes, *(f"lost: {line}" for line in lost), *_arrangement_lines(scan)]

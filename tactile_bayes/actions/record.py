@@ -24,9 +24,9 @@ from tactile_bayes.declarations import as_dict, default_of, field
 from tactile_bayes.errors import EXIT_DONE, EXIT_INTERRUPTED, DeviceError, UsageError, check_number
 from tactile_bayes.files.atomic import refuse_existing, unwritable
 from tactile_bayes.files.documents import check_session, read_session
-from tactile_bayes.files.instrument import read_array_calibration, read_head_geometry, read_landmarks
+from tactile_bayes.files.instrument import read_array_calibration, read_head_geometry
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.scan_mcap import RecordingWriter, create_exclusive, full_disk, read_scan, refuse_other_exam
+from tactile_bayes.files.scan_mcap import RecordingWriter, create_exclusive, full_disk, read_scan, touched_landmarks
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.hardware import head
 from tactile_bayes.hardware.ports import SILENT_S, Port, read_in_process
@@ -51,7 +51,7 @@ class Request(RecordOptions, kw_only=True):
 
     def facts(self) -> dict[str, str]:
         """Session facts as text: from the file, overridden by options."""
-        facts = read_session(self.session_file) if self.session_file else {}
+        facts = read_session(self.session_file)
         for name in ("side", "posture", "lubricant", "examiner", "subject"):
             if value := getattr(self, name):
                 check_session({name: value}, path=Path(f"--{name}"))
@@ -80,7 +80,9 @@ class Request(RecordOptions, kw_only=True):
         }
 
 
-def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration | None, str, Landmarks | None]:
+def instrument_of(
+    request: Request, facts: dict[str, str]
+) -> tuple[HeadGeometry, ElementCalibration | None, str, Landmarks | None]:
     """Geometry, calibration, its head if --like gives it, and landmarks; `UsageError` where a file is missing.
 
     Without a calibration is --uncalibrated: the head's own full scale is needed for one.
@@ -101,7 +103,9 @@ def instrument_of(request: Request) -> tuple[HeadGeometry, ElementCalibration | 
         calibration, owner = like.element_calibration, like.session.get("head_id", "")
     else:
         raise UsageError("the array's calibration is missing; give --array-calibration, --like or --uncalibrated")
-    return head, calibration, owner, _landmarks(request)
+    session = {**facts, "reference": request.reference or ""}
+    landmarks = None if request.landmarks is None else touched_landmarks(request.landmarks, session)
+    return head, calibration, owner, landmarks
 
 
 def calibration_age(request: Request, *, head_id: str, today: date) -> dict[str, str]:
@@ -119,22 +123,6 @@ def calibration_age(request: Request, *, head_id: str, today: date) -> dict[str,
     if fault and not request.accept_calibration:
         raise UsageError(f"{request.array_calibration} {fault}, or give --accept-calibration")
     return {"array_calibration_days": str(age)}
-
-
-def _landmarks(request: Request) -> Landmarks | None:
-    if request.landmarks is None:
-        return None
-    if request.landmarks.suffix.lower() != ".mcap":
-        return read_landmarks(request.landmarks)
-    scan = read_scan(request.landmarks)
-    if scan.landmarks is None:
-        raise UsageError(f"{request.landmarks} holds no landmarks; give a scan whose landmarks were touched")
-    reference = scan.session.get("reference", "")
-    if bool(reference) != bool(request.reference):
-        frame = f"relative to the tool {reference!r}" if reference else "of the tracker's own frame"
-        raise UsageError(f"the landmarks of {request.landmarks} are {frame}; record with the same --reference")
-    refuse_other_exam(request.landmarks, scan.session, request.facts())
-    return scan.landmarks
 
 
 @contextmanager
@@ -273,8 +261,8 @@ def make_recording(request: Request) -> tuple[RecordingReport, bool]:
     if request.tracker_url == request.head_url:
         raise UsageError(f"--head and --tracker are both {request.head_url}; give two ports")
     refuse_existing(request.output, force=request.force)
-    head, given, owner, landmarks = instrument_of(request)
     facts = request.facts()
+    head, given, owner, landmarks = instrument_of(request, facts)
     with ExitStack() as after, ExitStack() as stack:
         hello, lines, follower = _connect(request, stack)
         _check_fit(hello, head, request)

@@ -40,7 +40,7 @@ def simulate_action(
 ) -> None:
     """Make a scan with known truth from SCENE, a TOML file."""
     stated = read_scene(scene)
-    session = {} if session_file is None else read_session(session_file)
+    session = read_session(session_file)
     inputs = hash_inputs(scene=scene, session=session_file)
     for lump in stated.solid_lumps if fidelity == "empirical" else ():
         if warning := outside_range(lump.d_mm, lump.depth_ratio):

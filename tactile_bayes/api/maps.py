@@ -26,7 +26,7 @@ from tactile_bayes.errors import UsageError, check_choice, check_number
 from tactile_bayes.files import imports, scan_mcap
 from tactile_bayes.files.arrays_layout import ArrayMap, GridOptions, Stated
 from tactile_bayes.files.atomic import sha256
-from tactile_bayes.files.documents import with_session
+from tactile_bayes.files.documents import read_session
 from tactile_bayes.files.grids import GRID_SUFFIXES, grid_map, import_grid
 from tactile_bayes.files.instrument import head_geometry, read_scene, scene_of
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
@@ -401,7 +401,8 @@ def scan(
     times = Source({} if time is None else {"frame_time_s": _array(time)})
     if time is not None and layout.time_unit is None:
         layout = replace(layout, time_unit="s")  # whatever unit a file has
-    others = [times, _poses(poses, layout), _head(head), _calibration(calibration), _landmarks(landmarks)]
+    facts = read_session(path_of(session))
+    others = [times, _poses(poses, layout), _head(head), _calibration(calibration), _landmarks(landmarks, facts)]
     if isinstance(frames, str | Path):
         imported, _ = imports.import_arrays(path_of(frames), layout, others)
     else:
@@ -411,7 +412,7 @@ def scan(
         imported, _ = imports.combine_sources([Source(arrays), *others], layout)
     for line in finding_lines(imported.findings):
         warnings.warn(line, stacklevel=4)
-    return corrected(with_session(imported, path_of(session)), corrections)
+    return corrected(replace(imported, session={**imported.session, **facts}), corrections)
 
 
 def _array(values: Any) -> Any:
@@ -461,8 +462,12 @@ def _calibration(calibration: Any) -> Source:
     return _source_of("calibration", calibration, ElementCalibration, imports.calibration_source, part=part)
 
 
-def _landmarks(landmarks: Any) -> Source:
-    points = None if landmarks is None or isinstance(landmarks, str | Path | Landmarks | Scan) else _array(landmarks)
+def _landmarks(landmarks: Any, facts: Mapping[str, str]) -> Source:
+    if isinstance(landmarks, str | Path):
+        landmarks = scan_mcap.touched_landmarks(path_of(landmarks), facts)
+    elif isinstance(landmarks, Scan | SimulatedScan):
+        landmarks = scan_mcap.touched_landmarks(as_scan(landmarks), facts)
+    points = None if landmarks is None or isinstance(landmarks, Landmarks) else _array(landmarks)
     if points is not None and points.shape in ((2, 3), (3, 3)):
         return Source({"landmarks_mm": points[:2], **({"nipple_mm": points[2]} if len(points) == 3 else {})})
     return _source_of("landmarks", landmarks, Landmarks, imports.landmark_source)

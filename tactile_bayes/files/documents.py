@@ -13,11 +13,10 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
-from tactile_bayes.declarations import Meta, Record, field, from_plain, names_of, replace, schema_name, short_repr
+from tactile_bayes.declarations import Meta, Record, field, from_plain, names_of, schema_name, short_repr
 from tactile_bayes.errors import BadDataError, in_file, suggestion
 from tactile_bayes.files import reading
 from tactile_bayes.options import Posture, Side, TrialSettings
-from tactile_bayes.scans import Scan
 
 # --- The schemas in data_schema/, from a wheel or a checkout.
 
@@ -236,13 +235,10 @@ def check_session(session: Mapping[str, object], *, path: Path) -> None:
     parse_record(dict(session), dict[FactName, Fact], path=path)
 
 
-def with_session(scan: Scan, path: Path | None) -> Scan:
-    """The scan with a session file's facts in place of its own; for the errors see `read_session`."""
-    return scan if path is None else replace(scan, session={**scan.session, **read_session(path)})
-
-
-def read_session(path: Path) -> dict[str, str]:
-    """Read the session facts."""
+def read_session(path: Path | None) -> dict[str, str]:
+    """Read the session facts; none without a file."""
+    if path is None:
+        return {}
     document = load_toml(path, way_out='give facts as TOML: side = "left"')
     for key in SET_BY_RECORDING:
         if key in document:

@@ -17,11 +17,10 @@ from tactile_bayes import scans
 from tactile_bayes.declarations import names_of, replace
 from tactile_bayes.errors import BadDataError, in_file, suggestion
 from tactile_bayes.files.arrays_layout import KNOWN, LAYOUT, OPTIONAL, ArrayMap, Stated, in_words
-from tactile_bayes.files.instrument import LEAST_STERNUM_MM, read_array_calibration, read_head_geometry, read_landmarks
+from tactile_bayes.files.instrument import LEAST_STERNUM_MM, read_array_calibration, read_head_geometry
 from tactile_bayes.files.named_arrays import Source, is_text, plain_names, read_named
 from tactile_bayes.files.npz import Arrays
 from tactile_bayes.files.reading import kind_of
-from tactile_bayes.files.scan_mcap import read_scan
 from tactile_bayes.files.scan_text import is_identity, read_frames, read_poses, visible_poses
 from tactile_bayes.files.sequence_mha import is_sequence, read_sequence
 from tactile_bayes.findings import Finding, finding
@@ -137,17 +136,8 @@ def calibration_source(calibration: Path | scans.ElementCalibration) -> Source:
     return Source({name: np.asarray(getattr(calibration, name)) for name in names_of(calibration)})
 
 
-def touched_landmarks(path: Path) -> scans.Landmarks:
-    """Landmarks from a JSON file or another scan."""
-    landmarks = read_scan(path).landmarks if path.suffix.lower() == ".mcap" else read_landmarks(path)
-    if landmarks is None:
-        raise BadDataError("holds no landmarks", way_out="give another scan, or a JSON file", path=str(path))
-    return landmarks
-
-
-def landmark_source(landmarks: Path | scans.Landmarks) -> Source:
+def landmark_source(landmarks: scans.Landmarks) -> Source:
     """Arrays of the landmarks."""
-    landmarks = touched_landmarks(landmarks) if isinstance(landmarks, Path) else landmarks
     nipple = {} if landmarks.nipple_mm is None else {"nipple_mm": landmarks.nipple_mm}
     return Source({"landmarks_mm": np.stack([landmarks.sternal_notch_mm, landmarks.xiphoid_mm]), **nipple})
 

@@ -25,7 +25,7 @@ from tactile_bayes.declarations import Record, as_dict, from_plain
 from tactile_bayes.errors import BadDataError, UsageError, in_file
 from tactile_bayes.files.atomic import atomic_path, refuse_existing
 from tactile_bayes.files.documents import check_session, parse_json
-from tactile_bayes.files.instrument import calibration_document, head_document
+from tactile_bayes.files.instrument import calibration_document, head_document, read_landmarks
 from tactile_bayes.files.mcap_records import McapRecords, Messages, read_records
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.findings import Finding, finding, findings_in
@@ -228,12 +228,23 @@ def read_scan(path: Path) -> scans.Scan:
     return file.scan
 
 
-def refuse_other_exam(path: Path, theirs: Mapping[str, str], ours: Mapping[str, str]) -> None:
-    """Refuse the landmarks of a scan whose session names another patient or visit than ours."""
+def touched_landmarks(source: Path | scans.Scan, session: Mapping[str, str]) -> scans.Landmarks:
+    """Landmarks of a JSON file or another scan, which is to be of this session's patient, visit and frame."""
+    if isinstance(source, Path) and source.suffix.lower() != ".mcap":
+        return read_landmarks(source)
+    scan = read_scan(source) if isinstance(source, Path) else source
+    whose = f"the landmarks of {source}" if isinstance(source, Path) else "the landmarks"
+    if scan.landmarks is None:
+        raise UsageError(f"{whose} were not touched; give another scan, or a JSON file")
     for name in ("subject", "visit"):
-        if theirs.get(name) and ours.get(name) and theirs[name] != ours[name]:
-            fault = f"the landmarks of {path} are of {name} {theirs[name]}, this is {ours[name]}"
-            raise UsageError(f"{fault}; touch them anew, or leave them out")
+        theirs, ours = scan.session.get(name), session.get(name)
+        if theirs and ours and theirs != ours:
+            raise UsageError(f"{whose} are of {name} {theirs}, this is {ours}; touch them anew, or leave them out")
+    reference = scan.session.get("reference", "")
+    if bool(reference) != bool(session.get("reference")):
+        frame = f"relative to the tool {reference!r}" if reference else "of the tracker's own frame"
+        raise UsageError(f"{whose} are {frame}; touch them with the same --reference")
+    return scan.landmarks
 
 
 class ScanFile(Record, eq=False):

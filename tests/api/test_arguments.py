@@ -97,7 +97,7 @@ CALLS: dict[str, tuple[Callable[..., Any], str]] = {
     ),
     "landmarks of a scan without": (
         lambda _: tb.scan(np.ones((2, 3, 3)), landmarks=replace(tb.demo_scan(), landmarks=None)),
-        "landmarks is NoneType; give a path, or that of another scan",
+        "the landmarks were not touched; give another scan, or a JSON file",
     ),
     "landmarks of no kind": (lambda _: tb.scan(np.ones((2, 3, 3)), landmarks=3), "landmarks is int; give a path, or"),
     "a correction as text": (

@@ -14,7 +14,10 @@ import pytest
 from in_process import run_here
 
 import tactile_bayes
+import tactile_bayes as tb
 from tactile_bayes.commands.exam import import_command as command
+from tactile_bayes.declarations import replace
+from tactile_bayes.errors import UsageError
 from tactile_bayes.files.arrays_layout import LAYOUT, in_words
 from tactile_bayes.files.map_nc import read_map
 from tactile_bayes.files.scan_mcap import read_scan, read_scan_report
@@ -48,6 +51,16 @@ def test_landmarks_of_a_scan_are_corrected(run_cli: Run, tmp_path: Path) -> None
         done = run_cli("import", DEMO, *words, cwd=tmp_path)
     assert "the landmarks of P1.mcap are of subject P1, this is P2" in done.stderr
     assert not (tmp_path / "P2.mcap").exists()
+
+
+def test_python_takes_landmarks_of_the_same_patient_and_frame_only(tmp_path: Path) -> None:
+    demo = tb.demo_scan()
+    arrays = {"head": demo, "calibration": demo, "poses": demo.poses}
+    (tmp_path / "s.toml").write_text('subject = "P2"\n')
+    for fact, words in (("subject", "are of subject P1, this is P2"), ("reference", "relative to the tool 'P1'")):
+        given = replace(demo, session={fact: "P1"})
+        with pytest.raises(UsageError, match=f"the landmarks .*{words}"):
+            tb.scan(demo.frames.counts, demo.frames.time_s, landmarks=given, session=tmp_path / "s.toml", **arrays)
 
 
 def test_a_grid_becomes_a_map(run_cli: Run, tmp_path: Path) -> None:

@@ -395,7 +395,7 @@ def test_frames_of_poses_are_not_mixed(tmp_path):
         build_map([scan, fixed], every=8)
     write_scan(tmp_path / "fixed.mcap", fixed, provenance=Provenance("test", {}))
     given = {"head": "loop://head", "tracker": "loop://tracker", "like": tmp_path / "fixed.mcap", "duration_s": 1.0}
-    with pytest.raises(UsageError, match="are relative to the tool 'Sternum'; record with the same reference"):
+    with pytest.raises(UsageError, match="are relative to the tool 'Sternum'; touch them with the same reference"):
         tb.record(tmp_path / "a.mcap", landmarks=tmp_path / "fixed.mcap", **given)
 
 
