@@ -54,8 +54,12 @@ _HELP: Final = "`tactile-bayes import --help` says what they are"
 
 
 def read_arrays(path: Path) -> scans.Scan:
-    """Read a scan from a file of arrays with the layout's names."""
-    return import_arrays(path, ArrayMap())[0]
+    """Read a scan from a file of arrays with the layout's names, for a command without the options of `import`."""
+    try:
+        return import_arrays(path, ArrayMap())[0]
+    except BadDataError as error:
+        of_import = " (options of `import`: list the scan that it makes)" if "--" in error.way_out else ""
+        raise BadDataError(error.what, way_out=f"{error.way_out}{of_import}", path=error.path) from None
 
 
 def import_arrays(path: Path, options: ArrayMap, others: Sequence[Source] = ()) -> tuple[scans.Scan, list[str]]:

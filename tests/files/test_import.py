@@ -65,7 +65,11 @@ FAULTS: list[tuple[str, Callable[[Arrays], object], str]] = [
     ("shape", put("counts", lambda c: c[:, 0]), r"counts has shape \(20, 26\)"),
     ("length", put("frame_time_s", lambda t: t[:-1]), r"frame_time_s has shape \(19,\).*n = 20 as in counts"),
     ("empty", lambda a: a.update(position_mm=a["position_mm"][:0]), r"position_mm is empty"),
-    ("fractions", put("counts", lambda c: c + 0.5), "counts holds .*which is no raw reading.*--unit kPa"),
+    (
+        "fractions",
+        put("counts", lambda c: c + 0.5),
+        "counts holds .*which is no raw reading.*--unit kPa .options of `import`: list",
+    ),
     ("counts high", put("counts", lambda c: c.astype(np.int64) + 65535), "counts holds"),
     ("counts low", put("counts", lambda c: c.astype(np.int64) - 5000), "counts holds -"),
     ("text", put("offset_kpa", lambda o: o.astype(str)), "offset_kpa is <U"),
@@ -86,7 +90,7 @@ FAULTS: list[tuple[str, Callable[[Arrays], object], str]] = [
     ("landmarks in m", put("landmarks_mm", lambda p: p / 1000), "landmarks_mm.*metres or inches, give mm"),
     ("gain in Pa", put("gain_kpa_per_count", lambda g: g * 1000), "gain_kpa_per_count.*Pa or MPa"),
     ("time in ms", put("frame_time_s", lambda t: t * 1000), "frame_time_s steps by 5.*milliseconds"),
-    ("two clocks", put("pose_time_s", lambda t: t + 100), r"do not overlap.*poses' times$"),
+    ("two clocks", put("pose_time_s", lambda t: t + 100), r"do not overlap.*poses' times .options"),
     ("time zones", put("pose_time_s", lambda t: t + 7200), "do not overlap.*is it -7200, of a time zone"),
     (
         "whole seconds",
