@@ -46,7 +46,7 @@ MOST_SATURATED, MOST_DROPPED = 0.02, 0.2
 """Share of the readings at full scale, and of the frames left out for saturated or faulty taxels."""
 MOST_CUT: Final = 0.02
 """Share of the readings at the lowest count, where that lies far below the rest: in 50 right scans 0.001 at most."""
-LEAST_OF_BESIDE: Final = 0.75  #: Least reading of a row over the mean of those beside it: 0.95 in 66 right scans.
+LEAST_OF_BESIDE: Final = 0.75  #: Of a row or column, over the mean of those beside it: 0.95 in 66 right scans.
 COARSEST_COUNT: Final = 0.1  #: One count over the mean pressure: a lump's rise is a few tenths of it.
 WRAPPED: Final = 2000  #: Readings this near to 65,536 are below 0, or no value.
 LANDMARKS_MM: Final = (80.0, 350.0)  #: Distance from the sternal notch to the xiphoid.
@@ -178,20 +178,21 @@ def _geometry(part: SelectedFrames) -> Iterator[tuple[str, float]]:
     far_below = 2 * int(readings[0]) < float(np.median(working))
     if far_below and lowest > max(int(times[1:4].sum()), MOST_CUT * working.size):
         yield "cut_share", lowest / working.size
-    yield from _weakest_row(part, sample)
+    yield from _weakest_lines(part, sample)
     step = int(np.gcd.reduce(np.diff(present.astype(np.int64)))) if len(present) > 1 else 0
     gain = float(np.median(part.scan.element_calibration.gain_kpa_per_count[part.good_taxels]))
     yield "count_share", step * gain / float(np.median(level))
 
 
-def _weakest_row(part: SelectedFrames, sample: NDArray[np.uint16]) -> Iterator[tuple[str, float]]:
-    """Least reading of a row over the mean of the rows beside it, below `LEAST_OF_BESIDE`, in a sample of frames."""
+def _weakest_lines(part: SelectedFrames, sample: NDArray[np.uint16]) -> Iterator[tuple[str, float]]:
+    """Least reading of a row, and of a column, over the mean of those beside it, where below `LEAST_OF_BESIDE`."""
     good, mean_kpa = part.good_taxels, part.scan.element_calibration.linear_kpa(sample.mean(axis=0))
-    level = (good * mean_kpa).sum(axis=1) / good.sum(axis=1).clip(1)
-    row, beside = level[1:-1], (level[:-2] + level[2:]) / 2
-    share = np.divide(row, beside, out=np.ones_like(row), where=(row > 0) & (beside > 0))  # 0 where all is left out
-    if len(share) and share.min() < LEAST_OF_BESIDE:
-        yield "weakest_row_share", float(share.min())
+    for across, name in ((1, "row"), (0, "column")):
+        level = (good * mean_kpa).sum(axis=across) / good.sum(axis=across).clip(1)
+        line, beside = level[1:-1], (level[:-2] + level[2:]) / 2
+        share = np.divide(line, beside, out=np.ones_like(line), where=(line > 0) & (beside > 0))  # 0: all is left out
+        if len(share) and share.min() < LEAST_OF_BESIDE:
+            yield f"weakest_{name}_share", float(share.min())
 
 
 def scan_doubts(selection: SelectedFrames, *, pressure_window_kpa: tuple[float, float]) -> tuple[Finding, ...]:
@@ -312,10 +313,10 @@ def _unusual(quality: Mapping[str, float]) -> Iterator[tuple[str, str]]:
     if quality.get("repeated_share", 0.0) > MOST_REPEATED and quality.get("frozen_share", 0.0) <= MOST_FROZEN:
         share = 100 * quality["repeated_share"]
         yield f"{share:.0f} % of the frames repeat the one before: the array is slower than its clock says", ""
-    if "weakest_row_share" in quality:
-        share = 100 * quality["weakest_row_share"]
-        text = f"one of the array's rows reads {share:.0f} % of what the rows beside it read: the size may be wrong"
-        yield text, "have the array calibrated"
+    for name in ("row", "column"):
+        if share := quality.get(f"weakest_{name}_share"):
+            what = f"one of the array's {name}s reads {100 * share:.0f} % of what the {name}s beside it read"
+            yield f"{what}: the size may be wrong", "have the array calibrated"
     apart, reach = quality.get("landmark_distance_mm"), quality.get("landmark_reach_mm", 0.0)
     in_base = "check that landmarks are in the tracker's base frame, in mm"
     if apart is not None and not LANDMARKS_MM[0] <= apart <= LANDMARKS_MM[1]:

@@ -61,6 +61,11 @@ def half_a_row(values: np.ndarray) -> np.ndarray:
     return values
 
 
+def half_a_column(values: np.ndarray) -> np.ndarray:
+    values[:, :, 3] //= 2
+    return values
+
+
 def frozen(values: np.ndarray) -> np.ndarray:
     values[150:350] = values[150]
     return values
@@ -188,6 +193,7 @@ def test_a_map_without_a_lump_says_so_where_nothing_stands_against_it() -> None:
 
 UNUSUAL: dict[str, tuple[Callable[[Scan], Scan], str]] = {
     "a row of half the gain": (counts(half_a_row), "one of the array's rows reads 50 % of what"),
+    "a column of half the gain": (counts(half_a_column), "one of the array's columns reads 50 % of what"),
     "a slow array read often": (counts(lambda c: np.repeat(c[::5], 5, axis=0)), "repeat the one before"),
     "each frame twice": (counts(lambda c: np.repeat(c[::2], 2, axis=0)), "repeat the one before"),
     "wrapped below 0": (
