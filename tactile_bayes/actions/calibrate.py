@@ -30,6 +30,7 @@ from tactile_bayes.report.study import eq6_figure
 from tactile_bayes.scans import Scan
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.bodies import BodyCalibration
+from tactile_bayes.size.eq6 import SizeCalibration
 
 
 def calibrate_array_action(
@@ -108,21 +109,21 @@ def calibrate_size_action(
         learned = learn(table, LearnOptions(**options), typed, correct=correct, against=against, progress=progress)
     if correct is not None:
         protect_inputs(*learned.inputs.values())
-    learned.write(output, force=force)
     calibration = learned.calibration
     if isinstance(calibration, BodyCalibration):
         text_of = body_calibration_text if calibration.site is None else site_calibration_text
-        click.echo(text_of(calibration), nl=False)
-        return
-    if figure is not None and learned.lumps is not None:
+        text = text_of(calibration)
+    else:
+        text = calibration_text(
+            calibration,
+            not_left_out=learned.not_left_out,
+            other_fit=learned.other_fit,
+            table_rows=learned.table_rows,
+        )
+    click.echo(text, nl=False)  # first: a file that cannot be written loses no result
+    learned.write(output, force=force)
+    if figure is not None and isinstance(calibration, SizeCalibration) and learned.lumps is not None:
         eq6_figure(calibration, learned.lumps, figure, title=table.name, force=force)
-    text = calibration_text(
-        calibration,
-        not_left_out=learned.not_left_out,
-        other_fit=learned.other_fit,
-        table_rows=learned.table_rows,
-    )
-    click.echo(text, nl=False)
 
 
 def calibrate_repeatability_action(folder: Path, output: Path, size_calibration: str | None, force: bool) -> None:

@@ -254,12 +254,12 @@ def head_design_action(*, head: str | None, figure: Path | None, as_json: bool, 
     body = paper.HomogeneousTissue(**tissue)
     limit = body.limit_percent / 100
     candidates = paper.search_heads(body, kinds=HEADS if head is None else (head,))
-    if figure is not None:
-        paper_head.design_figure(candidates, body, limit=limit, path=figure, force=force)
     if as_json:
         click.echo(json.dumps(paper_head.design_document(candidates, body, limit=limit), indent=2))
     else:
         click.echo(f"{paper_head.design_text(candidates, body, limit=limit)}\n{RESEARCH_USE}")
+    if figure is not None:
+        paper_head.design_figure(candidates, body, limit=limit, path=figure, force=force)
     if paper.narrowest(candidates, limit=limit) is None:
         best = paper.most_even(candidates)
         raise UsageError(
@@ -295,15 +295,15 @@ def compare_model_action(
             click.echo(warning, err=True)
         with progress_bar(f"frames, {fidelity}") as progress:
             comparisons.append(compare_model(measured, body, fidelity=fidelity, head=head, progress=progress))
+    if as_json:
+        click.echo(dump_json(paper_head.comparison_document(measured, comparisons, inputs=inputs)), nl=False)
+    else:
+        for line in finding_lines(scan_findings(loaded)):
+            click.echo(line, err=True)
+        click.echo(f"{paper_head.comparison_text(measured, comparisons)}\n{RESEARCH_USE}")
     if figure is not None:
         title = f"{scan.stem} against {scene.stem}"
         paper_head.comparison_figure(measured, comparisons, figure, title=title, force=force)
-    if as_json:
-        click.echo(dump_json(paper_head.comparison_document(measured, comparisons, inputs=inputs)), nl=False)
-        return
-    for line in finding_lines(scan_findings(loaded)):
-        click.echo(line, err=True)
-    click.echo(f"{paper_head.comparison_text(measured, comparisons)}\n{RESEARCH_USE}")
 
 
 def sbc_action(

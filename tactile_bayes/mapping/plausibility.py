@@ -314,8 +314,8 @@ def _unusual(quality: Mapping[str, float]) -> Iterator[tuple[str, str]]:
         share = 100 * quality["repeated_share"]
         yield f"{share:.0f} % of the frames repeat the one before: the array is slower than its clock says", ""
     for name in ("row", "column"):
-        if share := quality.get(f"weakest_{name}_share"):
-            what = f"one of the array's {name}s reads {100 * share:.0f} % of what the {name}s beside it read"
+        if weakest := quality.get(f"weakest_{name}_share"):
+            what = f"one of the array's {name}s reads {100 * weakest:.0f} % of what the {name}s beside it read"
             yield f"{what}: the size may be wrong", "have the array calibrated"
     apart, reach = quality.get("landmark_distance_mm"), quality.get("landmark_reach_mm", 0.0)
     in_base = "check that landmarks are in the tracker's base frame, in mm"

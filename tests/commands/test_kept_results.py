@@ -20,7 +20,7 @@ DEMO = Path(__file__).resolve().parents[2] / "tactile_bayes" / "demo"
 def full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder on a disk that is full, with the inputs of the commands."""
     tb.demo_map().save(tmp_path / "map.nc")
-    for name in ("trial.csv", "excision.csv", "scan.mcap"):
+    for name in ("trial.csv", "excision.csv", "scan.mcap", "scene.toml", "phantoms.csv"):
         (tmp_path / name).symlink_to(DEMO / name)
 
     write = Path.write_bytes
@@ -43,6 +43,9 @@ CASES = {
     "validate": (("validate", "trial.csv", "--excision", "excision.csv", "-o", "out.json"), "Sizes against excision"),
     "a page": (("validate", "trial.csv", "--excision", "excision.csv", "--html", "out.html"), "Sizes against excision"),
     "map": (("map", "scan.mcap", "--every", "4", "-o", "map2.nc", "--figure", "out.png"), "written: map2.nc"),
+    "head design": (("head", "design", "--figure", "out.png"), "narrowest"),
+    "compare-model": (("compare-model", "scan.mcap", "scene.toml", "--every", "40", "--figure", "out.png"), "frames"),
+    "calibrate size": (("calibrate", "size", "phantoms.csv", "-o", "out.json"), "Eq 6"),
     "sbc": (("sbc", "--maps", "1", "--method", "laplace", "--figure", "out.png"), "1 map"),
 }
 
