@@ -304,7 +304,7 @@ def map_of(given: Any, **stated: Any) -> Map:
     path = path_of(given) if isinstance(given, str | Path) else None
     if path is not None and not stated and path.suffix.lower() not in GRID_SUFFIXES:
         return read_map(path)
-    if path is None and (not stated or isinstance(given, list | tuple) or not hasattr(given, "__array__")):
+    if path is None and (not stated or not hasattr(given, "__array__")):
         way_out = "build one with build_map, give a path, or map_of(numpy.array(...), spacing_mm=...)"
         if isinstance(given, list | tuple) and not stated:
             way_out = "give one map after the other, or pool the maps of one mass with pool"

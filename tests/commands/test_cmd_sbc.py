@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
@@ -99,6 +100,7 @@ def test_maps_that_all_abstain_leave_nothing_to_rank(tmp_path: Path, monkeypatch
     assert done.returncode == 0
     assert "no estimate on 3 (window 3)" in done.stdout
     assert "nothing to rank" in done.stdout
+    assert [row["outcome"] for row in csv.DictReader((tmp_path / "s.csv").read_text().splitlines())] == ["window"] * 3
 
 
 def test_ctrl_c_reports_the_maps_that_are_done_where_nothing_keeps_them(tmp_path: Path, monkeypatch) -> None:

@@ -146,6 +146,7 @@ READ: dict[str, tuple[bytes, Any]] = {
         tiff({"data": A.astype("u1").tobytes(), "photometric": 0, "tags": {42113: (2, "7")}}),
         np.where(A == 7, np.nan, 255 - A),
     ),
+    "PNG of no resolution": (png(packed(A, 8), bits=8, chunks={b"pHYs": struct.pack(">IIB", 0, 0, 1)}), A),
     "PNG of 2 bits": (png(packed(A % 4, 2), bits=2), A % 4),
     "PNG of 4 bits": (png(packed(A, 4), bits=4), A),
     "PNG of 16 bits": (png(packed(A * 999, 16), bits=16), A * 999),
@@ -216,6 +217,10 @@ REFUSED: dict[str, tuple[bytes, str]] = {
     "two PGM": (2 * (b"P5 4 3 255\n" + A.astype("u1").tobytes()), "several images"),
     "pixels that are not square": (
         tiff({"data": A.astype("u1").tobytes(), "tags": {282: (5, [(300, 1)]), 283: (5, [(150, 1)]), 296: (3, [1])}}),
+        "0.5 times as wide as high",
+    ),
+    "PNG of pixels that are not square": (
+        png(packed(A, 8), bits=8, chunks={b"pHYs": struct.pack(">IIB", 2, 1, 0)}),
         "0.5 times as wide as high",
     ),
 }

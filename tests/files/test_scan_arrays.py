@@ -339,6 +339,12 @@ def meander(frames: np.ndarray, lump: float = 2.0) -> np.ndarray:
     return frames
 
 
+def turns_alone(a: Arrays) -> None:
+    """Rotations without their positions, in place of the poses."""
+    del a["position_mm"]
+    a["pose_matrix"] = np.tile(np.eye(3), (len(a.pop("quaternion_wxyz")), 1, 1))
+
+
 FAULTS: list[tuple[str, Callable[[Arrays], Any], dict[str, Any], str]] = [
     ("NaN", nan("frames"), {"unit": "kPa"}, r"frames holds 26 values that are not finite \(first at \(3, 4, 0\)\)"),
     ("no unit", dict.copy, {}, "lacks gain_kpa_per_count .*--unit or --array-calibration"),
@@ -353,6 +359,8 @@ FAULTS: list[tuple[str, Callable[[Arrays], Any], dict[str, Any], str]] = [
     ("shape", dict.copy, {"unit": "kPa", "frame_shape": (26, 16)}, "16 x 26 taxels, not 26 x 16"),
     ("unknown", dict.copy, {"unit": "kPa", "arrays": {"count": "frames"}}, "'count' is no array.*mean counts"),
     ("not there", dict.copy, {"unit": "kPa", "arrays": {"counts": "P"}}, "has no array 'P' for counts; it has "),
+    ("both poses", lambda a: a.update(pose_matrix=np.eye(4)), {"unit": "kPa"}, "beside position_mm.*leave one out"),
+    ("turns alone", turns_alone, {"unit": "kPa"}, r"pose_matrix has shape \(\d+, 3, 3\); it must be \(m, 4, 4\)"),
     ("meander", lambda a: a.update(frames=meander(a["frames"])), {"unit": "kPa"}, "less if every second row runs back"),
     ("lever in m", lambda a: a["array_from_tracker"].__setitem__((slice(3), 3), 0.03), {"unit": "kPa"}, "like metres"),
 ]  # fmt: skip

@@ -159,6 +159,8 @@ def test_an_imported_grid_is_drawn_as_its_file_reads(axes):
     map_figure(replace(bump_map(), plane_from_base=None), None)
     assert not axes[0].xaxis_inverted()
     assert axes[0].yaxis_inverted()
+    map_figure(replace(bump_map(), plane_from_base=None, recipe=MapRecipe("grid", "none", 1.0)), None)
+    assert axes[1].get_xlabel() == "x (mm)"
 
 
 def test_the_size_is_drawn_and_one_sigma_of_the_bump_is_named_as_no_lump(axes):
