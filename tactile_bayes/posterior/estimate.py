@@ -27,7 +27,7 @@ from tactile_bayes.progress import Progress
 from tactile_bayes.scans import DEFAULT_HEAD, HeadShape
 from tactile_bayes.size import terms
 from tactile_bayes.size.draws import BUMP, EXTREMES, SIZES
-from tactile_bayes.size.pooling import Calibration, draw_sizes
+from tactile_bayes.size.pooling import MOST_INVALID, Calibration, draw_sizes
 
 # --- Search for the lump: candidate places, highest first, each fitted and assessed under either noise model.
 
@@ -207,7 +207,6 @@ def draw_with_size(task: EstimationTask, assessment: Assessment) -> MapDraws:
 
 # --- The answer for one map: a size, widths, or the reason for neither.
 
-MOST_INVALID = 0.05
 LONGER = "give --method ensemble, with a larger max_steps in --settings FILE.toml"
 OTHER_METHOD_ON_PAPER = "have the size estimated again by the slower method"
 #: How to make a calibration for another head.
