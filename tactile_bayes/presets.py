@@ -58,6 +58,7 @@ NORMALISE: Final[tuple[Normalise, ...]] = get_args(Normalise)
 # See docs/decisions/0065; the paper divides by the mean.
 DEFAULT_NORMALISE: Final[Normalise] = "gain"
 TrackerProtocol = Literal["open", "fastrak", "fastrak-ascii", "liberty", "liberty-ascii", "bird", "igtlink", "ndi"]
+ExportFormat = Literal["dicom", "fhir", "nrrd", "csv"]
 Method = Literal["optimise", "laplace", "importance", "ensemble"]
 METHODS: Final[tuple[Method, ...]] = get_args(Method)
 Noise = Literal["independent", "field"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, get_args
 
 from tactile_bayes.api.arguments import PathLike, list_of, output_path, path_of, plain, takes
 from tactile_bayes.api.estimating import Notice, estimate_file, estimate_one
@@ -16,8 +16,7 @@ from tactile_bayes.api.sized import SizeEstimate
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, UsageError, check_choice, check_number
 from tactile_bayes.exports.exam import EstimateFile, MapFile, merged_identity, parse_estimate, read_exam, shared_facts
-from tactile_bayes.exports.run import FORMATS, Outputs, refuse_unsupported
-from tactile_bayes.exports.run import ExportFormat as Format
+from tactile_bayes.exports.run import Outputs, refuse_unsupported
 from tactile_bayes.exports.run import export as exported_files
 from tactile_bayes.files.atomic import first_duplicate, sha256
 from tactile_bayes.files.documents import load_json
@@ -30,6 +29,7 @@ from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.files.size_json import read_repeatability
 from tactile_bayes.findings import counted, finding_lines
 from tactile_bayes.options import IdentityOptions
+from tactile_bayes.presets import ExportFormat
 from tactile_bayes.report.estimate_document import side_of
 from tactile_bayes.report.exam_page import exam_page
 from tactile_bayes.report.exam_words import PageLabels, ShownExam, exam_map, headline
@@ -306,7 +306,7 @@ def export(
     files: Any = (),
     path: PathLike | None = None,
     *,
-    to: Format,
+    to: ExportFormat,
     worklist: PathLike | None = None,
     patient_id_from_scan: bool = False,
     dictionary: PathLike | None = None,
@@ -347,7 +347,7 @@ def export(
     >>> tb.export(tb.estimate(tb.demo_map()), "records.csv", to="csv").paths  # doctest: +SKIP
     (PosixPath('records.csv'),)
     """
-    check_choice("to", to, FORMATS)
+    check_choice("to", to, get_args(ExportFormat))
     for name, value in identity.items():
         if not isinstance(value, str):
             raise UsageError(f"{name} is {value!r}; give a text")

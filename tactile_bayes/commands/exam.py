@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from inspect import cleandoc
 from pathlib import Path
-from typing import Final
+from typing import get_args
 
 import click
 
@@ -12,7 +12,7 @@ from tactile_bayes.api.settings import Settings
 from tactile_bayes.commands import options
 from tactile_bayes.files.arrays_layout import GridOptions, Stated, layout_lines
 from tactile_bayes.options import IdentityOptions, MapOptions, RecordOptions
-from tactile_bayes.presets import CORRECTIONS, METHODS
+from tactile_bayes.presets import CORRECTIONS, METHODS, ExportFormat
 
 _FILE = options.FilePath()
 
@@ -122,12 +122,9 @@ def show_command() -> None:
     """
 
 
-_FORMATS: Final = ("dicom", "fhir", "nrrd", "csv")
-
-
 @options.command("export", "pages.export_action")
 @click.argument("files", metavar="FILE...", nargs=-1, type=_FILE)
-@click.option("--to", required=True, type=click.Choice(_FORMATS), help="Format to write.")
+@click.option("--to", required=True, type=click.Choice(get_args(ExportFormat)), help="Format to write.")
 @options.output_option("OUT", None, "File to write; for dicom the folder of the files.")
 @options.path_option(
     "--worklist",

@@ -6,7 +6,7 @@ import io
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from tactile_bayes.exports.fhir import bundle_json
 from tactile_bayes.exports.redcap import dictionary_csv, records_csv
 from tactile_bayes.files.atomic import Format, check_suffix, refuse_existing, same_file, unwritable, write_all
 from tactile_bayes.findings import finding_lines
-from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.presets import RESEARCH_USE, ExportFormat
 
 # --- Maps as NRRD, the format of 3D Slicer: one slice in the patient's frame.
 
@@ -125,8 +125,6 @@ def _make_folder(folder: Path, names: set[str]) -> Path | None:
 
 # --- One call for every export: inputs are recognised by their content, and one line says which does not fit.
 
-ExportFormat = Literal["dicom", "fhir", "nrrd", "csv"]
-FORMATS: Final[tuple[ExportFormat, ...]] = get_args(ExportFormat)
 IDENTITY_FIELDS: Final[dict[ExportFormat, tuple[str, ...]]] = {
     "dicom": names_of(exam.Identity),
     "fhir": ("patient_id", "patient_name", "birth_date", "sex", "issuer", "accession", "study_date"),

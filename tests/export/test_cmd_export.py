@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from subprocess import CompletedProcess
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from export_files import WHEN, WHO, exported
@@ -137,13 +137,13 @@ def test_a_missing_extra_is_named_with_its_command(
     )
 
 
-def test_the_command_offers_every_format() -> None:
-    from tactile_bayes.commands import exam as export
+def test_every_format_says_which_parts_of_an_identity_it_holds() -> None:
     from tactile_bayes.declarations import names_of
     from tactile_bayes.exports import run
     from tactile_bayes.options import IdentityOptions
+    from tactile_bayes.presets import ExportFormat
 
-    assert export._FORMATS == run.FORMATS
+    assert tuple(run.IDENTITY_FIELDS) == get_args(ExportFormat)
     assert names_of(IdentityOptions) == run.IDENTITY_FIELDS["dicom"]
 
 

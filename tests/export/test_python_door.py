@@ -35,7 +35,7 @@ def test_the_door_stays_a_function_when_the_package_of_the_formats_is_loaded() -
     import tactile_bayes.exports.run
 
     assert callable(tb.export)
-    assert tactile_bayes.exports.run.FORMATS
+    assert tactile_bayes.exports.run.IDENTITY_FIELDS
 
 
 @pytest.mark.long
