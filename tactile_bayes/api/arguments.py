@@ -29,9 +29,11 @@ _VALUE: Final = r"-?[\d.]+|[a-z]+[A-Z]?[a-z]*\d*(?:-[a-z]+)*(?:\.[a-z]+)?"
 _OPTION: Final = re.compile(rf"(?<![\w-])--([a-z]+(?:-[a-z]+)*)(?: ({_VALUE}))?")
 _CHOICES: Final = (
     *("method", "normalise", "fidelity", "noise", "background", "scene", "form", "fit", "to", "size_calibration"),
-    *("level", "unit", "units", "length_unit", "time_unit", "pose_time_unit", "pose_layout"),
+    *("frame_order", "level", "unit", "units", "length_unit", "time_unit", "pose_time_unit", "pose_layout"),
 )
-_FLAGS: Final = ("force", "same-mass", "register-strokes", "flat-field", "patient-id-from-scan", "invert-rotation")
+_FLAGS: Final = (
+    *("as-stated", "force", "same-mass", "register-strokes", "flat-field", "patient-id-from-scan", "invert-rotation"),
+)
 
 
 Renamed = Sequence[tuple[str, str]]  #: Options written as keywords, and a function's own words for them.

@@ -204,6 +204,8 @@ def test_a_keyword_that_is_none_is_answered_with_the_one_meant(call: Callable[[]
         ("try --method ensemble", 'try method="ensemble"'),
         ("give their unit: --unit kPa", 'give their unit: unit="kPa"'),
         ("leave it or --unit out", "leave it or unit out"),
+        ("or map it with --as-stated", "or map it with as_stated=True"),
+        ("--frame-order rows takes them as they are", 'frame_order="rows" takes them as they are'),
         ("and give --size-calibration size.json.", 'and give size_calibration="size.json".'),
         ("its normalise is mean, not gain as --normalise says", "its normalise is mean, not gain as normalise says"),
         ("a larger max_steps in --settings FILE.toml", "a larger max_steps"),
