@@ -10,6 +10,7 @@ import re
 import shlex
 import tomllib
 from pathlib import Path
+from typing import get_args
 
 import click
 import h5py
@@ -19,7 +20,11 @@ from doc_pages import PROGRAM, Command, Reader, blocks_of, check_words, commands
 import tactile_bayes as tb
 from tactile_bayes import errors
 from tactile_bayes.cli import COMMANDS, cli
+from tactile_bayes.declarations import names_of
 from tactile_bayes.files.arrays_layout import LAYOUT, OPTIONAL, in_words
+from tactile_bayes.files.documents import load_schema
+from tactile_bayes.files.map_nc import MapHeader
+from tactile_bayes.presets import Background, ExportFormat, Noise, Normalise, TrackerProtocol
 from tactile_bayes.report.estimate_text import SOURCES
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -202,6 +207,25 @@ def test_the_formats_page_has_the_arrays_of_a_scan():
         optional = " (may be left out)" if name in OPTIONAL else ""
         wanted.append([f"`{name}`{optional}", in_words(one.shape), one.meaning])
     assert [[row[0], row[1], row[-1]] for row in rows] == wanted
+
+
+@pytest.mark.parametrize(
+    ("page", "names"),
+    [
+        ("formats.md", names_of(MapHeader)),
+        ("trackers.md", get_args(TrackerProtocol)),
+        ("guides/export.md", get_args(ExportFormat)),
+    ],
+)
+def test_a_page_names_all_that_a_file_holds_or_an_option_takes(page, names):
+    written = (DOCS / page).read_text(encoding="utf-8")
+    assert [name for name in names if f"`{name}`" not in written] == []
+
+
+def test_a_size_table_takes_the_values_of_the_options_that_state_the_same():
+    columns = {one["name"]: one for one in load_schema("size_table.table.json")["fields"]}
+    for name, choices in (("noise", Noise), ("normalise", Normalise), ("background", Background)):
+        assert set(columns[name]["constraints"]["enum"]) == set(get_args(choices)), name
 
 
 @pytest.mark.long

@@ -10,14 +10,14 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, get_args
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import DeviceError, UsageError
 from tactile_bayes.hardware import head, readings
 from tactile_bayes.hardware.ports import ANSWER_S, SILENT_S, Port, preview
 from tactile_bayes.hardware.trackers import ASK_FOR_TDATA, NAME_BYTES, IgtlinkParser, NdiPort, encode_transform
-from tactile_bayes.presets import MM_PER_UNIT
+from tactile_bayes.presets import MM_PER_UNIT, TrackerProtocol
 
 # --- Records of Ascension Flock of Birds and miniBIRD trackers, position and quaternion, by the standard transmitter.
 #
@@ -138,7 +138,7 @@ def _pose(
 
 # --- Records as the devices of these drivers send them.
 
-PROTOCOLS: Final = ("fastrak", "fastrak-ascii", "liberty", "liberty-ascii", "bird", "open", "igtlink")
+PROTOCOLS: Final = tuple(name for name in get_args(TrackerProtocol) if name != "ndi")  # which is asked for each pose
 
 
 def encode_record(protocol: str, pose: readings.ToolReading, number: int) -> bytes:

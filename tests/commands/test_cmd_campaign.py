@@ -40,12 +40,15 @@ from scipy.io import savemat
 
 import tactile_bayes as tb
 from tactile_bayes.campaigns.inputs import open_campaign
-from tactile_bayes.campaigns.report import ExamRow, index_html, trial_lines
+from tactile_bayes.campaigns.report import ExamRow, done_line, grown_line, index_html, trial_lines
 from tactile_bayes.campaigns.steps import Task, make_map, run_step
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.manifest_csv import Exam as Listed
+from tactile_bayes.files.manifest_csv import columns_of
 from tactile_bayes.files.tables import read_table
+from tactile_bayes.inference.draws import Quantity
+from tactile_bayes.report.pages import Growth
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 SIZED = ("07.v1.m1.r1", "07.v1.m1.r2", "09.v1.m1.r1")
@@ -296,6 +299,14 @@ def test_an_output_that_is_an_input_is_refused(finished: Path) -> None:
     shutil.copy(finished / "excision.csv", finished / "out" / "trial.csv")
     done = campaign(finished, "--excision", "out/trial.csv")
     assert "out/trial.csv is an input of this command; choose another name for the output" in done.stderr
+
+
+def test_a_table_has_a_column_for_each_value_of_its_rows() -> None:
+    exam = Listed("a.mcap", Path("a.mcap"), "01", "v1", "m1", 1)
+    size = Quantity(median=2, mean=2, sd=1, low=1, high=3, probability=0.95, kind="eti")
+    grown = Growth("01", "m1", "v1", "v2", "compared", sizes_mm=(size, size), percent=size)
+    assert list(done_line(ExamRow(exam, "detected", size=size))) == columns_of("exams_done")
+    assert list(grown_line(grown)) == columns_of("growth")
 
 
 @pytest.mark.long
