@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from tactile_bayes.declarations import EXACT, UNSET, Record, UnsetType, from_plain, names_of, to_plain
+from tactile_bayes.declarations import EXACT, Record, from_plain, names_of, to_plain
 from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.atomic import write_bytes
 from tactile_bayes.files.documents import parse_json
@@ -51,7 +51,7 @@ _TRANSFORMS = {
 }
 
 
-class MapHeader(Record, kw_only=True):
+class MapHeader(Record, kw_only=True, omit_defaults=True):
     """Attributes of a map's file: the schema as a text, the others as JSON."""
 
     schema: Literal["tactile-bayes/map/2"]
@@ -60,13 +60,14 @@ class MapHeader(Record, kw_only=True):
     frame_count: int
     quality: dict[str, float | None]  #: Null where a figure is not finite.
     masked_taxels: tuple[str, ...]
-    head: HeadShape | UnsetType = UNSET
-    nipple_mm: tuple[float, float, float] | UnsetType = UNSET
+    head: HeadShape | None = None
+    nipple_mm: tuple[float, float, float] | None = None
     findings: tuple[Finding, ...]
     provenance: dict[str, Any]
 
 
-_SHARED: Final = ("recipe", "background", "frame_count", "masked_taxels")  #: Fields of a header and of its map.
+_SHARED: Final = ("recipe", "background", "frame_count", "masked_taxels", "head", "findings")
+"""Fields of a header and of its map."""
 
 
 def write_map(path: Path, tactile_map: TactileMap, *, provenance: Provenance, force: bool = False) -> None:
@@ -133,9 +134,7 @@ def read_map_and_header(path: Path) -> tuple[TactileMap, MapHeader]:
             **transforms,
             **{name: getattr(header, name) for name in _SHARED},
             quality={name: math.nan if value is None else value for name, value in header.quality.items()},
-            head=None if isinstance(header.head, UnsetType) else header.head,
-            nipple_mm=None if isinstance(header.nipple_mm, UnsetType) else np.array(header.nipple_mm),
-            findings=header.findings,
+            nipple_mm=None if header.nipple_mm is None else np.array(header.nipple_mm),
         )
         return tactile_map, header
 
@@ -146,9 +145,7 @@ def _attributes(tactile_map: TactileMap, provenance: Provenance) -> dict[str, st
         schema=SCHEMA,
         **{name: getattr(tactile_map, name) for name in _SHARED},
         quality={name: float(v) if np.isfinite(v) else None for name, v in tactile_map.quality.items()},
-        head=UNSET if tactile_map.head is None else tactile_map.head,
-        nipple_mm=UNSET if tactile_map.nipple_mm is None else tuple(tactile_map.nipple_mm.tolist()),
-        findings=tactile_map.findings,
+        nipple_mm=None if tactile_map.nipple_mm is None else tuple(tactile_map.nipple_mm.tolist()),
         provenance=provenance.as_dict(),
     )
     plain = to_plain(header, digits=EXACT)
