@@ -414,15 +414,15 @@ def count_weights(cells: FitCells, residual_variance: float) -> FloatArray:
     return np.asarray(weight / weight.mean())
 
 
-def independent_errors(fit: LeastSquaresFit, weight: FloatArray) -> ErrorModel:
-    """Error model without correlation, for fits whose model contains the correlation itself."""
+def uncorrelated_errors(fit: LeastSquaresFit, weight: FloatArray) -> ErrorModel:
+    """Error model under ``noise = "field"``, whose fits contain the correlation themselves."""
     k, p = fit.jacobian.shape
     dof = max(k - p, 1)
     return ErrorModel(float(np.sqrt(weight @ fit.residual**2 / dof)), 1.0, float(dof))
 
 
-def error_model(cells: FitCells, fit: LeastSquaresFit, weight: FloatArray) -> ErrorModel:
-    """Estimate the error model from a fit's residuals.
+def inflated_errors(cells: FitCells, fit: LeastSquaresFit, weight: FloatArray) -> ErrorModel:
+    """Error model under ``noise = "independent"``, from a fit's residuals.
 
     `inflation` is the mean factor over the parameters by which the sandwich :math:`H^{-1} J^T W C W J H^{-1}`, with C
     from the residuals' autocorrelation, widens their covariance. Dividing the log-likelihood by it is the magnitude

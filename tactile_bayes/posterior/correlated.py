@@ -451,7 +451,7 @@ class CorrelatedAssessment(Record, eq=False):
             )
             position_share = from_positions / (from_positions + from_noise)
         figures = {
-            "noise": "field",
+            "noise": options.noise,
             "rotation_odds": next((one.odds for one in choice.structures if one.name == "rotated"), None),
             "rotated": fit.scene.shape == "rotated",
             "field_cosines": target.window.cosines,

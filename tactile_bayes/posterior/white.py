@@ -26,11 +26,11 @@ from tactile_bayes.posterior.bump import (
     count_weights,
     covered_share,
     drawn_widths,
-    error_model,
-    independent_errors,
+    inflated_errors,
     level_offset,
     log_normal_density,
     typical_level,
+    uncorrelated_errors,
     value_scale,
     window_cells,
 )
@@ -242,7 +242,7 @@ def fit_bump(
         weight_variance = float(np.mean(fit.residual**2))
         if settled:
             break
-    errors = independent_errors(fit, weight) if options.correlated else error_model(cells, fit, weight)
+    errors = uncorrelated_errors(fit, weight) if options.correlated else inflated_errors(cells, fit, weight)
     # a map without any noise still has the rounding of its numbers
     rounding = 1e-9 * bump.scale + 1e-14 * float(np.abs(cells.value).max())
     errors = replace(errors, noise_sd=max(errors.noise_sd, rounding))
@@ -535,7 +535,7 @@ class WhiteAssessment(Record, eq=False):
             labels=draws.replicates,
         )
         figures = {
-            "noise": "independent",
+            "noise": options.noise,
             "noise_inflation": fit.errors.inflation,
             "noise_dof": fit.errors.dof,
             "level_offset": level_offset(fit.fit.residual, weight=fit.weight),
