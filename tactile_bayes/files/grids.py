@@ -20,7 +20,7 @@ from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.map import MapRecipe, TactileMap, block_sums
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
-from tactile_bayes.presets import CELL_MM, MM_PER_UNIT
+from tactile_bayes.presets import CELL_MM, MM_PER_UNIT, Normalise
 from tactile_bayes.progress import Progress, no_progress
 
 # --- A grid of numbers in a text table, as programs and spreadsheets write it.
@@ -472,7 +472,7 @@ def _spacing(grid: Grid, *, stated_mm: float | None) -> tuple[float, list[str]]:
     return value, notes
 
 
-def _map(arrays: dict[str, np.ndarray[Any, Any]], *, spacing_mm: float, normalise: str, units: str) -> TactileMap:
+def _map(arrays: dict[str, np.ndarray[Any, Any]], *, spacing_mm: float, normalise: Normalise, units: str) -> TactileMap:
     """Map of arrays in kPa, or divided by their level, as `normalise` declares.
 
     Without ``count`` and ``variance`` a value is one reading of variance 0. A variance may be NaN where a

@@ -15,6 +15,7 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.findings import Finding, capitalised, counted, finding
 from tactile_bayes.geometry import BoolArray, FloatArray
 from tactile_bayes.mapping.select import LEAST_FRAMES
+from tactile_bayes.presets import Normalise
 from tactile_bayes.scans import HeadShape
 
 # --- Binomial smoothing of sums in cells.
@@ -40,7 +41,7 @@ class MapRecipe(Record):
     """Settings by which a map was built; a size calibration fits only maps of its own recipe."""
 
     source: str  #: ``"scan"`` or ``"grid"`` (a map imported as it is).
-    normalise: Annotated[str, Meta(pattern="^(mean|gain|none)$", extra={"words": "mean, gain or none"})]
+    normalise: Normalise
     cell_mm: Annotated[float, Meta(gt=0)]  #: Side of the square cells.
     pressure_window_kpa: tuple[float, float] | None = None  #: The gate on the frame's mean; None for an imported grid.
     latency_ms: float = 0.0  #: Delay of a pose's stamp against the frames.
