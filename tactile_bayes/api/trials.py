@@ -19,7 +19,7 @@ from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.column_map import read_mapping, read_wide, read_wide_excision
 from tactile_bayes.files.documents import dump_json, read_protocol
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.tables import Sheet, Table, check_references, read_table
+from tactile_bayes.files.tables import Sheet, Table, read_table
 from tactile_bayes.findings import capitalised
 from tactile_bayes.options import MOST_PATIENTS, Aim, PlanErrors, PlanOptions, TrialSettings
 from tactile_bayes.presets import INTERVAL, RESEARCH_USE
@@ -136,7 +136,6 @@ def load_trial(trial: Path | Sheet, excision: Path | Sheet, columns: Path | None
         table = read_table(trial, "trial.table.json")
     else:
         table = read_wide(trial, mapping, mapping.reading)
-    check_references(table, "trial.table.json", targets={"excision": sizes})
     columns_filled: Mapping[str, list[Any]] = table.columns
     posteriors: list[Path] = []
     if any(columns_filled.get("posterior", ())):
@@ -149,15 +148,21 @@ def load_trial(trial: Path | Sheet, excision: Path | Sheet, columns: Path | None
             problem = f"is {across_mm:g}, above ex_vivo_mm {largest_mm:g}, which is the largest extent"
             raise sizes.error(row, "ex_vivo_second_mm", problem, way_out="exchange or correct them")
     keys = list(zip(sizes.columns["patient"], sizes.columns["mass"], strict=True))
+    ex_vivo_mm = dict(zip(keys, sizes.columns["ex_vivo_mm"], strict=True))
     readings = readings_from_columns(columns_filled, fault=table.error)
+    for row, reading in enumerate(readings):
+        if reading.key not in ex_vivo_mm and reading.status != "not_done":
+            what = f"{reading.key[0]!r} + {reading.key[1]!r} has no size in {sizes.path}"
+            way_out = "add it there, correct the key, or leave its readings out"
+            raise table.error(row, "patient + mass", what, way_out=way_out)
     excised_on = dict(zip(keys, sizes.columns["date"], strict=True))
     analysed, other_visits = at_excision(readings, excised_on, fault=table.error)
     tables = {"trial": trial, "excision": excision, "columns": columns}
     files = {role: path for role, path in tables.items() if isinstance(path, Path)}
     return Trial(
-        readings=analysed,
+        readings=[one for one in analysed if one.key in ex_vivo_mm],  # of a patient who withdrew, none was done
         other_visits=other_visits,
-        ex_vivo_mm=dict(zip(keys, sizes.columns["ex_vivo_mm"], strict=True)),
+        ex_vivo_mm=ex_vivo_mm,
         ex_vivo_sd_mm=dict(zip(keys, sizes.columns["sd_mm"], strict=True)),
         files=files | {f"posterior_{number}": path for number, path in enumerate(posteriors, start=1)},
     )

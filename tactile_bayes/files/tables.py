@@ -184,9 +184,10 @@ def read_table(source: Path | Sheet, schema_name: str, *, may_be_empty: bool = F
 def check_unique(table: Table, keys: Sequence[str], *, way_out: str = "remove one row or correct its key") -> None:
     """Refuse two rows with the same values in the columns `keys`."""
     first: dict[tuple[Any, ...], int] = {}
-    for row, key in enumerate(_keys(table, keys)):
+    for row, key in enumerate(zip(*(table.columns[name] for name in keys), strict=True)):
         if (before := first.setdefault(key, row)) != row:
-            what = f"{_shown_key(key)} stands on line {table.line_numbers[before]} already"
+            shown = " + ".join(_shown(str(part)) for part in key)
+            what = f"{shown} stands on line {table.line_numbers[before]} already"
             raise table.error(row, " + ".join(keys), what, way_out=way_out)
 
 
@@ -246,18 +247,6 @@ def csv_cell(value: object, digits: int | None = None) -> str:
     if isinstance(value, float):
         return repr(value) if digits is None else f"{value:.{digits}g}"
     return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in str(value).strip())
-
-
-def check_references(table: Table, schema_name: str, *, targets: Mapping[str, Table]) -> None:
-    """Check by the schema's ``foreignKeys`` that each row refers to one of `targets`, tables by the names in there."""
-    for key in load_schema(schema_name).get("foreignKeys", []):
-        target = targets[key["reference"]["resource"]]
-        known = set(_keys(target, key["reference"]["fields"]))
-        for row, value in enumerate(_keys(table, key["fields"])):
-            if value not in known:
-                what = f"{_shown_key(value)} has no size in {target.path}"
-                way_out = "add it there, correct the key, or leave its readings out"
-                raise table.error(row, " + ".join(key["fields"]), what, way_out=way_out)
 
 
 def _check_header(header: Sequence[str], fields: Mapping[str, Any], *, wide: str) -> None:
@@ -400,10 +389,6 @@ def _parse_number(text: str, field: Mapping[str, Any]) -> float:
     raise BadDataError(f"{_shown(text)} is not a number", way_out=f"write digits only{unit}; {_blank_advice(field)}")
 
 
-def _keys(table: Table, fields: Sequence[str]) -> list[tuple[Any, ...]]:
-    return list(zip(*(table.columns[name] for name in fields), strict=True))
-
-
 def _is_required(field: Mapping[str, Any]) -> bool:
     return bool(field.get("constraints", {}).get("required", False))
 
@@ -418,10 +403,6 @@ def _names(fields: Mapping[str, Any]) -> str:
 
 def _shown(text: str) -> str:
     return repr(text if len(text) <= 40 else text[:37] + "...")
-
-
-def _shown_key(key: Sequence[Any]) -> str:
-    return " + ".join(_shown(str(part)) for part in key)
 
 
 def _fault(line: int, column: str, what: str, *, way_out: str) -> BadDataError:

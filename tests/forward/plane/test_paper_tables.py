@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from tactile_bayes.actions.show import describe
 from tactile_bayes.errors import EXIT_BAD_DATA, BadDataError
 from tactile_bayes.files.documents import load_schema
-from tactile_bayes.files.tables import check_references, csv_separator, read_table
+from tactile_bayes.files.tables import csv_separator, read_table
 
 TRIAL = "trial.table.json"
 EXCISION = "excision.table.json"
@@ -175,15 +175,6 @@ def test_the_first_fault_in_reading_order_is_reported(tmp_path: Path) -> None:
     path = write(tmp_path, HEADER + ROW + "P2,1,tactile,1,x,detected\nP3,1,tactile,1,y,detected\n")
     with pytest.raises(BadDataError, match=r"line 3, column size_mm: 'x'"):
         read_table(path, TRIAL)
-
-
-def test_a_row_without_its_partner_is_named(tmp_path: Path) -> None:
-    trial = read_table(write(tmp_path, HEADER + ROW + "P2,1,tactile,1,9,detected\n"), TRIAL)
-    excision = read_table(write(tmp_path, "patient,mass,ex_vivo_mm\nP1,1,12\n", name="ex.csv"), EXCISION)
-    with pytest.raises(
-        BadDataError, match=r"table.csv: line 3, column patient \+ mass: 'P2' \+ '1' has no size in .*ex.csv"
-    ):
-        check_references(trial, TRIAL, targets={"excision": excision})
 
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
