@@ -290,6 +290,8 @@ def read_scan_report(path: Path) -> ScanFile:
 def scan_records(path: Path, *, keep: Collection[str]) -> McapRecords:
     """Read all records of a scan of a known version; of topics not in `keep` only the times."""
     records = read_records(path, keep=keep)
+    if records.lost and not records.finished and is_recording(path):
+        records.lost[-1] = f"the scan is being recorded: what comes after {records.last_ns / 1e9:.3f} s is not in it yet"
     schema = records.metadata.get("tactile-bayes", {}).get("schema")
     if schema is None:
         what = "is cut off in its header" if records.lost else "is an MCAP file, but not a scan of this program"
@@ -413,10 +415,14 @@ def create_exclusive(path: Path, *, force: bool) -> IO[bytes]:
     return stream
 
 
-def refuse_recording(path: Path) -> None:
-    """Raise `UsageError` when a file is being recorded right now."""
+def is_recording(path: Path) -> bool:
+    """True while a recorder holds the file locked; False too where that cannot be told."""
     with suppress(OSError), path.open("rb") as stream:  # whoever reads it says what is wrong with it
-        _lock(stream, path)
+        try:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 def _lock(stream: IO[bytes], path: Path) -> None:

@@ -228,6 +228,7 @@ def test_a_file_that_is_being_recorded_is_left_alone(tmp_path, run_cli):
         done = run_cli("repair", "a.mcap", cwd=tmp_path)
         assert done.returncode == 2
         assert "a.mcap is being recorded; wait for its end" in done.stderr
+        assert "is being recorded: what comes after" in run_cli("show", "a.mcap", cwd=tmp_path).stdout
     assert path.read_bytes() == whole[:-50]
     with create_exclusive(path, force=True) as stream, pytest.raises(UsageError, match="is being recorded"):
         create_exclusive(path, force=True)
