@@ -47,6 +47,7 @@ from tactile_bayes.size.visits import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+_LARGEST_SHARE = 3.0  #: Of a growth that is asked for; what is larger is surely in percent.
 
 # --- Two visits and more compared: whether they are of one mass, and the change of its size.
 
@@ -426,6 +427,9 @@ def compare(
     visit_dates = None if dates is None else list_of("dates", dates, "dates, one for each visit")
     times = days_from_first(None if later is None else list(later), visit_dates)
     shares = tuple(plain(one) for one in list_of("grown_by", grown_by, "shares, such as 0.2 for 20 %"))
+    for share in shares:
+        if isinstance(share, int | float) and share > _LARGEST_SHARE:
+            raise UsageError(f"grown_by {share:g} is {100 * share:g} %; give a share: {share / 100:g} for {share:g} %")
     comparing = CompareOptions(times, shares, same_mass, plain(registration_mm))
     comparing.check_visits(2 + len(more))
     visits = [

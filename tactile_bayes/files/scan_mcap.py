@@ -291,7 +291,8 @@ def scan_records(path: Path, *, keep: Collection[str]) -> McapRecords:
     """Read all records of a scan of a known version; of topics not in `keep` only the times."""
     records = read_records(path, keep=keep)
     if records.lost and not records.finished and is_recording(path):
-        records.lost[-1] = f"the scan is being recorded: what comes after {records.last_ns / 1e9:.3f} s is not in it yet"
+        last_s = records.last_ns / 1e9
+        records.lost[-1] = f"the scan is being recorded: what comes after {last_s:.3f} s is not in it yet"
     schema = records.metadata.get("tactile-bayes", {}).get("schema")
     if schema is None:
         what = "is cut off in its header" if records.lost else "is an MCAP file, but not a scan of this program"

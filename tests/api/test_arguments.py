@@ -127,7 +127,7 @@ CALLS: dict[str, tuple[Callable[..., Any], str]] = {
     "growth as a number": (lambda one: tb.compare(one, one, grown_by=0.2), "grown_by is 0.2"),  # type: ignore[arg-type]
     "growth in percent": (
         lambda one: tb.compare(one, one, grown_by=[20]),
-        r"grown_by\[0\] is 20; give a number above -1",
+        "grown_by 20 is 2000 %; give a share: 0.2 for 20 %",
     ),
     "a shift as text": (lambda one: tb.compare(one, one, registration_mm="5"), "registration_mm is '5'"),  # type: ignore[arg-type]
     "a title of no text": (lambda one: one.report("x.html", title=3), "title is 3; give a text"),
