@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final, Literal, get_args
 
 from tactile_bayes.declarations import Record, from_plain, replace, set_fields
@@ -111,14 +111,23 @@ def verdict(findings: Iterable[Finding], *, answered: bool) -> Verdict:
 
 def finding_lines(findings: Iterable[Finding], severity: Severity | None = None, *, paper: bool = False) -> list[str]:
     """A line for each finding, cautions first; with `severity` those of one severity alone."""
-    chosen = [one for one in by_severity(findings) if severity in (None, one.severity)]
-    return [f"{LEADS[one.severity]}{one.sentence(paper=paper)}." for one in chosen]
+    return [f"{LEADS[one.severity]}{one.sentence(paper=paper)}." for one in _said_once(findings, severity)]
 
 
 def finding_summary(findings: Iterable[Finding], severity: Severity, *, most: int) -> list[str]:
     """One line of the first findings of one severity and the number of the others; empty without any."""
-    texts = [one.sentence() for one in by_severity(findings) if one.severity == severity]
+    texts = [one.sentence() for one in _said_once(findings, severity)]
     return first_texts(texts, most=most, lead=LEADS[severity])
+
+
+def _said_once(findings: Iterable[Finding], severity: Severity | None) -> Iterator[Finding]:
+    """Findings of a severity, cautions first; those that differ only in what they are about as one about all of it."""
+    about: dict[tuple[Finding, bool], list[str]] = {}
+    for one in by_severity(findings):
+        if severity in (None, one.severity):
+            about.setdefault((replace(one, about=""), bool(one.about)), []).append(one.about)
+    for (one, _), (*others, last) in about.items():
+        yield replace(one, about=f"{', '.join(others)} and {last}" if others else last)
 
 
 def first_texts(texts: Sequence[str], *, most: int, lead: str) -> list[str]:

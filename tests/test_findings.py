@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.findings import by_severity, counted, finding, first_of, verdict
+from tactile_bayes.findings import by_severity, counted, finding, finding_lines, finding_summary, first_of, verdict
 
 CAUTION = finding("late_poses", "poses came late", remedy="--latency-ms auto", on_paper="map the scan again")
 CHECK = finding("few_strokes", "the scan has 2 strokes only")
@@ -19,6 +19,13 @@ def test_a_caution_makes_a_result_doubtful_and_a_check_does_not():
 
 def test_cautions_come_first_and_each_finding_once():
     assert by_severity([CHECK, CAUTION, CHECK]) == (CAUTION, CHECK)
+
+
+def test_what_is_found_on_several_maps_is_said_once():
+    found = [CAUTION, *(one.labelled(f"map {number}") for number in (1, 2, 4) for one in (CHECK, CAUTION))]
+    _, caution, check = finding_lines(found)
+    assert caution == "CAUTION: map 1, map 2 and map 4: poses came late; --latency-ms auto."
+    assert [check] == finding_summary(found, "check", most=2) == finding_lines(found, "check")
 
 
 def test_paper_never_reads_an_option():
