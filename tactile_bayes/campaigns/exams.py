@@ -72,7 +72,7 @@ class NamePattern:
         if touching := re.search(r"\}(\{|\*)|\*\{", pattern):
             raise UsageError(f"{pattern!r} has nothing between two words ({touching[0]}); say what parts them")
         self._parts = 1 + pattern.count("/")
-        self._with_ending = pattern.lower().endswith(_ENDINGS)
+        self._with_ending = pattern.lower().endswith((*_ENDINGS, ".*"))
         parts = re.split(r"(\{\w+\}|\*)", pattern)
         self._names = re.compile("".join(map(self._part, ["", *parts], parts, [*parts[1:], ""])))
 

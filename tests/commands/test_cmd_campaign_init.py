@@ -190,6 +190,7 @@ def told(folder: Path, *columns: str) -> list[tuple[str, ...]]:
     [
         ("{patient}_{visit}_{exam}.npz", ("P01_2_02.npz", "P01_2_1.npz"), [("P01", "2", "2"), ("P01", "2", "1")]),
         ("{patient}_{visit}_{exam}", ("P-1_a_7.mat",), [("P-1", "a", "7")]),
+        ("{patient}_{visit}_{exam}.*", ("P-1_a_7.mat", "P2_b_1.npz"), [("P-1", "a", "7"), ("P2", "b", "1")]),
         ("{patient}/visit{visit}-{exam}.npz", ("P01/visit2-1.npz", "P02/visit1-1.npz"),
          [("P01", "2", "1"), ("P02", "1", "1")]),
         ("scan*_{patient}_{visit}", ("scan 17 neu_P01_3.npz",), [("P01", "3", "1")]),
