@@ -54,6 +54,8 @@ def emulate_action(
             "an NDI tracker sends nothing by itself: --drop, --corrupt, --stall, --disconnect and --once have nothing "
             "to act on; leave them out, or emulate another protocol"
         )
+    if kind == "head" and (faults.hold > 1 or faults.hide or faults.breathe_mm):
+        raise UsageError("--hold, --hide and --breathe are a tracker's; leave them out, or emulate a tracker or both")
     if protocol == "igtlink" and "tracker" in roles and tcp is None:
         raise UsageError("OpenIGTLink is spoken over a network; give --tcp 127.0.0.1:0")
     shared = stage if kind == "both" else None
@@ -87,6 +89,8 @@ def emulate_action(
     finally:
         for role, emulator in zip(roles, emulators, strict=True):
             words = f"{emulator.sent} records sent, {emulator.dropped} dropped, {emulator.faulty} spoilt on request"
+            if isinstance(emulator.device, EmulatedNdi):
+                words = "poses were sent as they were asked for, and not counted"
             click.echo(f"{role}: {words}" if kind == "both" else words, err=True)
 
 

@@ -220,9 +220,14 @@ def test_faults_have_nothing_to_act_on(run_cli, tmp_path):
     from tactile_bayes.files.scan_mcap import write_scan
 
     write_scan(tmp_path / "a.mcap", short_scan(0.2), provenance=Provenance("test", {}))
-    done = run_cli("emulate", "tracker", "a.mcap", "--protocol", "ndi", "--drop", "0.1", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "sends nothing by itself" in done.stderr
+    of_no_effect = {
+        "sends nothing by itself": ("tracker", "--protocol", "ndi", "--drop", "0.1"),
+        "--hold, --hide and --breathe are a tracker's": ("head", "--hold", "3"),
+    }
+    for words, (device, *options) in of_no_effect.items():
+        done = run_cli("emulate", device, "a.mcap", *options, cwd=tmp_path)
+        assert done.returncode == 2
+        assert words in done.stderr
 
 
 def test_the_emulated_tracker_speaks_as_the_guide_prints_it():
