@@ -52,6 +52,12 @@ def cut(*, right: int) -> np.ndarray:
             "window",
             "strokes 13 mm to the picture's right",
         ),
+        (
+            bump_values(x=32.0, y=0.0, amplitude=1.5, sigma_x=7.0, sigma_y=7.0) + WHITE,
+            "window",
+            "strokes 14 mm to the picture's right",
+        ),
+        (bump_values(x=36.0, y=0.0, amplitude=1.5, sigma_x=10.0, sigma_y=10.0) + WHITE, "window", "beyond it"),
     ],
 )
 def test_the_reason_has_a_code_and_a_way_out(values: np.ndarray, code: str, advice: str) -> None:
