@@ -115,6 +115,20 @@ def _moved(parts: Sequence[SelectedFrames], plane: Plane, told: _Parts) -> tuple
     return ()
 
 
+def _landmarks_moved(selections: Sequence[SelectedFrames]) -> tuple[Finding, ...]:
+    """Caution where both landmarks of two scans lie apart the same way: over a faint lump nothing else tells."""
+    touched = [part.scan.landmarks for part in selections if part.scan.landmarks is not None]
+    middles = [(marks.sternal_notch_mm + marks.xiphoid_mm) / 2 for marks in touched]
+    apart = max((float(np.linalg.norm(one - other)) for one, other in combinations(middles, 2)), default=0.0)
+    if apart <= LANDMARKS_MOVED_MM:
+        return ()
+    text = (
+        f"the landmarks of two scans lie {apart:.0f} mm apart on average: patient or tracker moved between them, and "
+        "one lump may be missed or taken for two"
+    )
+    return (finding("frames_contradict", text, _SCANS.remedy, _SCANS.on_paper),)
+
+
 def _ends(selection: SelectedFrames) -> list[SelectedFrames]:
     """The first and the last third of a scan's used frames."""
     every = np.arange(len(selection.used))
@@ -213,6 +227,8 @@ def stroke_figures(strokes: Sequence[latency.StrokeShift]) -> dict[str, float]:
 # --- Building of a tactile map from scans.
 
 MAX_LANDMARK_SHIFT_MM = 20.0  #: Landmarks of one examination lie nearer to their mean, or patient or tracker moved.
+LANDMARKS_MOVED_MM = 10.0
+"""Distance between the middles of two scans' landmarks that tells a motion: 99 % of touches by 3 mm (SD) lie nearer."""
 _SHARED_FACTS = ("subject", "side", "visit", "posture")  #: Facts of the session that scans of one exam have in common.
 
 
@@ -275,7 +291,8 @@ def _build(
         figures |= radius_figures
     if not any(one.kind == "frames_contradict" for one in findings):
         findings += _numbered([_moved(_ends(part), plane, _ENDS) for part in selections])
-    findings += _moved(selections, plane, _SCANS) if len(selections) > 1 else ()
+    if len(selections) > 1:
+        findings += _moved(selections, plane, _SCANS) or _landmarks_moved(selections)
     sources = accumulate.frame_sources(selections, plane_from_base=plane.plane_from_base, cell_mm=settings.cell_mm)
     if settings.register_strokes:
         sources, strokes = latency.register_strokes(sources)

@@ -412,6 +412,17 @@ def test_a_head_whose_rim_presses_harder_has_not_moved():
     assert [one for one in build_map(felt).findings if one.kind == "frames_contradict"] == []
 
 
+@pytest.mark.parametrize(("notch_mm", "xiphoid_mm", "told"), [(12, 12, True), (9, 9, False), (0, 18, False)])
+def test_landmarks_that_lie_apart_tell_that_a_patient_moved_between_scans(notch_mm, xiphoid_mm, told):
+    """Two scans displaced by 10 mm had no lump by their map, where the same at rest had one of 15 mm."""
+    scan = scans.make_scan(scans.strokes(), field=scans.uniform)
+    marks, up = MARKS, np.array([0.0, 0.0, 1.0])
+    moved = Landmarks(marks.sternal_notch_mm + notch_mm * up, marks.xiphoid_mm + xiphoid_mm * up)
+    built = build_map([replace(scan, landmarks=marks), replace(scan, landmarks=moved)])
+    found = [one.text for one in built.findings if one.kind == "frames_contradict"]
+    assert [text.startswith("the landmarks of two scans lie 12 mm apart") for text in found] == [True] * told
+
+
 def test_scans_that_do_not_belong_together_are_refused():
     scan = stroke_scan()
     moved = Landmarks(MARKS.sternal_notch_mm + np.array([0, 0, 60.0]), MARKS.xiphoid_mm)
