@@ -10,7 +10,7 @@ import numpy as np
 
 from tactile_bayes.declarations import Record
 from tactile_bayes.errors import CANNOT_SHOW, Abstention, UsageError
-from tactile_bayes.geometry import BoolArray, FloatArray
+from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap, orientation_of
 from tactile_bayes.mapping.plausibility import against_no_lump
 from tactile_bayes.options import PRIORS, BumpPrior, FitSettings
@@ -295,23 +295,18 @@ def coverage_shortfall(tactile_map: TactileMap, centre_mm: tuple[float, float], 
     """
     cell, mask = tactile_map.recipe.cell_mm, trusted_cells(tactile_map)
     dx, dy = tactile_map.x_mm - centre_mm[0], tactile_map.y_mm[:, None] - centre_mm[1]
+    rings_mm = (np.arange(np.ceil(reach_mm / cell)) + 0.5) * cell
+    least = np.maximum(LEAST_SEEN * 2 * np.arange(1, len(rings_mm)), 1)  # next to the corner one cell is enough
     shortfall, view = {}, orientation_of(tactile_map)
     for axis, (x, y) in SIDES.items():
         along, across = dx * x + dy * y, np.abs(dx * y - dy * x)
-        sector = across <= along
-        reached = _covered_distance(along[sector], mask[sector], cell, reach_mm)
-        if reach_mm - reached >= cell:
-            shortfall[view.side_words(axis)] = reach_mm - reached
+        ring = np.digitize(along[(across <= along) & mask], rings_mm)
+        covered = np.bincount(ring, minlength=len(rings_mm))[1 : len(rings_mm)]
+        open_rings = np.flatnonzero(covered < least)
+        short = reach_mm - rings_mm[open_rings[0]] if len(open_rings) else 0.0
+        if short >= cell:
+            shortfall[view.side_words(axis)] = float(short)
     return shortfall
-
-
-def _covered_distance(along: FloatArray, covered: BoolArray, cell: float, reach: float) -> float:
-    """Distance in mm to which a sector of 90 degrees is covered; next to its corner one covered cell is enough."""
-    for step in range(1, int(np.ceil(reach / cell))):
-        ring = (along >= (step - 0.5) * cell) & (along < (step + 0.5) * cell)
-        if covered[ring].sum() < (LEAST_SEEN * 2 * step if step > 1 else 1):
-            return max(step - 0.5, 0.0) * cell
-    return reach
 
 
 def rim_fault(tactile_map: TactileMap, bump: ModalBump, *, radius_mm: float) -> str:
