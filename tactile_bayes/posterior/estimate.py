@@ -405,7 +405,7 @@ def _findings(result: MapDraws, *, cell_mm: float) -> Iterator[Finding]:
     """Cautions and checks on the size of a lump, besides those on its map."""
     posterior, calibration = result.posterior, result.calibration
     if calibration is not None:
-        beyond = [] if result.size is None else calibration.beyond_lumps(result.size.median_mm)
+        beyond = [] if result.size is None else calibration.beyond_lumps(result.size)
         for text in (*calibration.outside(*posterior.medians), *beyond):
             yield finding("outside_calibration", f"{terms.UNLIKE_LEARNED}: {text}")
         if (cosines := result.figures.get("field_cosines", FIELD_COSINES)) < FIELD_COSINES:

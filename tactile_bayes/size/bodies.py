@@ -30,7 +30,7 @@ from tactile_bayes.declarations import Meta, Record, replace
 from tactile_bayes.errors import BadDataError, UsageError, check_number, suggestion
 from tactile_bayes.geometry import BoolArray, FloatArray, Matrix, Vector
 from tactile_bayes.size import terms
-from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, Supposition
+from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, SizePosterior, Supposition
 from tactile_bayes.size.eq6 import Eq6Law, Power, Powers, eq6_coefficients, eq6_log_size, eq6_terms
 from tactile_bayes.size.terms import SiteShift
 
@@ -289,9 +289,9 @@ class BodyCalibration(BodyLaw, eq=False, kw_only=True):
         inside[inside] = self.leverage(amplitude[inside], sigma_mm[inside]) <= FARTHEST_LEVERAGE
         return inside
 
-    def beyond_lumps(self, largest_mm: float) -> list[str]:
-        """Text on a size beyond the table's lumps; empty within."""
-        return terms.beyond_lumps(self.domain, largest_mm)
+    def beyond_lumps(self, size: SizePosterior) -> list[str]:
+        """Texts on a size beyond the table's lumps; empty within."""
+        return terms.beyond_lumps(self.domain, size.median_mm, size.axis_ratio)
 
     def omissions(self) -> list[str]:
         """Sources of error that a size does not contain, in words."""

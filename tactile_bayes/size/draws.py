@@ -248,6 +248,11 @@ class SizePosterior(Record, eq=False):
         return float(np.median(finite)) if finite.size else float("nan")
 
     @property
+    def axis_ratio(self) -> float:
+        """Median ratio of the larger diameter to the smaller."""
+        return float(np.nanmedian(self.max_size_mm / self.min_size_mm))
+
+    @property
     def leading(self) -> SizePosterior:
         """The sizes that reports lead with, as `files.reports.Sized.leading`."""
         return self if self.another_exam is None else self.another_exam

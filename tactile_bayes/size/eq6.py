@@ -178,9 +178,9 @@ class SizeCalibration(Record, eq=False):
         by_x = terms.within_reach(self.x.domain, amplitude, sigma_x_mm)
         return np.asarray(by_x & terms.within_reach(self.y.domain, amplitude, sigma_y_mm))
 
-    def beyond_lumps(self, largest_mm: float) -> list[str]:
-        """Text on a size beyond the tables' lumps; empty within."""
-        return terms.beyond_lumps(self.x.domain, largest_mm)
+    def beyond_lumps(self, size: SizePosterior) -> list[str]:
+        """Texts on a size beyond the tables' lumps; empty within."""
+        return terms.beyond_lumps(self.x.domain, size.median_mm, size.axis_ratio)
 
     def omissions(self) -> list[str]:
         """Sources of error that a size does not contain, in words."""

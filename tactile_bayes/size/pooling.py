@@ -340,7 +340,7 @@ def pool_maps(
     if size.invalid > MOST_INVALID * size.d_x_mm.size:
         return PooledEstimate("no_estimate", f"no positive size in {size.invalid} of {size.d_x_mm.size} draws")
     outside = [f"map {i + 1}: {text}" for i, middle in named for text in at_depth.outside(*middle)]
-    outside += at_depth.beyond_lumps(size.median_mm)
+    outside += at_depth.beyond_lumps(size)
     reason = "" if found_on == len(shapes) else few
     if found_on > 1:
         map_numbers = {i: number for number, i in enumerate(sorted(places), start=1)}

@@ -257,12 +257,18 @@ def within_reach(domain: Domain, amplitude: FloatArray, sigma_mm: FloatArray) ->
     return inside
 
 
-def beyond_lumps(domain: Domain, largest_mm: float) -> list[str]:
-    """Text on a size beyond the lumps of a table, where the law extrapolates; empty within."""
-    low, high = domain["d_mm"]
-    if not (largest_mm < low or largest_mm > high):
-        return []
-    return [f"largest size {largest_mm:.3g} mm (the table's lumps: {low:.3g} to {high:.3g} mm)"]
+LONGEST: Final = 2.0
+"""Axis ratio of a size from which it is a caution: balls come out with 1.2 at most, lumps of 2:1 are off by 18 %."""
+
+
+def beyond_lumps(domain: Domain, largest_mm: float, axis_ratio: float) -> list[str]:
+    """Texts on a size beyond the lumps of a table, which are balls; empty within."""
+    (low, high), texts = domain["d_mm"], []
+    if largest_mm < low or largest_mm > high:
+        texts.append(f"largest size {largest_mm:.3g} mm (the table's lumps: {low:.3g} to {high:.3g} mm)")
+    if axis_ratio >= LONGEST:
+        texts.append(f"{axis_ratio:.1f} times as long as wide: a scar, a fold of skin or a rib's end looks so")
+    return texts
 
 
 def extrapolated(far: Sequence[str]) -> Abstention:

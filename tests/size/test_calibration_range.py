@@ -21,6 +21,7 @@ from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import BumpDraws, ShapeDraws
 from tactile_bayes.size.pooling import SizePriors, pool_maps
+from tactile_bayes.size.terms import beyond_lumps
 
 SHIPPED = size_calibration_path("solid")
 EVEN = (0.0, 0.0, 0.0)
@@ -154,8 +155,17 @@ def test_a_size_beyond_the_tables_lumps_is_cautioned(shipped: BodyCalibration, s
     assert pooled.size is not None
     assert (pooled.size.median_mm > 30.0) == told
     assert any(text.endswith("(the table's lumps: 5 to 30 mm)") for text in pooled.outside) == told
-    assert shipped.beyond_lumps(4.0) == ["largest size 4 mm (the table's lumps: 5 to 30 mm)"]
-    assert shipped.beyond_lumps(float("nan")) == []
+
+
+def test_a_size_far_longer_than_wide_is_cautioned(shipped: BodyCalibration) -> None:
+    """A hard scar of 21 mm by 3 was sized as a lump of 13 mm without a word: sizes were learned from balls."""
+    assert beyond_lumps(shipped.domain, 4.0, 1.9) == ["largest size 4 mm (the table's lumps: 5 to 30 mm)"]
+    assert beyond_lumps(shipped.domain, float("nan"), float("nan")) == []
+    shape = ShapeDraws.of(BumpDraws(*(np.full(400, value) for value in (0.35, 5.3, 1.8, 0.0))))
+    pooled = pool_maps([shape], calibration=shipped, priors=SizePriors(), rng=np.random.default_rng(1))
+    assert any(
+        "times as long as wide: a scar, a fold of skin or a rib's end looks so" in text for text in pooled.outside
+    )
 
 
 def test_the_live_view_begins_with_the_caution() -> None:
