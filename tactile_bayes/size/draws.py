@@ -212,6 +212,11 @@ class Supposition(Record):
         return median, low, high
 
 
+def _finite_median(values: FloatArray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else float("nan")
+
+
 class SizePosterior(Record, eq=False):
     """Draws of the lump's size: (chain, draw) diameters along the axes nearest to the head's x and y, mm.
 
@@ -244,13 +249,12 @@ class SizePosterior(Record, eq=False):
     @property
     def median_mm(self) -> float:
         """Median of the largest diameter over the draws that gave one; NaN where none did."""
-        finite = self.max_size_mm[np.isfinite(self.max_size_mm)]
-        return float(np.median(finite)) if finite.size else float("nan")
+        return _finite_median(self.max_size_mm)
 
     @property
     def axis_ratio(self) -> float:
-        """Median ratio of the larger diameter to the smaller."""
-        return float(np.nanmedian(self.max_size_mm / self.min_size_mm))
+        """Median ratio of the larger diameter to the smaller; NaN where no draw gave a size."""
+        return _finite_median(self.max_size_mm / self.min_size_mm)
 
     @property
     def leading(self) -> SizePosterior:

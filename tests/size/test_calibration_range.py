@@ -19,7 +19,7 @@ from tactile_bayes.files.size_json import read_size_calibration, size_calibratio
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import HEAD_PROFILE
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.draws import BumpDraws, ShapeDraws
+from tactile_bayes.size.draws import BumpDraws, ShapeDraws, SizePosterior
 from tactile_bayes.size.pooling import SizePriors, pool_maps
 from tactile_bayes.size.terms import beyond_lumps
 
@@ -160,7 +160,8 @@ def test_a_size_beyond_the_tables_lumps_is_cautioned(shipped: BodyCalibration, s
 def test_a_size_far_longer_than_wide_is_cautioned(shipped: BodyCalibration) -> None:
     """A hard scar of 21 mm by 3 was sized as a lump of 13 mm without a word: sizes were learned from balls."""
     assert beyond_lumps(shipped.domain, 4.0, 1.9) == ["largest size 4 mm (the table's lumps: 5 to 30 mm)"]
-    assert beyond_lumps(shipped.domain, float("nan"), float("nan")) == []
+    without_any = SizePosterior(*[np.full((1, 3), np.nan)] * 2, {}, 3, np.zeros(3))
+    assert beyond_lumps(shipped.domain, without_any.median_mm, without_any.axis_ratio) == []
     shape = ShapeDraws.of(BumpDraws(*(np.full(400, value) for value in (0.35, 5.3, 1.8, 0.0))))
     pooled = pool_maps([shape], calibration=shipped, priors=SizePriors(), rng=np.random.default_rng(1))
     assert any(
