@@ -434,14 +434,12 @@ def inflated_errors(cells: FitCells, fit: LeastSquaresFit, weight: FloatArray) -
     dof = max(k - p, 1)
     residual = fit.residual - fitted_tilt(cells, fit.residual, weight=weight)
     noise_variance = float(weight @ residual**2) / dof
-    if not noise_variance > 0 or k <= p:
+    information = inverse_information(fit.jacobian, weight)
+    if not noise_variance > 0 or k <= p or not np.isfinite(information).all():
         return ErrorModel(float(np.sqrt(max(noise_variance, 0.0))), 1.0, float(dof))
     white = residual * np.sqrt(weight / noise_variance)
     correlation, half = residual_autocorrelation(*cells.on_grid(np.stack([white, np.ones(k)])))
     root = fit.jacobian * np.sqrt(weight)[:, None]
-    information = inverse_information(fit.jacobian, weight)
-    if not np.isfinite(information).all():
-        return ErrorModel(float(np.sqrt(noise_variance)), 1.0, float(dof))
     correlated = _correlate_columns(cells, root, correlation, half)
     inflation = float(np.trace(information @ (root.T @ correlated)) / p)
     inflation = float(np.clip(inflation, 1.0, k / (p + MINIMUM_DOF)))

@@ -52,6 +52,9 @@ class SamplerSettings(FitSettings, kw_only=True):
 
 def check_options(options: SamplerSettings) -> None:
     """`UsageError` for options that contradict each other."""
+    if options.method in ("optimise", "laplace") and (options.accuracy_sd or options.accuracy_mm):
+        fault = f"method {options.method} draws once, to no stated accuracy; leave out --accuracy-sd and accuracy_mm"
+        raise UsageError(f"{fault}, or give --method importance")
     if not options.correlated:
         options_in_use = {
             "a scene": options.scene not in ("auto", "none"),

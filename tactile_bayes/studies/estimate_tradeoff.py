@@ -308,9 +308,7 @@ def settings_of(options: SamplerSettings, *, level_known: bool) -> list[Estimate
     if options.method != "optimise":
         level: Background = "fixed" if level_known else "free"
         # another model: no noise field, no prior
-        plain = replace(
-            options, method="optimise", scene="auto", accuracy_mm=None, noise="independent", background=level
-        )
+        plain = replace(_with_method(options, "optimise"), scene="auto", noise="independent", background=level)
         settings.append(EstimateSetting(METHOD, "--method optimise", plain, 0.5, usable=False))
     for method, weight in (("laplace", 1.0), ("importance", 1.0), ("ensemble", 8.0)):
         if method != options.method:

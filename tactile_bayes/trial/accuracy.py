@@ -103,8 +103,7 @@ def share_interval(share: float, number: float, *, confidence: float) -> Ends:
 
 
 def accuracy_figures(sizes: ModalitySizes, *, intervals: Intervals) -> dict[str, Figure]:
-    """Accuracy of one modality: `mape_percent`, `mae_mm` (a mass not detected has size 0), the same over detected
-    masses only, weighted and median percent errors, and `bias_percent` (detected only: 0 has no logarithm)."""
+    """Accuracy of one modality, by the fields of its report; the bias is of detected masses: 0 has no logarithm."""
     detected = sizes.only_detected()
     bias = figure(geometric_ratio, detected, scale="log", intervals=intervals)
     on_log = partial(figure_with_misses, scale="log", intervals=intervals)

@@ -65,8 +65,12 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "cosines as text": ({"field_cosines": "8"}, "field_cosines is '8'; give a whole number from 6 to 40"),
     "a calibration that is none": ({"size_calibration": 3}, "a path is wanted, not int"),
     "a repeatability that is none": ({"repeatability": 3}, "a path is wanted, not int"),
+    "an accuracy of least squares": ({"method": "laplace", "accuracy_sd": 0.01}, 'or give method="importance"$'),
     "a checkpoint of no chain": ({"checkpoint": "c.npz"}, 'give method="ensemble"$'),
-    "an accuracy of white noise": ({"noise": "independent", "accuracy_mm": 0.1}, 'needs .*give noise = "field"$'),
+    "an accuracy of white noise": (
+        {"method": "importance", "noise": "independent", "accuracy_mm": 0.1},
+        'needs .*give noise = "field"$',
+    ),
 }
 
 
