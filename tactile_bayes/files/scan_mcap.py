@@ -407,11 +407,12 @@ def create_exclusive(path: Path, *, force: bool) -> IO[bytes]:
         stream = os.fdopen(os.open(path, flags, 0o600), "wb")
     except OSError as error:
         raise UsageError(f"{path} cannot be written ({error.strerror}); choose another place") from None
-    try:
-        _lock(stream, path)
-    except UsageError:
-        stream.close()
-        raise
+    with suppress(OSError):  # some network file systems have no locks
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            stream.close()
+            raise UsageError(f"{path} is being recorded; wait for its end, or choose another name") from None
     stream.truncate(0)
     return stream
 
@@ -424,15 +425,6 @@ def is_recording(path: Path) -> bool:
         except BlockingIOError:
             return True
     return False
-
-
-def _lock(stream: IO[bytes], path: Path) -> None:
-    try:
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise UsageError(f"{path} is being recorded; wait for its end, or choose another name") from None
-    except OSError:
-        return  # some network file systems have no locks
 
 
 class RecordingWriter(ScanWriter):

@@ -326,8 +326,8 @@ class DeviceClock:
 
 def wrap_period(before_ns: int, after_ns: int, *, passed_ns: int) -> int | None:
     """Period of `WRAPS_NS` that explains a counter's restart by the time passed, if any."""
-    passed = [ns for ns in WRAPS_NS if before_ns < ns and abs(after_ns + ns - before_ns - passed_ns) < _SLIP_NS]
-    return passed[0] if passed else None
+    fits = (ns for ns in WRAPS_NS if before_ns < ns and abs(after_ns + ns - before_ns - passed_ns) < _SLIP_NS)
+    return next(fits, None)
 
 
 class PoseClock:
