@@ -180,22 +180,18 @@ def calibration_line(name: str, calibration: Calibration, *, sigma_mm: float) ->
         line += f" ({calibration.source}{head}); "
         beside = "" if calibration.residual is None else " and its residual"
         line += f"Eq 6 for this map: {constants_text(calibration.constants(sigma_mm))}{beside}; "
-        line += f"{fat_text(calibration.fat_mm)}{unknowns_text(calibration.unknowns)}"
+        line += unknowns_text(calibration.unknowns, calibration.fat_mm)
     return line
 
 
-def fat_text(fat_mm: float | None) -> str:
-    """Depth of the fat that sizes use, to stand before `unknowns_text`; empty where they use none."""
-    if fat_mm is None:
-        return ""
-    return f"fat under the head {fat_mm:.1f} mm deep, from the pressure profile away from the lump; "
-
-
-def unknowns_text(unknowns: Mapping[str, float]) -> str:
-    """Share of the variance between bodies that knowing each property would remove, largest first."""
+def unknowns_text(unknowns: Mapping[str, float], fat_mm: float | None = None) -> str:
+    """Depth of the fat that sizes use, and the variance that knowing each property would remove, largest first."""
     ranked = sorted(unknowns.items(), key=lambda pair: -pair[1])
     parts = [f"{UNKNOWN_NAMES.get(name, name)} {100 * share:.0f} %" for name, share in ranked if share >= 0.005]
-    return "share of the variance between bodies that knowing one property removes: " + (", ".join(parts) or "none")
+    depth = f"fat under the head {fat_mm:.1f} mm deep, from the pressure profile away from the lump; " if fat_mm else ""
+    return (
+        f"{depth}share of the variance between bodies that knowing one property removes: {', '.join(parts) or 'none'}"
+    )
 
 
 # --- A size calibration as text for people.

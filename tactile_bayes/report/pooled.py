@@ -9,21 +9,12 @@ import numpy as np
 from tactile_bayes.declarations import UNSET
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scans_of
 from tactile_bayes.files.reports import POOLED, EstimateReport, Interval, MassReport, PooledMap, PooledReport
-from tactile_bayes.findings import (
-    Finding,
-    capitalised,
-    finding,
-    finding_lines,
-    finding_summary,
-    first_lines,
-    first_of,
-    verdict,
-)
+from tactile_bayes.findings import Finding, finding, finding_lines, finding_summary, first_lines, first_of, verdict
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.posterior.verdict import chance_text
 from tactile_bayes.presets import MATCH_MM, RESEARCH_USE
 from tactile_bayes.report import estimate_text
-from tactile_bayes.report.calibration import fat_text, site_words, unknowns_text
+from tactile_bayes.report.calibration import site_words, unknowns_text
 from tactile_bayes.report.estimate_document import another_exam, supposed_line, supposed_lines, suppositions
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import EXTREMES, LEAST_PROBABILITY
@@ -268,7 +259,7 @@ def pooled_text(report: PooledReport) -> str:
     lines.append(estimate_text.shape_text(figures))
     ends = estimate_text.ends_text("sizes", worst.mc_error, worst.sd)
     lines.append(f"Monte-Carlo error of the interval ends: {ends}.")
-    lines.append(f"{capitalised(fat_text(report.fat_mm) + unknowns_text(report.unknowns))}.")
+    lines.append(f"{unknowns_text(report.unknowns, report.fat_mm).capitalize()}.")
     lines += [f"Sizes by {report.site}."] if report.site else []
     lines += [f"{report.known_words.capitalize()}."] if report.known_words else []
     lines += [f"Left out: {'; '.join(report.left_out)}."] if report.left_out else []
