@@ -191,15 +191,15 @@ def live_estimate(tactile_map: TactileMap, calibration_path: str | None, rises: 
         lump = apply(inverse(tactile_map.plane_from_base), np.array(centre_mm))
     if estimate.size is not None:
         cautions = finding_summary(estimate.findings, "caution", most=1)
-        return LiveAnswer(" ".join([*cautions, _interval("largest size", estimate.size.max_size_mm, INTERVAL)]), lump)
+        return LiveAnswer(" ".join([*cautions, _interval("largest size", estimate.size.max_size_mm)]), lump)
     widths = np.maximum(estimate.map_posterior.sigma_x_mm, estimate.map_posterior.sigma_y_mm)
-    return LiveAnswer(_interval("map width sigma", widths, INTERVAL), lump)
+    return LiveAnswer(_interval("map width sigma", widths), lump)
 
 
-def _interval(name: str, draws: FloatArray, probability: float) -> str:
-    tail = (1 - probability) / 2
+def _interval(name: str, draws: FloatArray) -> str:
+    tail = (1 - INTERVAL) / 2
     low, middle, high = np.nanquantile(draws, [tail, 0.5, 1 - tail])
-    return f"{name} {middle:.1f} mm ({low:.1f} to {high:.1f}, {100 * probability:g} % equal-tailed)"
+    return f"{name} {middle:.1f} mm ({low:.1f} to {high:.1f}, {100 * INTERVAL:g} % equal-tailed)"
 
 
 def run(pipe: int, setup: dict[str, Any]) -> None:

@@ -290,7 +290,10 @@ class Recorder:
                 self._check_silence(now)
                 self._check_host_time(now)
         finally:
-            self._stop_devices()
+            for line in self._lines:
+                with contextlib.suppress(DeviceError):  # of one that has gone
+                    line.port.write(line.stop)
+                line.stream.stop()
             self._add_cautions()
             self._update_report()
         return self.report
@@ -515,13 +518,6 @@ class Recorder:
         if self.recording and self.tracker is not None and report.last_ns - self._pose_ns > _HIDDEN_NS:
             self._note_unseen(report.unseen or "nothing is sent", self._heard_ns)
         self.observer.report(report)
-
-    def _stop_devices(self) -> None:
-        """Send stop commands to the devices that are still there."""
-        for line in self._lines:
-            with contextlib.suppress(DeviceError):
-                line.port.write(line.stop)
-            line.stream.stop()
 
 
 def _counts_in_words(counted: Counter[str]) -> str:

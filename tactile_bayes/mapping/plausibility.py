@@ -285,10 +285,7 @@ def _unlike(quality: Mapping[str, float], head: HeadShape | None) -> Iterator[tu
         yield text, "check that pitch and surface are in mm, and which axis is which"
     spans = [quality[name] for name in ("span_x_mm", "span_y_mm") if name in quality]
     if spans and max(spans) > MOST_SPAN_MM:
-        yield (
-            f"the places spread over {max(spans):,.0f} mm: no breast does",
-            "check that positions are in mm and that none jumps",
-        )
+        yield f"the places spread over {max(spans):,.0f} mm: no breast does", "check that they are in mm and none jumps"
 
 
 _ONE_TOOL: Final = "record one tool of the tracker (docs/trackers.md), or leave the other poses out"

@@ -245,7 +245,7 @@ def test_a_clock_that_stands_still_is_told_and_a_map_without_times_is_not_doubte
             {"frames_used": 480.0, "plateau_readings": 50.0, "plateau_count": 2400.0},
             "state it at its import: --saturation",
         ),
-        ({"frames_used": 480.0, "span_x_mm": 900.0}, "check that positions are in mm and that none jumps"),
+        ({"frames_used": 480.0, "span_x_mm": 900.0}, "check that they are in mm and none jumps"),
         ({"frames_used": 480.0, "frame_rate_hz": 4.9999999999}, None),
         ({"frames_used": 480.0, "frame_rate_hz": 2.0, "frames_every": 50.0}, None),
     ],
