@@ -7,9 +7,11 @@ import pytest
 from numpy.polynomial import legendre
 
 from tactile_bayes.declarations import replace
+from tactile_bayes.errors import BadDataError
 from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, Strokes, Tracker, head_poses
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
+from tactile_bayes.mapping.convention import corrected
 from tactile_bayes.mapping.map import broken_assumptions, skewed
 from tactile_bayes.scans import PressureFrames, Scan
 from validation.stress_frames import on_sphere
@@ -75,6 +77,15 @@ def test_the_curvature_is_that_of_the_sphere_the_head_moved_on(radius_mm: float)
     found = figures(on_sphere(one, scan_of(one), radius_mm) if np.isfinite(radius_mm) else scan_of(one))
     assert found["skin_curvature_per_m"] == pytest.approx(1000.0 / (radius_mm - 5.0), rel=0.05, abs=0.05)
     assert any("skin is curved outwards" in text for text in told(found, "check")) == (radius_mm < 200)
+
+
+def test_few_strokes_round_a_small_breast_are_not_taken_for_rotations_of_another_convention() -> None:
+    """The head sank by more than the lines lay apart: face and motion were 86 degrees apart. The control is wrong."""
+    one = scene(noise=TRUE_POSES, strokes=Strokes(lines=3, spacing_mm=4.0, half_length_mm=36.0))
+    scan = on_sphere(one, scan_of(one), 60.0)
+    assert figures(scan)["normal_agreement"] > 0.99
+    with pytest.raises(BadDataError, match="degrees apart"):
+        build_map(corrected(scan, ["scalar-last"]), as_stated=True)
 
 
 def dragged(lag_mm: float, **changes) -> Scan:
