@@ -403,13 +403,17 @@ def test_a_patient_who_moved_between_scans_or_within_one_is_told(between, moved_
     assert [bool(re.search(near, one.text)) for one in findings] == [True] * bool(told)
 
 
-def test_a_head_whose_rim_presses_harder_has_not_moved():
-    """At the border of each third only the rim was: 1 of 8 right scans was told as of a patient who moved."""
-    scan = scans.make_scan(scans.strokes(), field=scans.uniform)
-    rim = np.ones(scan.head.shape)
-    rim[:, [0, -1]] = 1.6
-    felt = scans.with_counts(scan, np.rint(scan.frames.counts * rim).astype(np.uint16))
-    assert [one for one in build_map(felt).findings if one.kind == "frames_contradict"] == []
+@pytest.mark.parametrize(
+    ("spacing_mm", "profile"),
+    [(5.0, [1.6, 1, 1, 1, 1, 1, 1, 1.6]), (2.0, [1, 1, 1.2, 3.5, 3.5, 1.2, 1, 1])],
+    ids=["harder at its rim", "harder at its middle, as on convex skin"],
+)
+def test_a_head_that_presses_unevenly_has_not_moved(spacing_mm, profile):
+    """Each third felt the head's own profile: 1 of 8 right scans was told as of a patient who moved."""
+    scan = scans.make_scan(scans.strokes(spacing_mm=spacing_mm), field=scans.uniform)
+    felt = scans.with_counts(scan, np.rint(scan.frames.counts * (profile / np.mean(profile))).astype(np.uint16))
+    built = build_map(felt, as_stated=True)
+    assert [one for one in built.findings if one.kind == "frames_contradict"] == []
 
 
 @pytest.mark.parametrize(("notch_mm", "xiphoid_mm", "told"), [(12, 12, True), (9, 9, False), (0, 18, False)])
