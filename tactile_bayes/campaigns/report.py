@@ -137,16 +137,16 @@ def done_line(row: ExamRow) -> dict[str, object]:
     return {
         **_exam_cells(row.exam),
         "folder": f"{layout.EXAMS}/{row.exam.name}",
-        "scan_sha256": " ".join(scan["sha256"] for scan in row.scans if "sha256" in scan) or None,
+        "scan_sha256": " ".join(scan["sha256"] for scan in row.scans if "sha256" in scan),
         "status": row.status,
-        "reason": row.reason or None,
+        "reason": row.reason,
         **_quantity_cells(row.size, _SIZES),
         "smallest_mm": row.smallest_mm,
         "detected_probability": row.detected_probability,
         "centre_x_mm": x_mm,
         "centre_y_mm": y_mm,
         "verdict": verdict(row.findings, answered=row.size is not None),
-        "findings": " ".join(finding_lines(row.findings)) or None,
+        "findings": " ".join(finding_lines(row.findings)),
         "synthetic": row.synthetic,
     }
 
@@ -249,12 +249,12 @@ def grown_line(row: Growth) -> dict[str, object]:
         "later_visit": row.later,
         "days": row.days,
         "status": row.status,
-        "reason": row.reason or None,
+        "reason": row.reason,
         "earlier_mm": first,
         "later_mm": later,
         **_quantity_cells(row.percent, names),
-        "verdict": row.verdict or None,
-        "findings": " ".join(finding_lines(row.findings)) or None,
+        "verdict": row.verdict,
+        "findings": " ".join(finding_lines(row.findings)),
     }
 
 

@@ -51,12 +51,12 @@ def same_file(one: Path, other: Path) -> bool:
 
 
 def refuse_same(
-    outputs: Iterable[Path | None], inputs: Iterable[Path | None], *, role: str = "an input of this command"
+    outputs: Iterable[Path], inputs: Iterable[Path | None], *, role: str = "an input of this command"
 ) -> None:
     """Refuse an output that is the same file as an input, under any name; `role` is what the file is besides."""
     read = [path for path in inputs if path is not None]
     for path in outputs:
-        if path is not None and any(same_file(path, one) for one in read):
+        if any(same_file(path, one) for one in read):
             raise UsageError(f"{path} is {role}; choose another name for the output")
 
 

@@ -65,8 +65,8 @@ def _draws_of(result: Estimate | SizePosterior) -> tuple[str, dict[str, FloatArr
     """Name of the method, its (chain, draw) arrays by name, and its diagnostics."""
     if isinstance(result, SizePosterior):
         return "pooled", {name: np.atleast_2d(getattr(result, name)) for name in _OF_A_SIZE}, result.figures
-    if result.map_posterior is None or result.draws is None:
-        raise ValueError("no estimate, so no posterior to write")
+    assert result.map_posterior is not None
+    assert result.draws is not None
     draws = {name: getattr(result.map_posterior, name) for name in OF_A_MAP}
     if result.size is not None:
         draws |= {name: getattr(result.size, name) for name in _OF_A_SIZE}

@@ -264,7 +264,8 @@ def _interpolated(values: FloatArray) -> FloatArray:
     """Times with those that are missing interpolated; a row without a time has no pose either."""
     known = np.isfinite(values)
     if not known.any():
-        raise BadDataError("its column of times has no number", way_out="give --pose-rate-hz in its place")
+        what = "its column of times or frame numbers has no number"
+        raise BadDataError(what, way_out="leave it out, and give --pose-rate-hz HZ")
     index = np.arange(len(values))
     return np.asarray(np.interp(index, index[known], values[known]))
 

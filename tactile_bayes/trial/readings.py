@@ -304,12 +304,10 @@ def visits_in_order(visits: Mapping[str, date | None]) -> list[str] | None:
     """
     if len(visits) < 2:
         return list(visits)
-    days = {code: day or day_of(code) for code, day in visits.items()}
-    known = [day for day in days.values() if day is not None]
+    days = {code: day for code, stated in visits.items() if (day := stated or day_of(code)) is not None}
+    if len(days) == len(visits):
+        return sorted(days, key=lambda code: days[code]) if len(set(days.values())) == len(days) else None
     numbers = _numbers(visits)
-    if len(known) == len(visits):
-        ordered = sorted(visits, key=lambda code: days[code] or date.min)
-        return ordered if len(set(known)) == len(visits) else None
     return None if numbers is None else sorted(visits, key=lambda code: numbers[code])
 
 
@@ -410,8 +408,8 @@ def _check_dates(
 ) -> None:
     """Refuse dates that contradict the visits' numbers."""
     numbers = _numbers(order) or {}
-    dated = [name for name in order if days[name] is not None and name in numbers]
+    dated = {name: day for name in order if (day := days[name]) is not None and name in numbers}
     for earlier, later in pairwise(sorted(dated, key=lambda name: numbers[name])):
-        if (days[later] or date.max) < (days[earlier] or date.min):
-            problem = f"visit {later} is of {days[later]}, before visit {earlier} of {days[earlier]}"
+        if dated[later] < dated[earlier]:
+            problem = f"visit {later} is of {dated[later]}, before visit {earlier} of {dated[earlier]}"
             raise fault(first_row[later], "date", problem, way_out="correct the date, or the visits' numbers")

@@ -208,7 +208,13 @@ def test_files_are_told_by_their_names(
 
 
 def test_side_date_and_reader_are_told_too_and_exams_without_a_number_are_counted(tmp_path: Path) -> None:
-    named(tmp_path, "P01 L 2026-03-01 Mo.npz", "P01 L 2026-03-02 Jo.npz", "P02 rechts 2026-03-01 Mo.npz")
+    named(
+        tmp_path,
+        "P01 L 2026-03-01 Mo.npz",
+        "P01 L 2026-03-02 Jo.npz",
+        "P02 rechts 2026-03-01 Mo.npz",
+        "P03 R 2026-02-30 Jo.npz",
+    )
     done = init(tmp_path, "--names", "{patient} {side} {date} {reader}")
     columns = ("patient", "side", "date", "reader", "replicate")
     assert told(tmp_path, *columns) == [
@@ -216,6 +222,7 @@ def test_side_date_and_reader_are_told_too_and_exams_without_a_number_are_counte
         ("P01", "left", "2026-03-02", "Jo", "2"),
     ]
     assert "has 'rechts' for the side; name it left, right, L or R" in done.stderr
+    assert "has '2026-02-30' for the date; name it 2026-03-01" in done.stderr
 
 
 def test_a_name_that_does_not_follow_the_pattern_or_contradicts_its_file_is_left_out(tmp_path: Path) -> None:

@@ -89,6 +89,8 @@ def test_a_wide_table_is_read_by_its_mapping(tmp_path: Path) -> None:
         (WIDE.replace("1.2", "ND"), MAPPING, 'us_cm: is ND; does ND mean that the mass was not found? then add '
          'not_detected = ["ND"] to the mapping; that it was not looked for? not_done = ["ND"]'),
         (WIDE.replace("P1,10", "P1,0"), MAPPING, "is 0; was the mass not measured? then leave the cell blank"),
+        (WIDE.replace("1.2", "-1.2"), MAPPING, "line 2, column us_cm: is -1.2; a size is above 0"),
+        (WIDE.replace("10,1.2", ",1.2").replace("20,NV", ",NV").replace("15,,", ",,"), MAPPING, "ex_mm: holds no size"),
         (WIDE.replace("1.2", "about 1"), MAPPING, "line 2, column us_cm: 'about 1' is not a number"),
         (WIDE.replace("1.2", "<1"), MAPPING, "'<1' is a bound, not a number; give the number measured"),
         (WIDE.replace("1.2", "1.2%"), MAPPING, "'1.2%' has a percent sign; write the number that is meant without it"),

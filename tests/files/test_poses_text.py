@@ -252,6 +252,13 @@ FAULTS: dict[str, tuple[list[str], dict[str, Any], str]] = {
     "no such tool": (["Time," + NDI, *with_times(ndi())], {"tool": "Port:9"}, "has no one tool 'Port:9'.*Port:1"),
     "no times": ([NDI, *ndi()], {}, "has frame numbers but no times; .*pose_rate_hz"),
     "no unit": ([EULER.replace(" (cm)", ""), *polhemus()], {}, "does not say the unit of x, y and z.*length_unit"),
+    "no unit and no names": (polhemus(), {"pose_layout": "euler"}, "does not say the unit of x, y and z.*length_unit"),
+    "a layout too long": (polhemus(), {"pose_layout": "matrix"}, "has 8 numbers a row, and a pose as matrix has 16"),
+    "no frame numbers": (
+        ["frame,x,y,z,qw,qx,qy,qz", *(f",{line}" for line in QUATERNIONS)],
+        {"pose_rate_hz": 60.0},
+        "its column of times or frame numbers has no number; leave it out, and give pose_rate_hz",
+    ),
     "no layout": (with_times(QUATERNIONS), {}, "has 8 numbers a row and no names; give pose_layout"),
     "another clock": (
         ["time,x,y,z,qw,qx,qy,qz", *with_times(QUATERNIONS, lambda t: f"10:15:{t:06.3f} AM")],
@@ -350,3 +357,6 @@ def test_a_sequence_metafile_with_two_tools_or_damage_is_one_line(tmp_path: Path
         with pytest.raises(BadDataError) as caught:
             tb.scan(path, head=SCAN.head, unit="kPa", tool="ProbeToTracker")
         assert "\n" not in str(caught.value)
+    path.write_bytes(data.replace(b"_Timestamp", b"_Timeshift"))
+    with pytest.raises(BadDataError, match="has frames without a time"):
+        brought_in(path, tool="ProbeToTracker")
