@@ -162,7 +162,7 @@ def _import_scan(source: Path, output: Path, request: ImportRequest) -> list[str
     scan = corrected(replace(scan, session={**scan.session, **facts}), request.corrections)
     inputs = hash_inputs(source=source, session=request.session_file, **request.scan_files)
     write_scan(output, scan, provenance=Provenance("import", settings, inputs), truth=truth, force=request.force)
-    return [*describe_scan(scan), *notes, *(f"lost: {line}" for line in lost), *_arrangement_lines(scan)]
+    return [*describe_scan(scan), *notes, *_arrangement_lines(scan)]
 
 
 def _lengths(scan: Scan) -> str:

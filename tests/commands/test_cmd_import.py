@@ -111,7 +111,8 @@ def test_an_unfinished_scan_is_mended_and_the_loss_told(run_cli: Run, tmp_path: 
     (tmp_path / "cut.mcap").write_bytes(data[: len(data) // 2])
     done = run_cli("import", "cut.mcap", "-o", "mended.mcap", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "lost: cut off at byte" in done.stdout
+    assert "To check: cut off at byte" in done.stdout
+    assert done.stdout.count("cut off at byte") == 1
     file = read_scan_report(tmp_path / "mended.mcap")
     assert file.complete
     assert "cut off" in file.provenance["settings"]["lost"][0]
