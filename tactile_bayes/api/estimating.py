@@ -11,7 +11,7 @@ import numpy as np
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import Answer, Failure, SizeEstimate, size_priors
 from tactile_bayes.declarations import as_dict, names_of, replace
-from tactile_bayes.errors import NO_LUMP, BadDataError, TactileBayesError, in_file
+from tactile_bayes.errors import NO_LUMP, BadDataError, TactileBayesError, UsageError, in_file
 from tactile_bayes.files.map_nc import read_map_and_scans
 from tactile_bayes.files.npz import CheckpointFile
 from tactile_bayes.files.provenance import Provenance, hash_inputs
@@ -257,6 +257,8 @@ def _options(settings: Settings, calibration: Calibration | None, tactile_map: T
     noise = settings.noise or noise
     if calibration is None and noise == "field":
         background = "free"
+    if noise == "independent" and settings.field_cosines != "auto":
+        raise UsageError('field_cosines are of a noise field; leave them out, or give noise = "field"')
     background = settings.background or background
     radius = settings.fit_radius_mm or (calibration.recipe.radius_mm if calibration else FIT_RADIUS_MM)
     values = {name: getattr(settings, name) for name in names_of(FitSettings)}

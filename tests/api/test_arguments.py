@@ -66,6 +66,10 @@ SETTINGS: dict[str, tuple[Any, str]] = {
     "a calibration that is none": ({"size_calibration": 3}, "a path is wanted, not int"),
     "a repeatability that is none": ({"repeatability": 3}, "a path is wanted, not int"),
     "an accuracy of least squares": ({"method": "laplace", "accuracy_sd": 0.01}, 'or give method="importance"$'),
+    "cosines of white noise": (
+        {"noise": "independent", "field_cosines": 8},
+        'leave them out, or give noise = "field"$',
+    ),
     "a checkpoint of no chain": ({"checkpoint": "c.npz"}, 'give method="ensemble"$'),
     "an accuracy of white noise": (
         {"method": "importance", "noise": "independent", "accuracy_mm": 0.1},
