@@ -409,8 +409,6 @@ def _mixture_quantiles(mean: FloatArray, sd: FloatArray) -> FloatArray:
     """(n,) ascending, evenly spaced quantiles of a mixture of n normals."""
     spread, n = float(np.var(mean)), len(mean)
     total = float(np.sqrt(np.mean(sd**2) + spread))
-    if not total > 0:
-        return mean
     sort_key, n_merged = mean if spread > np.mean(sd**2) else sd, n // MERGED * MERGED
     sd = np.maximum(sd, LEAST_SD * total)
     if n_merged >= LEAST_MERGED:  # a subset spread evenly over the order, so that neither end is lost

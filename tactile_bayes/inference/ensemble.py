@@ -206,7 +206,7 @@ class _Ensemble:
         p = len(centre)
         self._emcee_state = emcee.State
         self._centre, self._scale = centre, np.sqrt(np.diag(covariance))
-        self.walkers = max(2 * ((WALKERS_PER_PARAMETER * p + 1) // 2), 2 * p + 2)
+        self.walkers = WALKERS_PER_PARAMETER * p
         self._sampler = emcee.EnsembleSampler(
             self.walkers, p, self._standardised(log_density), vectorize=True, moves=[(emcee.moves.DEMove(), 1.0)]
         )

@@ -299,7 +299,7 @@ def _sample_until_accurate(sampler: _Sampler, options: ImportanceOptions) -> _Sa
     # a fitted proposal may take twice the points: chains, which come next, are asked for a fifth of the accuracy
     if mixture.extended(accuracy_sd, most=2 * options.most, patience=HEAVY_POINTS, heavy=HEAVY).reached(accuracy_sd):
         return mixture
-    if _can_be_trusted(sampler.shape):
+    if sampler.shape <= TRUSTED_SHAPE:
         sampler.extended(accuracy_sd, most=options.most, patience=ADAPTED_FROM)
         if sampler.reached(NEAR_ENOUGH * accuracy_sd):
             return sampler
@@ -309,11 +309,6 @@ def _sample_until_accurate(sampler: _Sampler, options: ImportanceOptions) -> _Sa
         "use --method ensemble",
         diagnostics={"pareto_k": float(mixture.shape), "end_error_sd": mixture.error},
     )
-
-
-def _can_be_trusted(shape: float) -> bool:
-    """True for a Pareto shape up to `TRUSTED_SHAPE`, or for equal weights."""
-    return shape == -np.inf or bool(np.isfinite(shape) and shape <= TRUSTED_SHAPE)
 
 
 def _adapted_start(
@@ -402,14 +397,15 @@ class _Sampler:
         while True:
             # the spread of four replicates misses rare large weights: 0.036 SD was seen for 0.015
             self.error = self._end_error() * (1.0 + max(self.shape, 0.0) if np.isfinite(self.shape) else 1.0)
-            hopeless = self.points >= patience and not _can_be_trusted(self.shape - heavy)
+            # a shape of NaN is no trusted one, and -inf, of equal weights, is
+            hopeless = self.points >= patience and not self.shape - heavy <= TRUSTED_SHAPE
             if self.reached(accuracy_sd) or self.points >= most or hopeless:
                 return self
             self.extend(self.points)
 
     def reached(self, accuracy_sd: float) -> bool:
         """True where the weights can be trusted and the error is no larger than this."""
-        return _can_be_trusted(self.shape) and self.error <= accuracy_sd
+        return self.shape <= TRUSTED_SHAPE and self.error <= accuracy_sd
 
     def log_evidence(self) -> tuple[float, float]:
         """Log of the integral of exp(log density), and its standard error, from the replicates."""

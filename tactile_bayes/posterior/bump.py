@@ -480,7 +480,7 @@ def residual_autocorrelation(grid: FloatArray, mask: FloatArray) -> tuple[FloatA
     total = np.bincount(ring[used], products[used], largest + 1)
     number = np.bincount(ring[used], pairs[used], largest + 1)
     radial = total / np.maximum(number, 1)
-    radial = radial / radial[0] if radial[0] > 0 else np.eye(1, largest + 1)[0]
+    radial = radial / radial[0]
     below_noise = np.flatnonzero(radial < 2.0 / np.sqrt(np.maximum(number / 2.0, 1.0)))
     half = int(below_noise[0]) - 1 if len(below_noise) else largest
     axis = np.arange(-half, half + 1)

@@ -198,7 +198,7 @@ def draw_parameters(
             continue
         figures = draws.diagnostics
         shape = figures.get("pareto_k", 0.0)
-        if shape == -np.inf or shape <= TRUSTED_SHAPE:
+        if shape <= TRUSTED_SHAPE:
             if fit.width_sd_mm is not None:  # of the Gaussians without their bias
                 error_sd = figures.get("end_error_sd", END_ERROR / float(np.sqrt(draws.effective_draws)))
                 errors = {"end_error_sd": error_sd, "end_error_mm": error_sd * fit.width_sd_mm}

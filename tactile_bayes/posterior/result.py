@@ -44,7 +44,7 @@ def prior_sensitivity(
 ) -> Sensitivity:
     """Shifts of quantities under a width prior twice as wide, by reweighting the draws.
 
-    Quantities are draws in the order of the widths; those of another number are left out, as are NaN draws.
+    Quantities are draws in the order of the widths; NaN draws are left out.
     """
     p = 0.5 * np.log(sigma_x * sigma_y).ravel()
     z = (p - np.log(prior.width_median_mm)) / prior.log_width_sd
@@ -52,8 +52,6 @@ def prior_sensitivity(
     medians, ends = {}, {}
     for name, draws in quantities.items():
         values = draws.ravel()
-        if values.shape != weight.shape:
-            continue
         is_finite = np.isfinite(values)
         sd = float(values[is_finite].std()) or 1.0
         probabilities = np.array([0.5, TAIL, 1.0 - TAIL])

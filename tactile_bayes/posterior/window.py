@@ -428,8 +428,6 @@ class LinearModel:
         shares = np.array(SHARES)
         for length in (0.0, *sorted(LENGTHS_MM, reverse=True)):
             of_length = shares[(shares > 0) == (length > 0)]
-            if not len(of_length):
-                continue
             if length not in self._lengths:
                 cosines = self.window.cosines**2  # a share of 0, the same for every length, has no directions
                 no_field = Whitening(float(np.mean(LENGTHS_MM)), np.zeros((cosines, 0)), np.zeros(0))

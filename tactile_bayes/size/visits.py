@@ -353,8 +353,6 @@ def _with_amplitudes(
     contrasts = np.diff(np.eye(v), axis=0)
     departs = contrasts @ (log_amplitude - exponents[:, None, None] * mean)
     finite = np.isfinite(departs).all(axis=(0, 1))
-    if finite.sum() < 2:
-        return mean, covariance
     within, noise_covariance = covariance[finite].mean(axis=0) @ contrasts.T, contrasts * noise @ contrasts.T
     gains, scores = [], []
     for alpha, one in zip(exponents, departs[:, :, finite], strict=True):
