@@ -36,12 +36,8 @@ def smooth_weights(log_weights: FloatArray) -> tuple[FloatArray, float]:
     if not excess[-1] > 1e-12:
         return weights / weights.sum(), float("-inf")
     shape, scale = fit_generalised_pareto(excess)
-    if np.isfinite(shape):
-        probability = (np.arange(tail) + 0.5) / tail
-        log_beyond = np.log1p(-probability)
-        near_exponential = abs(shape) < 1e-10
-        quantile = -scale * log_beyond if near_exponential else scale * np.expm1(-shape * log_beyond) / shape
-        weights[top] = np.minimum(cut + quantile, 1.0)
+    log_beyond = np.log1p(-(np.arange(tail) + 0.5) / tail)
+    weights[top] = np.minimum(cut + scale * np.expm1(-shape * log_beyond) / shape, 1.0)
     return weights / weights.sum(), shape
 
 
@@ -61,8 +57,6 @@ def fit_generalised_pareto(excess: FloatArray) -> tuple[float, float]:
     with np.errstate(divide="ignore", invalid="ignore"):
         profile = n * (np.log(-theta / shapes) - shapes - 1.0)
     profile = np.where(np.isfinite(profile), profile, -np.inf)
-    if not np.isfinite(profile.max()):
-        return float("nan"), float("nan")
     weight = np.exp(profile - profile.max())
     best = float(weight @ theta / weight.sum())
     shape = float(np.mean(np.log1p(-best * positive)))

@@ -282,7 +282,7 @@ def _gaussian_smoothed(array: FloatArray, width_cells: float) -> FloatArray:
     for n in array.shape:
         distance = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
         weight = np.exp(-0.5 * (distance / max(width_cells, 0.3)) ** 2)
-        kernels.append(np.where(distance <= max(1, int(np.ceil(4 * width_cells))), weight, 0.0))
+        kernels.append(np.where(distance <= np.ceil(4 * width_cells), weight, 0.0))
     return np.asarray(kernels[0] @ array @ kernels[1])
 
 

@@ -170,7 +170,7 @@ def _fit_neighbour(
     """Fit of a second structure with its log odds; without a fit, an upper bound of the log odds and True."""
     scene = replace(plain.scene, extra=extra)
     starts, bound = _starts(plain, extra, rising_places)
-    if not starts or (bound < np.log(LEAST_ODDS) and not forced):
+    if bound < np.log(LEAST_ODDS) and not forced:
         return None, min(bound, 0.0), True
     attempts = (fit_or_none(plain.target.problem, scene, start) for start in starts)
     fits = [fit for fit in attempts if fit is not None]
@@ -322,7 +322,7 @@ MOST_SDS = 2.5  #: Length of either, in the SD of one of its two components, bey
 
 def irregular(fit: FieldFit) -> bool:
     """True for a lone bump that is more skewed, or whose axis ratio changes more outwards, than a ball's."""
-    if fit.scene.extra or fit.scene.shape == "ridge":  # the misfit of a neighbour would be tested
+    if fit.scene.extra:  # the misfit of a neighbour would be tested
         return False
     shape, covariance = outline(fit)
     pairs = ((slice(0, 2), BALLS_SD[0]), (slice(2, 4), BALLS_SD[1]))
@@ -373,7 +373,7 @@ def pose_covariance(fit: FieldFit) -> FloatArray:
     noise = fit.target.window.cells.pose_noise
     p = fit.scene.bump_parameters
     covariance = np.zeros((len(fit.mode), len(fit.mode)))
-    if noise is None or fit.scene.shape == "ridge":
+    if noise is None:
         return covariance
     tangents, window = tangent_columns(fit), fit.target.window
     across, along = map(_overlap_roots, (window.x_mm, window.y_mm), noise.side_mm)

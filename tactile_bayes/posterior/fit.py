@@ -154,8 +154,6 @@ def fit_scene(problem: Problem, scene: Scene, start: FloatArray) -> FieldFit:
         mode, covariance, _ = mode_and_covariance(target, mode, scale=scene.steps, tolerance=FINE)
         if not target.select_fields(mode):
             break
-    if not np.isfinite(target(mode[None])[0]):
-        raise NotConvergedError("no posterior mode: the fitted bump does not rise above the correlated noise")
     # the curvature at the mode is too narrow where fields with different modes share the evidence
     mixture = newton_mixture(target, mode, covariance)
     if mixture is None:
@@ -372,7 +370,7 @@ DEPARTURE_REFITS = 2  #: Fits with the column: for the first it is orthogonal un
 def add_departure(choice: SceneChoice) -> SceneChoice:
     """Test whether a bump that stands alone is a Gaussian; add the regressor where the evidence supports it."""
     fit = choice.fit
-    if fit.scene.extra or fit.scene.shape == "ridge":  # the misfit of a neighbour would be tested
+    if fit.scene.extra:  # the misfit of a neighbour would be tested
         return choice
     _, exponent, log_odds = _exponent_regression(fit)
     test = Structure("departure", odds(log_odds), bool(log_odds > np.log(LEAST_ODDS)), False)

@@ -267,7 +267,7 @@ def _reason_for_fault(tactile_map: TactileMap, candidate: Candidate, reason: str
     narrow, wide = sorted(fit.widths()[:2])
     if not fit.theta[0] > 0:
         return Abstention("undetected", reason, about_mm=centre_mm)
-    if wide / max(narrow, 1e-9) > MOST_AXIS_RATIO:
+    if wide / narrow > MOST_AXIS_RATIO:
         return Abstention("ridge", reason, FEEL_A_RIB, FEEL_A_RIB_ON_PAPER, centre_mm)
     if narrow < LEAST_WIDTH_IN_CELLS * fit.cells.cell_mm:
         return _coarse(reason, narrow, centre_mm)

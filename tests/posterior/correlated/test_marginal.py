@@ -269,7 +269,7 @@ def test_intervals_cover(errors: dict[str, float]) -> None:
 
 
 def test_independent_errors_would_not_cover(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tactile_bayes.posterior.window.SHARES", (0.0,))
+    monkeypatch.setattr("tactile_bayes.posterior.window.SHARES", (0.0, 1e-9))
     assert coverage(15, white=0.003, field=0.02, length=4.0).max() < 0.73
 
 
