@@ -152,6 +152,9 @@ def test_a_map_apart_is_named_and_none_where_all_agree():
     assert outlying_maps(np.array([2.70, 2.72, 2.68, 4.0]), noise, prior) == (3,)
     assert outlying_maps(np.array([2.70, 2.72, 2.68, 2.8]), noise, prior) == ()
     assert outlying_maps(np.array([2.0, 3.0]), noise[:2], prior) == ()
+    stated, learned = BetweenMaps(0.02, 0.0), BetweenMaps(0.02, 0.5)  # what is stated of these maps is not of others
+    others = [SizePriors(between_maps=one, another_exam=None).spread_of_others for one in (stated, learned, None)]
+    assert others == [prior, learned, prior]
 
 
 def test_a_round_lump_stays_round_and_its_largest_size_is_not_biased():
