@@ -120,6 +120,8 @@ def test_the_size_is_equation_6_of_the_map() -> None:
     share = found.size.variance_share
     assert sum(share.values()) == pytest.approx(100)
     assert share["map"] < 10  # the calibration dominates on a clear map, and the report says so
+    assert found.sensitivity is not None
+    assert set(found.sensitivity.median) == {"sigma_x_mm", "sigma_y_mm", "max_size_mm"}
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,12 @@ from scipy.ndimage import gaussian_filter
 from tactile_bayes.declarations import replace
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior import estimate
-from tactile_bayes.posterior.bump import levelled
+from tactile_bayes.posterior.bump import Detection, levelled
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.posterior.white import BumpFit
+from tactile_bayes.posterior.verdict import NO_EVIDENCE
+from tactile_bayes.posterior.white import BumpFit, WhiteAssessment
 
 FIELD = SamplerSettings(method="laplace", background="free", rotation="off", noise="field")
 
@@ -52,6 +53,22 @@ def test_a_lower_lump_is_found_behind_a_rise_at_the_edge():
     assert np.median(found.map_posterior.x_mm) == pytest.approx(-12.0, abs=1.0)
     assert np.median(found.map_posterior.sigma_x_mm) == pytest.approx(4.0, rel=0.15)
     assert any("rim" in candidate.fault or "flank" in candidate.fault for candidate in found.candidates)
+
+
+def test_the_search_goes_on_past_a_rise_without_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
+    lump = (-12.0, 3.0)
+
+    def only_the_lower(tactile_map: TactileMap, fit: BumpFit, _: SamplerSettings) -> WhiteAssessment:
+        is_lump = fit.centre_mm == pytest.approx(lump, abs=1.0)
+        return WhiteAssessment(tactile_map, fit, Detection(9.0 if is_lump else -1.0))
+
+    monkeypatch.setattr(estimate, "assess", only_the_lower)
+    both = bump_values(half_mm=25.0, amplitude=0.3, x=12.0, y=3.0, sigma_x=4.0, sigma_y=4.0)
+    both += bump_values(half_mm=25.0, amplitude=0.2, x=lump[0], y=lump[1], sigma_x=4.0, sigma_y=4.0) - 1.0
+    candidates, found = estimate.search(grid_map(both + noise(2, 51)), SamplerSettings(rotation="off"))
+    assert found is not None
+    assert found.fit.centre_mm == pytest.approx(lump, abs=1.0)
+    assert [one.fault for one in candidates] == [NO_EVIDENCE, ""]
 
 
 def test_no_place_is_weighed_twice_for_an_empty_map(monkeypatch: pytest.MonkeyPatch) -> None:
