@@ -188,7 +188,7 @@ def _rise_at_rim(
     rest: TactileMap, whole: TactileMap, candidates: tuple[Candidate, ...], options: SamplerSettings, estimate: Estimate
 ) -> tuple[Rise | None, bool]:
     """Rise at the rim with the evidence of a lump, too little covered to measure, and True where it is likely one."""
-    if not candidates or candidates[0].fit is None or not candidates[0].fault.startswith(AT_RIM):
+    if candidates[0].fit is None or not candidates[0].fault.startswith(AT_RIM):
         return None, False
     bump, lump = candidates[0].fit.modal(), estimate.lump
     if bump.amplitude <= (0.0 if lump is None else LEAST_RISE_AT_RIM * lump.amplitude):

@@ -90,11 +90,11 @@ def weigh(
     """The rise of a bump with its odds and features; `candidate` is that of the search."""
     centre_mm, (narrow, wide) = (bump.x_mm, bump.y_mm), sorted((bump.sigma_x_mm, bump.sigma_y_mm))
     evidence = log1p(float(np.clip(detection.log_bayes_factor, 0.0, MOST_EVIDENCE)))
-    too_wide = max(log(max(wide, 1e-3) / WIDE_MM), 0.0)
+    too_wide = max(log(wide / WIDE_MM), 0.0)
     open_share = 1.0 - covered_share(tactile_map, centre_mm, radius_mm=1.5 * wide)
     fault = "" if candidate is None else candidate.fault
     faulty = float(bool(fault) and not fault.startswith(NO_EVIDENCE))
-    features = (evidence, min(log(wide / max(narrow, 1e-3)), 2.0), min(too_wide, 2.0), open_share, faulty)
+    features = (evidence, min(log(wide / narrow), 2.0), min(too_wide, 2.0), open_share, faulty)
     return WeighedRise(detection, centre_mm, features, candidate)
 
 
@@ -324,7 +324,7 @@ def rim_fault(tactile_map: TactileMap, bump: ModalBump, *, radius_mm: float) -> 
         return f"narrower than a cell (sigma {narrow:.2g} mm on {cell:g} mm cells): not resolved"
     typical = float(np.median(tactile_map.count[tactile_map.covered]))
     cells = window_cells(tactile_map, centre_mm, radius_mm=max(1.5 * wide, cell))
-    typical_here = float(np.median(cells.count)) if len(cells) else 0.0
+    typical_here = float(np.median(cells.count))
     if typical_here >= LEAST_READ * typical:
         return ""
     return f"{AT_RIM} (its cells hold {typical_here:g} readings, where {typical:g} are typical)"

@@ -92,7 +92,7 @@ def cosines_for(width_mm: float, axis_mm: FloatArray) -> int:
     """Number of cosines along an axis for a bump's width, from `FIELD_COSINES` to `FINE_FIELD_COSINES`: errors shorter
     than the shortest half wave are modelled as independent."""
     _, side = _phase(axis_mm)
-    wanted = np.ceil(side / (HALF_WAVE_IN_WIDTHS * max(width_mm, 1e-6)))
+    wanted = np.ceil(side / (HALF_WAVE_IN_WIDTHS * width_mm))
     return int(np.clip(wanted, FIELD_COSINES, FINE_FIELD_COSINES))
 
 
