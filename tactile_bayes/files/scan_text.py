@@ -356,7 +356,7 @@ def read_frames(path: Path, stated: Stated) -> Source:
     """Read frames and, where the text has them, times, unit and rate; the frames' shape is stated where it is known."""
     all_lines, words = read_text_table(path, stated.decimal)
     lines = _without_word_columns(all_lines)
-    if header := next((line for line in lines if is_header_of_poses(line) and len(line.fields) < _MOST_OF_POSES), None):
+    if header := next((line for line in lines if len(line.fields) < _MOST_OF_POSES and is_header_of_poses(line)), None):
         raise BadDataError(f"is a table of poses by line {header.number}", way_out="give the frames, and it as --poses")
     blocks = _blocks(lines, math.prod(stated.frame_shape) if stated.frame_shape else None)
     if blank_cells := sum(field == NO_SENSEL for line in blocks[0] for field in line.fields):

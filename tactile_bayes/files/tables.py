@@ -445,8 +445,9 @@ class Line(Record):
 def number(text: str, *, decimal_comma: bool) -> float | None:
     """A number, a time of day in s, or a date and time in s since 1970; NaN for no value, None for anything else."""
     text = text.strip(_AROUND)
+    decimal_comma = decimal_comma and "," in text and _ANY_DECIMAL_COMMA.fullmatch(text) is not None
     try:
-        return float(text.replace(",", ".") if decimal_comma and _ANY_DECIMAL_COMMA.fullmatch(text) else text)
+        return float(text.replace(",", ".") if decimal_comma else text)
     except ValueError:
         if text.lower() in _NO_VALUE:
             return float("nan")
@@ -518,7 +519,7 @@ def _is_number_row(fields: Sequence[str], marks: Sequence[str]) -> bool:
 
 
 def _is_number(text: str, marks: Sequence[str]) -> bool:
-    return text in marks or may_be_thousands(text) or number(text, decimal_comma=True) is not None
+    return text in marks or number(text, decimal_comma=True) is not None or may_be_thousands(text)
 
 
 def split_fields(text: str, separator: str) -> list[str]:
@@ -533,7 +534,8 @@ def comma_numbers(rows: Iterable[Sequence[str]], marks: Sequence[str] = (), *, w
 
     With a `way_out` they are refused where all may have commas between thousands: which is meant cannot be told.
     """
-    fields = (field for row in rows if _is_number_row(row, marks) for field in row)
+    with_commas = (row for row in rows if any("," in field for field in row))
+    fields = (field for row in with_commas if _is_number_row(row, marks) for field in row)
     commas = [one for one in fields if _ANY_DECIMAL_COMMA.fullmatch(one) or may_be_thousands(one)]
     if way_out and commas and all(map(may_be_thousands, commas)):
         first = commas[0]
