@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from few_draws import few_draws  # noqa: F401 - all tests of this file use it
 from in_process import run_here
 from plain_calibration import RECIPE
 from posterior_files import write_calibration, write_maps

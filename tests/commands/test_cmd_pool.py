@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from few_draws import few_draws  # noqa: F401 - all tests of this file use it
 from in_process import run_here
 from posterior_files import MADE, write_calibration, write_maps
 from posterior_maps import bump_map, correlated_field, grid_map

@@ -58,6 +58,7 @@ def test_dciodvfy_reports_no_error(written: list[Path]) -> None:
         assert [line for line in lines if line.startswith(("Error", "Abort"))] == []
 
 
+@pytest.mark.long_repeats
 def test_dciodvfy_reports_a_missing_attribute(written: list[Path]) -> None:
     """The negative control: a type 1 attribute is taken away."""
     dataset = pydicom.dcmread(written[-1])
@@ -66,6 +67,7 @@ def test_dciodvfy_reports_a_missing_attribute(written: list[Path]) -> None:
     assert "Error" in said(tool("dciodvfy"), written[-1])
 
 
+@pytest.mark.long_repeats
 def test_dcmtk_reads_them(written: list[Path]) -> None:
     for path in written:
         assert said(tool("dcmftest"), path).startswith("yes:")

@@ -46,10 +46,11 @@ from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.mapping.select import scan_findings
+from tactile_bayes.report import growth_page
 from tactile_bayes.report.campaign_page import ExamEntry, MassEntry, VisitEntry, campaign_html
 from tactile_bayes.report.compare import VisitMap, compare_summary, compare_text, growths
 from tactile_bayes.report.exam_page import exam_page
-from tactile_bayes.report.growth_page import DrawnMap, draw_comparison
+from tactile_bayes.report.growth_page import DrawnMap
 from tactile_bayes.report.map import map_figure, map_summary, map_text
 from tactile_bayes.report.pages import Growth
 from tactile_bayes.report.pooled import pooled_summary, pooled_text
@@ -175,12 +176,19 @@ def nrrd(made: Made) -> str:
     return nrrd_bytes(made.map_file).partition(b"\n\n")[0].decode()
 
 
+@cache
+def dicom_of(findings: tuple[Finding, ...]) -> Path:
+    """The folder of an exam's files."""
+    out = folder() / "out"
+    tb.export(Made(findings).estimate, out, to="dicom", study_date="2026-11-24T10:30")
+    return out
+
+
 def dicom(made: Made, name: str) -> str:
     """All texts of a file of the exam: its comments and those of its content."""
     pytest.importorskip("highdicom")
     pydicom = pytest.importorskip("pydicom")
-    out = folder() / "out"
-    tb.export(made.estimate, out, to="dicom", study_date="2026-11-24T10:30")
+    out = dicom_of(tuple(made.findings))
     file = pydicom.dcmread(out / f"{name}.dcm")
     return " ".join(str(one.value) for one in file.iterall() if one.keyword in ("TextValue", "ImageComments"))
 
@@ -209,8 +217,11 @@ def campaign_card(made: Made) -> str:
 
 
 def drawn(made: Made) -> Any:
+    """The picture without its maps, which say nothing."""
     maps = [[DrawnMap(made.map, made.answer.report)] for _ in range(2)]
-    return draw_comparison(made.compared.compared, made.compared.report, maps, None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(growth_page, "_draw_maps", lambda *_, **__: None)
+        return growth_page.draw_comparison(made.compared.compared, made.compared.report, maps, None)
 
 
 @dataclass(frozen=True)
