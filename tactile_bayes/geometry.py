@@ -41,20 +41,20 @@ def rotation_from_quaternion(quaternion_wxyz: FloatArray) -> FloatArray:
 
 
 def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
-    """Unit quaternion, scalar first and not negative, of one (3, 3) rotation (eigenvector method, Bar-Itzhack 2000)."""
-    r = rotation
+    """(..., 4) unit quaternions, scalar first and not negative, of (..., 3, 3) rotations (Bar-Itzhack 2000)."""
+    r = np.moveaxis(rotation, (-2, -1), (0, 1))
+    none = np.zeros(r.shape[2:])
     gram = np.array(
         [
-            [r[0, 0] - r[1, 1] - r[2, 2], 0.0, 0.0, 0.0],
-            [r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2], 0.0, 0.0],
-            [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], r[2, 2] - r[0, 0] - r[1, 1], 0.0],
+            [r[0, 0] - r[1, 1] - r[2, 2], none, none, none],
+            [r[0, 1] + r[1, 0], r[1, 1] - r[0, 0] - r[2, 2], none, none],
+            [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], r[2, 2] - r[0, 0] - r[1, 1], none],
             [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], r[0, 0] + r[1, 1] + r[2, 2]],
         ]
     )
-    _, vectors = np.linalg.eigh(gram)  # reads the lower triangle
-    x, y, z, w = vectors[:, -1]
-    quaternion = np.array([w, x, y, z])
-    return -quaternion if w < 0 else quaternion
+    _, vectors = np.linalg.eigh(np.moveaxis(gram, (0, 1), (-2, -1)))  # reads the lower triangle
+    quaternion = vectors[..., [3, 0, 1, 2], -1]
+    return np.where(quaternion[..., :1] < 0, -quaternion, quaternion)
 
 
 def unroll_quaternion_signs(quaternion_wxyz: FloatArray) -> FloatArray:

@@ -527,7 +527,7 @@ def _poses(scene: Scene, depth: DepthAt | None, *, rng: np.random.Generator) -> 
     shift, turn = rng.standard_normal((2, len(time), 3))
     position = position + scene.noise.tracker_mm * shift
     attitude = attitude @ rotation_from_vector(np.radians(scene.noise.tracker_deg) * turn)
-    quaternion = np.array([quaternion_from_rotation(rotation) for rotation in attitude])
+    quaternion = quaternion_from_rotation(attitude)
     late = np.rint((time + scene.tracker.latency_ms / 1000) * 1e9) / 1e9
     return TrackerPoses(late, position, quaternion)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +17,14 @@ from tactile_bayes.errors import BadDataError
 from tactile_bayes.files.posterior_nc import read_posterior
 from tactile_bayes.presets import RESEARCH_USE
 
-with warnings.catch_warnings():
-    warnings.simplefilter("ignore", FutureWarning)
-    import arviz
+
+@pytest.fixture(scope="module")
+def arviz() -> Any:
+    """Imported where it is used: it takes as long as twenty tests."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        import arviz
+    return arviz
 
 
 GROUPS = ("posterior", "sample_stats", "observed_data", "prior")
@@ -40,7 +46,9 @@ def chains(tmp_path_factory: pytest.TempPathFactory) -> tuple[SizeEstimate, Path
 
 
 @pytest.mark.long
-def test_arviz_opens_all_groups_and_its_figures_and_summaries_work(chains: tuple[SizeEstimate, Path]) -> None:
+def test_arviz_opens_all_groups_and_its_figures_and_summaries_work(
+    arviz: Any, chains: tuple[SizeEstimate, Path]
+) -> None:
     made, path = chains
     data = arviz.from_netcdf(path)
     assert set(data.groups()) == {*GROUPS, "log_likelihood"}
@@ -62,7 +70,7 @@ def test_arviz_opens_all_groups_and_its_figures_and_summaries_work(chains: tuple
 
 
 @pytest.mark.long
-def test_statistics_are_of_the_draws(chains: tuple[SizeEstimate, Path]) -> None:
+def test_statistics_are_of_the_draws(arviz: Any, chains: tuple[SizeEstimate, Path]) -> None:
     made, path = chains
     estimate, data = made.estimate, arviz.from_netcdf(path)
     assert estimate.draws is not None
@@ -76,7 +84,7 @@ def test_statistics_are_of_the_draws(chains: tuple[SizeEstimate, Path]) -> None:
 
 
 @pytest.mark.long
-def test_python_gives_arviz_the_groups_of_the_file(chains: tuple[SizeEstimate, Path]) -> None:
+def test_python_gives_arviz_the_groups_of_the_file(arviz: Any, chains: tuple[SizeEstimate, Path]) -> None:
     made, path = chains
     held, found = arviz.from_netcdf(path), made.to_arviz()
     assert set(found.groups()) == set(held.groups())
@@ -88,7 +96,7 @@ def test_python_gives_arviz_the_groups_of_the_file(chains: tuple[SizeEstimate, P
 
 
 @pytest.mark.long
-def test_the_prior_is_the_models(chains: tuple[SizeEstimate, Path]) -> None:
+def test_the_prior_is_the_models(arviz: Any, chains: tuple[SizeEstimate, Path]) -> None:
     """ln of the mean width normal about ln 5 mm with SD 1, half the log ratio with SD 0.5, both below 15 mm."""
     prior = arviz.from_netcdf(chains[1]).prior
     mean_width = 0.5 * np.log(prior["sigma_x_mm"] * prior["sigma_y_mm"]).values.ravel()
@@ -109,7 +117,7 @@ def test_the_netcdf_library_reads_every_group(chains: tuple[SizeEstimate, Path])
 
 
 @pytest.mark.parametrize("method", ["importance", "laplace"])
-def test_other_methods_write_the_groups_that_they_have(method: str, tmp_path: Path) -> None:
+def test_other_methods_write_the_groups_that_they_have(arviz: Any, method: str, tmp_path: Path) -> None:
     made = estimated(method)
     made.write(tmp_path / "post.nc")
     data = arviz.from_netcdf(tmp_path / "post.nc")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from plain_reports import full_text
@@ -21,6 +23,13 @@ from tactile_bayes.posterior.white import AT_RIM, Candidate, fit_bump
 
 FIELD = SamplerSettings(background="free", noise="field")
 WHITE = 0.01 * np.random.default_rng(4).standard_normal((51, 51))
+EMPTY = 1 + WHITE
+
+
+@cache
+def empty(centre_mm: tuple[float, float] | None = None) -> Estimate:
+    """Of a map with nothing but noise."""
+    return run(EMPTY, centre_mm=centre_mm)
 
 
 def run(values: np.ndarray, *, count: np.ndarray | int = 40, **options: object) -> Estimate:
@@ -44,7 +53,7 @@ def cut(*, right: int) -> np.ndarray:
         (np.full((9, 9), np.nan), "cannot_show", "map a scan"),
         (np.ones((51, 51)), "cannot_show", "what was saved"),
         (STEP, "empty", "go over the place again"),
-        (1 + WHITE, "undetected", "go over the place again"),
+        (EMPTY, "undetected", "go over the place again"),
         (cut(right=1), "window", "mm to the picture's right (+x)"),
         # half a lump beyond the rim, by whose probability there was no lump; to the left nothing is to be extended
         (
@@ -61,7 +70,7 @@ def cut(*, right: int) -> np.ndarray:
     ],
 )
 def test_the_reason_has_a_code_and_a_way_out(values: np.ndarray, code: str, advice: str) -> None:
-    found = run(values)
+    found = empty() if values is EMPTY else run(values)
     assert found.status == "no_estimate"
     assert (found.code, found.code in CODES) == (code, True), found.reason
     assert advice in found.advice
@@ -135,10 +144,8 @@ def test_a_wide_rise_at_the_rim_asks_for_strokes_and_not_for_a_larger_window() -
 @pytest.mark.long_repeats
 @pytest.mark.parametrize("centre", [None, (3.0, 2.0)])
 def test_no_lump_is_said_first_with_the_place(centre: tuple[float, float] | None) -> None:
-    tactile_map = grid_map(1 + WHITE)
-    fit = replace(FIELD, centre_mm=centre)
-    found = estimate_map(tactile_map, calibration=None, options=fit, rng=np.random.default_rng(1))
-    first = full_text(found, tactile_map).splitlines()[0]
+    found = empty(centre)
+    first = full_text(found, grid_map(EMPTY)).splitlines()[0]
     assert first.startswith("No lump found ")
     assert ("on the 26 cm2 that the map covers" if centre is None else "near (3.0, 2.0) mm") in first
     assert "strokes" not in found.advice

@@ -82,6 +82,7 @@ def test_a_sane_answer_where_there_is_a_lump(name: str, method: str) -> None:
     np.testing.assert_allclose(medians, widths, rtol=tolerance)
 
 
+@pytest.mark.long_repeats
 @METHOD
 @pytest.mark.parametrize("scene", ["round", "rotated"])
 def test_a_round_bump_in_every_shape(scene: str, method: str) -> None:

@@ -39,7 +39,8 @@ class Export(NamedTuple):
 
 
 def rows(values: Any, separator: str = ",", digits: int = 4) -> list[str]:
-    return [separator.join(f"{value:.{digits}f}" for value in row) for row in values]
+    line = separator.join([f"%.{digits}f"] * np.shape(values)[-1])
+    return [line % tuple(row) for row in values]
 
 
 def timed(unit: str, separator: str = ",") -> list[tuple[float, str]]:

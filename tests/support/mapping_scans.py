@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.geometry import apply, quaternion_from_rotation, rigid
+from tactile_bayes.geometry import apply, quaternion_from_rotation, rigid, rotation_from_quaternion
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
 GAIN_KPA = 2.0**-11  # 65536 counts reach 32 kPa: counts carry pressures to 0.0005 kPa
@@ -57,19 +57,21 @@ def make_scan(
     """
     head = head or flat_head()
     n = len(centres_mm)
-    turns = [rotation(float(yaw)) for yaw in np.broadcast_to(yaw_deg, n)]
-    from_head = [rigid(turn, np.array([*centre, 0.0])) for turn, centre in zip(turns, centres_mm, strict=True)]
-    points = [apply(one, head.surface_mm) for one in from_head]
-    values = np.stack([field(p[..., 0], p[..., 1]) for p in points]) if n else np.zeros((0, *head.shape))
+    turns = {float(yaw): rotation(float(yaw)) for yaw in np.unique(yaw_deg)}
+    from_head = np.zeros((n, 4, 4)) + np.eye(4)
+    from_head[:, :3, :3] = [turns[float(yaw)] for yaw in np.broadcast_to(yaw_deg, n)]
+    from_head[:, :2, 3] = centres_mm
+    points = np.stack([apply(one, head.surface_mm) for one in from_head])
+    values = field(points[..., 0], points[..., 1])
     pressure = values * np.broadcast_to(levels_kpa, n)[:, None, None]
-    tracker = [one @ head.scanhead_from_tracker for one in from_head]
+    tracker = from_head @ head.scanhead_from_tracker
     time = 100.0 + interval_s * np.arange(n)
     return Scan(
         PressureFrames(time, np.rint(pressure / GAIN_KPA).astype(np.uint16)),
         TrackerPoses(
             time,
-            np.array([one[:3, 3] for one in tracker]).reshape(n, 3),
-            np.array([quaternion_from_rotation(one[:3, :3]) for one in tracker]).reshape(n, 4),
+            tracker[:, :3, 3],
+            quaternion_from_rotation(tracker[:, :3, :3]),
         ),
         head,
         ElementCalibration(np.full(head.shape, GAIN_KPA), np.zeros(head.shape), saturation_count=65535),
@@ -92,18 +94,12 @@ def strokes(*, reach_mm: float = 15.0, lines: int = 4, spacing_mm: float = 5.0, 
 
 def moved(scan: Scan, transform: np.ndarray) -> Scan:
     """The whole scan, landmarks included, after a rigid motion of the tracker's base."""
-    q = np.array([_turned(transform[:3, :3], one) for one in scan.poses.quaternion_wxyz])
+    q = quaternion_from_rotation(transform[:3, :3] @ rotation_from_quaternion(scan.poses.quaternion_wxyz))
     poses = TrackerPoses(scan.poses.time_s, apply(transform, scan.poses.position_mm), q)
     marks = scan.landmarks
     if marks is not None:
         marks = Landmarks(apply(transform, marks.sternal_notch_mm), apply(transform, marks.xiphoid_mm))
     return replace(scan, poses=poses, landmarks=marks)
-
-
-def _turned(turn: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    from tactile_bayes.geometry import rotation_from_quaternion
-
-    return quaternion_from_rotation(turn @ rotation_from_quaternion(quaternion))
 
 
 def part(scan: Scan, frames: slice) -> Scan:

@@ -47,6 +47,11 @@ def scan(tracker_mm: float = 0.3, *, tracker_deg: float = 0.0, seed: int = 1) ->
     return simulate(scene, rng=np.random.default_rng(seed)).scan
 
 
+@cache
+def built(tracker_mm: float, tracker_deg: float = 0.0) -> TactileMap:
+    return build_map(scan(tracker_mm, tracker_deg=tracker_deg))
+
+
 def told(tactile_map: TactileMap) -> dict[str, float]:
     return {name: tactile_map.quality[name] for name in POSE_NOISE if name in tactile_map.quality}
 
@@ -61,7 +66,7 @@ def with_poses(whole: Scan, poses: TrackerPoses) -> Scan:
 @pytest.mark.parametrize(("tracker_mm", "tracker_deg"), [(0.1, 0.0), (0.6, 0.0), (0.3, 0.3)])
 def test_what_the_tracker_was_given_is_found(tracker_mm: float, tracker_deg: float) -> None:
     """An error of the tilt moves the head by its lever of 55 mm; two poses are averaged, on average to 2/3."""
-    found = told(build_map(scan(tracker_mm, tracker_deg=tracker_deg)))
+    found = told(built(tracker_mm, tracker_deg))
     true = np.sqrt((tracker_mm**2 + (np.radians(tracker_deg) * 55.0) ** 2) * 2 / 3)
     assert found["pose_noise_x_mm"] == pytest.approx(true, rel=0.12)
     assert found["pose_noise_y_mm"] == pytest.approx(true, rel=0.12)
@@ -122,7 +127,7 @@ def test_two_scans_tell_the_mean_of_their_variances() -> None:
 
 
 def test_the_maps_report_names_the_tracker_position_error() -> None:
-    assert "frames' places" in map_text(build_map(scan(0.3)))
+    assert "frames' places" in map_text(built(0.6))
 
 
 # --- what the widths make of it ---
@@ -199,7 +204,7 @@ def test_the_spread_is_that_of_the_whole_covariance() -> None:
 
 
 def test_the_report_says_what_they_make_of_the_widths_or_that_they_are_left_out() -> None:
-    tactile_map = build_map(scan(0.6))
+    tactile_map = built(0.6)
     found = estimated(tactile_map)
     share = found.diagnostics["places_share"]
     assert isinstance(share, float)
@@ -244,7 +249,7 @@ def test_frames_that_are_there_twice_leave_the_spread() -> None:
     frames = whole.frames
     later = np.repeat(frames.time_s, 2) + np.tile([0.0, 1e-6], len(frames.time_s))
     doubled = replace(frames, time_s=later, counts=np.repeat(frames.counts, 2, axis=0))
-    once, twice = build_map(whole), build_map(replace(whole, frames=doubled))
+    once, twice = built(0.6), build_map(replace(whole, frames=doubled))
     assert twice.count.sum() == pytest.approx(2 * once.count.sum(), rel=0.01)
     first, second = (np.diag(pose_covariance(fit_of(estimated(one)))) for one in (once, twice))
     np.testing.assert_allclose(np.sqrt(second), np.sqrt(first), rtol=0.05)

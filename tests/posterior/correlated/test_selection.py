@@ -70,8 +70,8 @@ def false_rates(maps: int) -> dict[str, float]:
 
 
 def test_a_round_bump_brings_no_structure() -> None:
-    """12 maps: at a true rate of 5 % three or more false ones come in 1 run of 50."""
-    assert max(false_rates(12).values()) <= 2 / 12
+    """6 maps: at a true rate of 5 % two or more false ones come in 1 run of 30."""
+    assert max(false_rates(6).values()) <= 1 / 6
 
 
 @pytest.mark.slow
@@ -91,7 +91,7 @@ def test_independent_errors_would_invent_them(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_an_ellipse_is_found() -> None:
-    assert rate("ellipse", 8, sigma_x=5.0 * 1.33) >= 7 / 8
+    assert rate("ellipse", 4, sigma_x=5.0 * 1.33) == 1.0
 
 
 @pytest.mark.slow
@@ -110,6 +110,7 @@ def test_what_is_there_is_found_and_named() -> None:
     assert choose(bump() + errors(1)).supported == "round"
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize(("x", "y"), [(17.0, 6.0), (-13.0, -14.0), (1.0, 22.0)])
 def test_a_second_lump_is_found_where_it_is(x: float, y: float) -> None:
     choice = choose(bump() + second(x=x, y=y) + errors(2))
