@@ -25,7 +25,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
 # The same examples at every run; `HYPOTHESIS_PROFILE=ci` looks at more of them.
-settings.register_profile("default", max_examples=20, derandomize=True, deadline=None)
+settings.register_profile("default", max_examples=10, derandomize=True, deadline=None)
 settings.register_profile(
     "ci", max_examples=200, derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from tactile_bayes.size.bodies import BodyCalibration
 
 DEMO = Path(tb.__file__).parent / "demo"
 RECIPE = {"normalise": "gain", "background": "free", "fit_radius_mm": 20, "noise": "field"}
+PROFILE = ("head_profile_x2", "head_profile_y2", "head_profile_y4")
 SHIFT = 0.2
 
 
@@ -33,17 +35,21 @@ def solid() -> BodyCalibration:
     return body_calibration(path)
 
 
+@cache
+def demo_profile() -> tuple[float, ...]:
+    quality = tb.demo_map().tactile_map.quality
+    return tuple(quality[name] for name in PROFILE)
+
+
 def table(n: int = 12, *, profile: bool = True, **more: object) -> pandas.DataFrame:
     """Lumps whose sizes are e^0.2 times those that `solid` gives their maps, at the demo map's depth of fat."""
-    rng, quality = np.random.default_rng(102), tb.demo_map().tactile_map.quality
-    names = ("head_profile_x2", "head_profile_y2", "head_profile_y4")
-    told = tuple(quality[name] for name in names)
+    rng, told = np.random.default_rng(102), demo_profile()
     use = solid().at_fat([told if profile else None])
     width, amplitude = np.linspace(np.log(3.2), np.log(6.5), n), np.exp(rng.uniform(-1.4, -0.8, n))
     d_mm = np.exp(use.log_size(np.log(amplitude), width) + SHIFT)
     columns = {"d_mm": d_mm, "amplitude": amplitude, "sigma_x_mm": np.exp(width), "sigma_y_mm": np.exp(width)}
     if profile:
-        columns |= dict(zip(names, told, strict=True))
+        columns |= dict(zip(PROFILE, told, strict=True))
     return pandas.DataFrame({**columns, **RECIPE, **more})
 
 

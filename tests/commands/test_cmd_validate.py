@@ -104,6 +104,7 @@ def test_without_a_tactile_reading_every_pair_is_compared(tmp_path: Path) -> Non
     assert "mri errs 0.86 times as much as us, no interval: an interval needs at least 8 patients (found 2)" in text
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("name", ["us", "clinical_breast_examination"])
 def test_the_table_fits_80_columns(name: str, tmp_path: Path) -> None:
     text = validate(TRIAL, "--excision", EXCISION).stdout

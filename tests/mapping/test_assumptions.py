@@ -98,7 +98,7 @@ def dragged(lag_mm: float, **changes) -> Scan:
     return replace(ways[0], frames=PressureFrames(ways[0].frames.time_s, counts))
 
 
-@pytest.mark.parametrize("lag_mm", [0.0, 0.6, 1.8])
+@pytest.mark.parametrize("lag_mm", [0.0, pytest.param(0.6, marks=pytest.mark.long), 1.8])
 def test_a_lump_that_is_dragged_along_is_seen_apart(lag_mm: float) -> None:
     found = figures(dragged(lag_mm))
     assert found["stroke_lag_mm"] == pytest.approx(lag_mm, abs=0.15 + 0.35 * lag_mm)  # one linear step

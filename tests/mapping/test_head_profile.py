@@ -234,6 +234,7 @@ def test_the_depth_tells_seats_apart_that_the_map_does_not() -> None:
     assert sizes["without"][1] / sizes["without"][0] > 1.2
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("name", sorted(TRUE_FAT_MM))
 def test_the_depth_of_fat_of_another_programs_bodies_is_within_20_percent(shared_data: Path, name: str) -> None:
     """An independent program's scans: the fat within 20 %, which tells 12 mm from 20 and 24."""

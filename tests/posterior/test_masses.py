@@ -118,6 +118,7 @@ def test_masses_are_ranked_by_evidence_inside_the_calibration() -> None:
     assert ranked((1.50, 32.0, 400.0, False), (0.08, 24.0, 4.5, True)) == [0, 1]
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("seed", range(3))
 def test_one_lump_is_one_mass(seed: int) -> None:
     """`validation.masses` has the share over 200 simulated exams."""

@@ -36,7 +36,7 @@ def test_a_wide_rise_at_the_edge_is_no_lump_and_the_same_rise_inside_is_one():
     assert inside.status == "estimate"
 
 
-@pytest.mark.long_repeats
+@pytest.mark.long
 @pytest.mark.parametrize(("x", "status"), [(26.0, "no_estimate"), (20.0, "estimate")])
 def test_a_wide_rise_must_be_seen_on_every_side(x: float, status: str) -> None:
     """The map ends 1.4 and 2 widths from its centre: 1.6 are asked for."""

@@ -22,6 +22,7 @@ def knowing(*, inverted: tuple[str, ...] = ()) -> BodyCalibration:
     return replace(calibration(hidden=hidden), bodies={"stiffness_ratio": (8.0, 100.0), "seat": (0.0, 1.2)})
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("inverted", [(), ("stiffness_ratio",)])
 @pytest.mark.parametrize("known", [{}, {"seat": 0.3}])
 def test_a_supposed_size_is_the_size_with_that_property_known(

@@ -44,6 +44,7 @@ def test_single_limits_are_quantiles_of_the_noncentral_t(n: int, confidence: flo
     assert percentile_factor(n, percentile=0.975, confidence=confidence) == pytest.approx(expected, rel=1e-8)
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize(("n", "confidence"), [(4, 0.95), (10, 0.975), (17, 0.025), (60, 0.95)])
 def test_paired_limits_by_integrating_over_mean_and_deviation(n: int, confidence: float) -> None:
     """The probability that mean +- k SD holds 95 % of the population, the plain double integral."""

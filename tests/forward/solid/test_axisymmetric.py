@@ -140,6 +140,7 @@ def test_a_lump_of_its_own_tissue_is_no_lump() -> None:
         assert np.abs(mode).max() <= 1e-12 * np.abs(condensed("resting").perturbation(500.0)[0]).max()
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("name", ["centred", "resting", "flat"])
 def test_a_hard_lump_stiffens_and_a_soft_one_softens(name: str) -> None:
     lump = condensed(name)

@@ -70,6 +70,7 @@ def test_what_no_ellipse_is_like_is_irregular_and_the_report_says_so(form: str) 
     assert "irregular" in [one.kind for one in found.findings]
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("form", ["round", "ellipse", "slightly oblique"])
 def test_an_ellipse_has_no_irregular_outline(form: str) -> None:
     """The negative control, three maps each; a false alarm in one map has a chance of a few percent at most."""

@@ -63,7 +63,9 @@ def with_poses(whole: Scan, poses: TrackerPoses) -> Scan:
 # --- what the map tells ---
 
 
-@pytest.mark.parametrize(("tracker_mm", "tracker_deg"), [(0.1, 0.0), (0.6, 0.0), (0.3, 0.3)])
+@pytest.mark.parametrize(
+    ("tracker_mm", "tracker_deg"), [pytest.param(0.1, 0.0, marks=pytest.mark.long), (0.6, 0.0), (0.3, 0.3)]
+)
 def test_what_the_tracker_was_given_is_found(tracker_mm: float, tracker_deg: float) -> None:
     """An error of the tilt moves the head by its lever of 55 mm; two poses are averaged, on average to 2/3."""
     found = told(built(tracker_mm, tracker_deg))

@@ -96,6 +96,7 @@ def test_evidence_is_that_of_a_quadrature() -> None:
     assert everything(fit.mode[None])[0] == pytest.approx(fit.target(fit.mode[None])[0], abs=1e-6)
 
 
+@pytest.mark.long_repeats
 @pytest.mark.parametrize("name", list(FITS))
 def test_gaussians_are_as_wide_as_the_density(name: str) -> None:
     fit = FITS[name]()
