@@ -150,7 +150,7 @@ def test_help_fits_a_narrow_terminal(words, paragraph, folder, child_environment
 
 
 def test_no_color_is_plain_and_errors_are_red(folder, child_environment):
-    words, named = ("estimate", "none.nc"), {"environment": child_environment, "cwd": folder, "columns": 80}
+    words, named = ("show", "none.nc"), {"environment": child_environment, "cwd": folder, "columns": 80}
     plain, code = on_a_terminal(*words, **named, NO_COLOR="1")
     coloured, _ = on_a_terminal(*words, **named)
     dumb, _ = on_a_terminal(*words, **{**named, "environment": child_environment | {}}, TERM="dumb")

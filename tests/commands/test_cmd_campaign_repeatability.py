@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from campaign_files import FAST, JOURNAL, contents, rows_of, steps, thinned, write, write_table
+from few_draws import few_draws  # noqa: F401 - all tests of this file use it
 from in_process import run_here
 
 from tactile_bayes.actions import campaign as actions

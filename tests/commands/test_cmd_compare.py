@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
+from few_draws import few_draws  # noqa: F401 - all tests of this file use it
 from in_process import run_here
 from posterior_maps import bump_map
 from published_schemas import check_document

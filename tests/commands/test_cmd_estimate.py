@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from few_draws import few_draws  # noqa: F401 - all tests of this file use it
 from in_process import run_here
 from plain_calibration import RECIPE
 from posterior_files import write_calibration, write_maps
@@ -116,7 +117,7 @@ def test_the_draws_open_in_arviz(ensemble_run: CompletedProcess[str], folder: Pa
 
 def test_no_lump_is_an_answer_with_its_reason_and_exit_6(folder: Path, tmp_path: Path) -> None:
     output = tmp_path / "p.nc"
-    done = run_here("estimate", "empty.nc", *FAST, "-o", output, cwd=folder)
+    done = run_here("estimate", "empty.nc", *FAST, "--size-calibration", "size.json", "-o", output, cwd=folder)
     assert done.returncode == 6
     assert done.stdout.startswith("No lump found on the 26 cm2 that the map covers: ")
     assert "Research use only" in done.stdout

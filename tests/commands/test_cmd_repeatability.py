@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from few_draws import few_draws  # noqa: F401 - all tests of this file use it
 from in_process import run_here
 from published_schemas import check_document
 from repeated_exams import shape, write_done, write_exam, write_repeats

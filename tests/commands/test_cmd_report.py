@@ -10,6 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from few_draws import few_draws  # noqa: F401 - all tests of this file use it
 from in_process import run_here
 from repeated_exams import write_repeats
 

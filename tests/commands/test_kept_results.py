@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from few_draws import few_draws  # noqa: F401 - all tests of this file use it
 from in_process import run_here
 
 import tactile_bayes as tb

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from campaign_files import rows_of, thinned, write, write_table
+from few_draws import few_draws  # noqa: F401 - all tests of this file use it
 from in_process import run_here
 
 import tactile_bayes as tb

@@ -8,10 +8,9 @@ from typing import Any
 
 import pytest
 from export_files import write_exam
-from few_draws import few_draws
 from searched_once import searched_once
 
-__all__ = ["estimate", "exam", "few_draws", "searched_once"]
+__all__ = ["estimate", "exam", "searched_once"]
 
 
 @pytest.fixture(scope="session")

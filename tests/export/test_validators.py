@@ -38,7 +38,10 @@ def said(*words: object) -> str:
 
 
 @pytest.fixture(scope="module", params=EXAMS)
-def made(request: pytest.FixtureRequest, exam: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    if not any(map(shutil.which, ("dciodvfy", "dcmftest"))):
+        pytest.skip("no validator is installed")
+    exam = request.getfixturevalue("exam")
     out = tmp_path_factory.mktemp("dicom") / "out"
     exported(exam, *EXAMS[request.param], "--to", "dicom", "-o", out)
     return out

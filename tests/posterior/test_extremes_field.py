@@ -58,8 +58,13 @@ def answer(tactile_map: TactileMap, method: str, fit: SamplerSettings = FIELD) -
     return found
 
 
+HELD_ELSEWHERE = ("a depression", "over the edge")  # by tests of detection and of the search
+
+
 @METHOD
-@pytest.mark.parametrize("name", list(NOTHING))
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.long] * (name in HELD_ELSEWHERE)) for name in NOTHING]
+)
 def test_no_number_where_there_is_nothing_to_measure(name: str, method: str) -> None:
     found = answer(NOTHING[name][0], method)
     assert found.status == "no_estimate"
