@@ -15,7 +15,7 @@ from tactile_bayes.findings import Finding, finding
 from tactile_bayes.geometry import BoolArray, FloatArray, IndexArray, inverse, principal_axes, rotation_from_quaternion
 from tactile_bayes.mapping.cells import MAX_POSE_GAP_MS, FramePoses, Projection
 from tactile_bayes.mapping.select import SelectedFrames, chunks
-from tactile_bayes.scans import ElementCalibration, HeadGeometry, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import HeadGeometry, Scan, TrackerPoses
 
 # --- Frames averaged over 20 ms and over 2 x 2 taxels: enough to find shifts of a millimetre, in a tenth of the time.
 
@@ -222,8 +222,7 @@ def corrected(scan: Scan, corrections: Iterable[str]) -> Scan:
 
 
 def _with_correction(scan: Scan, name: str) -> Scan:
-    head, poses = scan.head, scan.poses
-    lever = head.scanhead_from_tracker
+    head, lever = scan.head, scan.head.scanhead_from_tracker
     levers = {
         "lever-inverse": inverse(lever),
         "lever-none": np.eye(4),
@@ -233,17 +232,12 @@ def _with_correction(scan: Scan, name: str) -> Scan:
     if name in levers:
         return replace(scan, head=HeadGeometry(head.surface_mm, head.pitch_mm, levers[name]))
     if name in ("scalar-last", "inverse-rotation"):
-        wxyz = corrected_quaternions(poses.quaternion_wxyz, [name])
-        return replace(scan, poses=TrackerPoses(poses.time_s, poses.position_mm, wxyz))
-    calibration = scan.element_calibration
-    counts, gain, offset = (
-        reordered(array, name) for array in (scan.frames.counts, calibration.gain_kpa_per_count, calibration.offset_kpa)
-    )
-    return replace(
-        scan,
-        frames=PressureFrames(scan.frames.time_s, counts),
-        element_calibration=ElementCalibration(gain, offset, calibration.saturation_count),
-    )
+        wxyz = corrected_quaternions(scan.poses.quaternion_wxyz, [name])
+        return replace(scan, poses=replace(scan.poses, quaternion_wxyz=wxyz))
+    frames, stated = scan.frames, scan.element_calibration
+    gain, offset = (reordered(array, name) for array in (stated.gain_kpa_per_count, stated.offset_kpa))
+    calibration = replace(stated, gain_kpa_per_count=gain, offset_kpa=offset)
+    return replace(scan, frames=replace(frames, counts=reordered(frames.counts, name)), element_calibration=calibration)
 
 
 def reordered(array: Any, name: str) -> Any:
