@@ -11,12 +11,12 @@ import csv
 import html
 import json
 import re
-from collections.abc import Callable, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import zip_longest
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
@@ -116,8 +116,16 @@ class Made:
         return MapFile(Path("m.nc"), "ab" * 32, self.map, {"side": "right"})
 
 
+@pytest.fixture(autouse=True, scope="module")
+def scratch(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Keep what `folder` makes among pytest's own folders, which go."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tempfile, "tempdir", str(tmp_path_factory.mktemp("findings")))
+        yield
+
+
 def folder() -> Path:
-    return Path(mkdtemp(prefix="findings-"))
+    return Path(tempfile.mkdtemp())
 
 
 def shown(path: Path) -> str:
