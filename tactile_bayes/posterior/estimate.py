@@ -405,9 +405,10 @@ def _findings(result: MapDraws, *, cell_mm: float) -> Iterator[Finding]:
     """Cautions and checks on the size of a lump, besides those on its map."""
     posterior, calibration = result.posterior, result.calibration
     if calibration is not None:
-        beyond = [] if result.size is None else calibration.beyond_lumps(result.size)
-        for text in (*calibration.outside(*posterior.medians), *beyond):
-            yield finding("outside_calibration", f"{terms.UNLIKE_LEARNED}: {text}")
+        outside = calibration.outside(*posterior.medians)
+        outside += [] if result.size is None else calibration.beyond_lumps(result.size)
+        if outside:
+            yield finding("outside_calibration", f"{terms.UNLIKE_LEARNED}: {' and '.join(outside)}")
         if (cosines := result.figures.get("field_cosines", FIELD_COSINES)) < FIELD_COSINES:
             text = f"the errors of the map were resolved by {cosines} basis functions along each axis, and sizes were "
             text += f"learned with {FIELD_COSINES} or more"
