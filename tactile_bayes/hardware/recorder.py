@@ -305,8 +305,6 @@ class Recorder:
     def _read_lines(self) -> None:
         """Wait briefly for bytes, and process all of them."""
         waiting = [line.stream for line in self._lines if not line.stream.ended]
-        if not waiting:
-            time.sleep(_TICK_S)
         ready, _, _ = select.select(waiting, [], [], _TICK_S)
         for line in self._lines:
             if line.stream not in ready:
