@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 import shutil
 import sys
-from collections.abc import Callable
 from datetime import date
 from pathlib import Path
 from typing import Final
@@ -134,9 +133,9 @@ def _prepare(output: Path, *, force: bool) -> None:
         write_bytes(output / name, (Path(__file__).resolve().parent.parent / "demo" / name).read_bytes(), force=True)
 
 
-def _how_to_type(which: Callable[[str], str | None] = shutil.which) -> str:
+def _how_to_type() -> str:
     """The command to type where the program is not on the PATH, as after `make demo`; else empty."""
-    if which(PROGRAM):
+    if shutil.which(PROGRAM):
         return ""
     started = Path(sys.argv[0])
     typed = str(started) if started.name == PROGRAM else f"{shlex.quote(sys.executable)} -m tactile_bayes"

@@ -29,15 +29,13 @@ _COLUMNS: Final = {"size_mm": "median", "low_mm": "low", "high_mm": "high", "pro
 StatedSize = Quantity | Interval
 
 
-def read_stated_size(path: Path, number: int | None = None) -> StatedSize | None:
-    """Largest size in a file of `estimate`, mm; None without one.
-
-    `number` is the estimate's place in a list, from 1; a list of one needs none.
-    """
-    return _size_and_provenance(path, number)[0]
+def read_stated_size(path: Path) -> StatedSize | None:
+    """Largest size in a file of `estimate`, mm; None without one."""
+    return _size_and_provenance(path, None)[0]
 
 
 def _size_and_provenance(path: Path, number: int | None) -> tuple[StatedSize | None, object]:
+    """Size and provenance in a file; `number`: the estimate's place in a list, from 1; a list of one needs none."""
     head = first_bytes(path, 8)
     if is_json(head):
         return _from_json(path, number)

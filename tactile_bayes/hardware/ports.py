@@ -234,13 +234,13 @@ class Stream:
     def fileno(self) -> int:
         return self.pipe
 
-    def wait_until_ready(self, timeout_s: float = READY_S) -> None:
+    def wait_until_ready(self) -> None:
         """Wait until the reader reads: before, a device's data would pile up in a buffer of 4 KiB.
 
-        After `timeout_s` the recording begins without it, and bytes that it loses are counted. Devices are told to send
+        After `READY_S` the recording begins without it, and bytes that it loses are counted. Devices are told to send
         only afterwards, so that what comes meanwhile may be dropped.
         """
-        end = time.monotonic() + timeout_s
+        end = time.monotonic() + READY_S
         while not (self.ready or self.ended) and (remaining_s := end - time.monotonic()) > 0:
             if select.select([self], [], [], remaining_s)[0]:
                 self.read()
@@ -289,9 +289,8 @@ def read_in_process(port: Port) -> Stream:
     """Start a process that reads a port."""
     ours, theirs = os.pipe()
     os.set_blocking(ours, False)
-    if hasattr(fcntl, "F_SETPIPE_SZ"):
-        with contextlib.suppress(OSError):  # a user's pipes may be limited; the rest is only shorter
-            fcntl.fcntl(ours, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+    with contextlib.suppress(OSError, AttributeError):  # macOS has no such size, and a user may be limited
+        fcntl.fcntl(ours, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
     with port.descriptor() as device:
         process = subprocess.Popen(
             [sys.executable, "-I", "-S", str(Path(reading.__file__)), str(device), str(theirs)],

@@ -106,7 +106,8 @@ def test_the_demo_says_what_to_type_where_the_program_is_not_on_the_path(
     monkeypatch: pytest.MonkeyPatch, found: str | None, started: str, words: str
 ) -> None:
     monkeypatch.setattr("sys.argv", [started, "demo"])
-    said = _how_to_type(which=lambda _: found)
+    monkeypatch.setattr("shutil.which", lambda _: found)
+    said = _how_to_type()
     assert words in said
     assert bool(said) == bool(words)
 

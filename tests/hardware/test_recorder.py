@@ -82,11 +82,12 @@ def test_a_reader_says_when_it_reads_and_nothing_of_that_is_data(line):
     os.close(ours)
 
 
-def test_a_reader_that_does_not_come_is_not_waited_for_without_end():
+def test_a_reader_that_does_not_come_is_not_waited_for_without_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tactile_bayes.hardware.ports.READY_S", 0.05)
     device, far = os.pipe()
     process = subprocess.Popen([sys.executable, "-c", "import sys; sys.stdin.read()"], stdin=subprocess.PIPE)
     stream = Stream(process, device)
-    stream.wait_until_ready(0.05)
+    stream.wait_until_ready()
     assert not stream.ready
     process.stdin.close()
     stream.close()
