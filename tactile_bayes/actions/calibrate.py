@@ -30,7 +30,6 @@ from tactile_bayes.report.study import eq6_figure
 from tactile_bayes.scans import Scan
 from tactile_bayes.shell import progress_bar
 from tactile_bayes.size.bodies import BodyCalibration
-from tactile_bayes.size.eq6 import SizeCalibration
 
 
 def calibrate_array_action(
@@ -122,7 +121,7 @@ def calibrate_size_action(
         )
     click.echo(text, nl=False)  # first: a file that cannot be written loses no result
     learned.write(output, force=force)
-    if figure is not None and isinstance(calibration, SizeCalibration) and learned.lumps is not None:
+    if figure is not None and not isinstance(calibration, BodyCalibration) and learned.lumps is not None:
         eq6_figure(calibration, learned.lumps, figure, title=table.name, force=force)
 
 

@@ -131,7 +131,7 @@ def load_trial(trial: Path | Sheet, excision: Path | Sheet, columns: Path | None
     `tidy_trial` is tidy whatever the mapping holds.
     """
     sizes = read_excision(excision, columns)
-    mapping = None if columns is None or tidy_trial or isinstance(trial, Sheet) else read_mapping(columns)
+    mapping = None if columns is None or tidy_trial else read_mapping(columns)
     if mapping is None or mapping.reading is None or isinstance(trial, Sheet):
         table = read_table(trial, "trial.table.json")
     else:
@@ -170,7 +170,7 @@ def load_trial(trial: Path | Sheet, excision: Path | Sheet, columns: Path | None
 
 def read_excision(excision: Path | Sheet, columns: Path | None) -> Table:
     """Sizes after excision: from a wide table where the mapping has ``[excision]``, otherwise from a tidy one."""
-    mapping = None if columns is None or isinstance(excision, Sheet) else read_mapping(columns)
+    mapping = None if columns is None else read_mapping(columns)
     if mapping is None or mapping.excision is None or isinstance(excision, Sheet):
         return read_table(excision, "excision.table.json")
     return read_wide_excision(excision, mapping, mapping.excision)
