@@ -263,7 +263,9 @@ def size_table(table: Table, *, least_stiffness_ratio: float = 0.0) -> eq6.SizeT
     d_mm, amplitude, sigma_x, sigma_y = (array(n) for n in ("d_mm", "amplitude", "sigma_x_mm", "sigma_y_mm"))
     depth = array("depth_ratio")
     if d_mm is None or amplitude is None or sigma_x is None:
-        raise BadDataError("no rows", way_out="give a row for each lump", path=str(table.path))
+        what = f"each of its lumps is marked as not detectable, or softer than {least_stiffness_ratio:g}"
+        way_out = "give others, or a lower --least-stiffness-ratio"
+        raise BadDataError(what, way_out=way_out, path=str(table.path))
     if depth is None:
         return eq6.SizeTable(d_mm, amplitude, sigma_x, sigma_y)
     same = [columns[name] for name in ("seat", "d_mm", "stiffness_ratio", "thickness_mm", "head_radius_mm", "head")]

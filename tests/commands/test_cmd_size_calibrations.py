@@ -84,6 +84,14 @@ def test_lumps_of_one_kind_are_remembered_and_lumps_that_differ_are_not() -> Non
     assert table_cautions(unknown) == ()
 
 
+def test_a_table_of_which_no_lump_is_left_says_why(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("d_mm,amplitude,sigma_x_mm,stiffness_ratio\n10,0.4,3.4,20\n")
+    words = ("calibrate", "size", "t.csv", "-o", "s.json", "--least-stiffness-ratio", 100)
+    refused = run_here(*words, cwd=tmp_path)
+    assert refused.returncode == 3
+    assert "softer than 100; give others, or a lower --least-stiffness-ratio" in refused.stderr
+
+
 def test_a_file_keeps_its_cautions(tmp_path: Path) -> None:
     shipped = read_size_calibration(size_calibration_path("plane-strain") or Path())
     columns = {"seat": ["centred"], "sigma_y_mm": [None], "stiffness_ratio": [8.0], "d_mm": [10.0]}
