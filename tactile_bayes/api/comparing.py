@@ -190,7 +190,7 @@ def compare_answers(
 
     `numbers` of the visits for findings and reasons, with codes where these are others; by default from 1 on.
     """
-    if len(visits) < 2 or not all(visits):
+    if not all(visits):
         raise UsageError("a comparison needs two visits of a map or more each: `compare VISIT1.nc --with VISIT2.nc`")
     comparing.check_visits(len(visits))
     if settings.size_calibration == "none":

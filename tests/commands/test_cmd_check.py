@@ -64,6 +64,13 @@ def test_a_map_has_nothing_to_correct(tmp_path):
     assert "--correct: for scans only; leave out or give --as scan" in refused.stderr
 
 
+def test_a_scan_in_another_unit_of_length_is_told_by_how_far_it_moved(tmp_path):
+    arrays = arrays_of(tb.demo_scan())
+    np.savez(tmp_path / "far.npz", **arrays | {"position_mm": 100 * arrays["position_mm"]})
+    said = run_here("import", "far.npz", "-o", "far.mcap", cwd=tmp_path)
+    assert "no breast is so large; check their unit" in said.stdout
+
+
 def test_a_scan_of_which_no_map_can_be_made_is_imported(tmp_path):
     scan = tb.demo_scan()
     counts = np.full_like(scan.frames.counts, 4095)

@@ -48,6 +48,9 @@ def test_a_scan_that_shows_nothing_checks_no_head(tmp_path: Path) -> None:
     done = run_here("check", "even.mcap", "-o", "head.json", cwd=tmp_path)
     assert done.returncode != 0
     assert "does not show that its head is right" in done.stderr
+    both = run_here("check", "even.mcap", "even.mcap", "-o", "head.json", cwd=tmp_path)
+    assert both.returncode == 2
+    assert "-o takes the head of one scan" in both.stderr
     assert not (tmp_path / "head.json").exists()
 
 

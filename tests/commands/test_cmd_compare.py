@@ -196,6 +196,7 @@ def test_a_stated_spread_between_exams_widens_the_change_and_leaves_one_interval
         (("a0.nc", "--with", "same0.nc", "--dates", "2026-01-01,soon"), 2, "'soon' is no date"),
         (("a0.nc", "--with", "same0.nc", "--days", 3, "--dates", "2026-01-01,2026-02-01"), 2, "give one of them"),
         (("a0.nc", "--with", "same0.nc", "--size-calibration", "none"), 2, "needs a size calibration"),
+        (("a0.nc", "--with", "same0.nc", "--pdf", "g.pdf"), 2, "--pdf prints the page that --output names"),
         (("a0.nc", "--with", "no.nc"), 3, "no.nc"),
     ],
 )

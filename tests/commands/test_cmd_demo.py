@@ -10,6 +10,7 @@ from pathlib import Path
 from subprocess import CompletedProcess
 
 import pytest
+from in_process import run_here
 
 from tactile_bayes.actions.exam import _how_to_type
 from tactile_bayes.files.instrument import read_scene
@@ -110,6 +111,16 @@ def test_the_demo_says_what_to_type_where_the_program_is_not_on_the_path(
     said = _how_to_type()
     assert words in said
     assert bool(said) == bool(words)
+
+
+@pytest.mark.parametrize(("output", "words"), [("mine/a", "mine/a is a file"), ("mine", "mine is not empty")])
+def test_a_demo_leaves_what_is_there_alone(tmp_path: Path, output: str, words: str) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "a").write_text("mine")
+    refused = run_here("demo", "-o", output, cwd=tmp_path)
+    assert refused.returncode == 2
+    assert f"{words}; choose another name" in refused.stderr
+    assert [one.read_text() for one in (tmp_path / "mine").iterdir()] == ["mine"]
 
 
 @pytest.mark.long

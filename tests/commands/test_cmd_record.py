@@ -408,6 +408,7 @@ def test_another_device_on_the_port_is_told_by_what_it_says(record, scan, monkey
         (["--head-baud", "115200", "--like", "SOURCE"], 4, "--every 15"),
         (["--tracker", "/dev/nothing", "--like", "SOURCE"], 4, "tracker /dev/nothing: cannot be opened"),
         (["--tracker", "", "--like", "SOURCE"], 2, "--tracker is empty; give the tracker's port"),
+        (["--tool", "Probe", "--like", "SOURCE"], 2, "--tool and --reference are of a tracker; give its port"),
         (["--examiner", "Dr Who", "--like", "SOURCE"], 3, "error: --examiner: examiner is 'Dr Who'; give a text"),
         (
             ["--size-calibration", "no.json", "--live", "--uncalibrated", "--like", "SOURCE"],

@@ -221,6 +221,7 @@ def test_faults_have_nothing_to_act_on(run_cli, tmp_path):
 
     write_scan(tmp_path / "a.mcap", short_scan(0.2), provenance=Provenance("test", {}))
     of_no_effect = {
+        "is spoken over a network; give --tcp": ("tracker", "--protocol", "igtlink"),
         "sends nothing by itself": ("tracker", "--protocol", "ndi", "--drop", "0.1"),
         "--hold, --hide and --breathe are a tracker's": ("head", "--hold", "3"),
     }
