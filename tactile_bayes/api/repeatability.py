@@ -72,7 +72,7 @@ def exams_of_campaign(folder: Path) -> list[ExamFolder]:
 
 
 def learn_from_exams(
-    exams: Sequence[ExamFolder], *, size_calibration: str | None = None, fewest: int | None = None
+    exams: Sequence[ExamFolder], *, size_calibration: str | None = None, fewest: int = FEWEST_MASSES
 ) -> size_json.RepeatabilityFile:
     """Learn the spread between exams of one mass from those that were repeated within a visit.
 
@@ -82,13 +82,13 @@ def learn_from_exams(
     groups, left_out = _repeats(exams)
     repeats, masses = [repeat for group in groups for repeat in group], []
     if not groups:
-        learn_repeatability([], fewest=fewest or FEWEST_MASSES)  # refuses them
+        learn_repeatability([], fewest=fewest)  # refuses them
     calibration, sizing = _calibration(repeats, size_calibration)
     for group in groups:
         alone = [log_size_alone(calibration, read_shape(one.exam.folder / SHAPE)) for one in group]
         first, values = group[0].exam, np.array(alone)
         masses.append(RepeatedExams(first.of_mass, first.mass, values[:, 0], values[:, 1]))
-    learned = learn_repeatability(masses, fewest=fewest or FEWEST_MASSES)
+    learned = learn_repeatability(masses, fewest=fewest)
     spread = learned.repeatability
     entries = [
         size_json.RepeatedMass(

@@ -55,7 +55,6 @@ class Feed(Observer):
 
     def __init__(self, pipe: int) -> None:
         self._pipe = pipe
-        self.missed = 0
         os.set_blocking(pipe, False)
         with suppress(OSError, AttributeError):
             fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
@@ -81,8 +80,6 @@ class Feed(Observer):
         with suppress(BlockingIOError, BrokenPipeError):  # it is full, or the view was closed; the recording goes on
             if len(data) <= select.PIPE_BUF:  # a longer one could be cut in two
                 os.write(self._pipe, data)
-                return
-        self.missed += 1
 
     def close(self) -> None:
         """Close the feed; the view ends after reading the rest of the pipe."""
