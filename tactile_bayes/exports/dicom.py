@@ -414,7 +414,7 @@ def _group(
         "algorithm_id": sr.AlgorithmIdentification(
             name=MODEL, version=estimate.version or __version__, parameters=[estimate.method_words]
         ),
-        "finding_sites": _sites(estimate, maps),
+        "finding_sites": _sites(maps),
         "measurements": list(_measurements(finding, evidence)),
         "qualitative_evaluations": [sr.QualitativeEvaluation(coded(exam.OUTCOME), coded(finding.outcome))],
     }
@@ -429,9 +429,9 @@ def _group(
     return group
 
 
-def _sites(estimate: exam.EstimateFile, maps: Sequence[exam.MapFile]) -> list[Any] | None:
+def _sites(maps: Sequence[exam.MapFile]) -> list[Any] | None:
     """The breast with its side; None for a phantom or an unknown side."""
-    sides = {one.facts.get("side") for one in maps} or {estimate.facts.get("side")}
+    sides = {one.facts.get("side") for one in maps}
     side = sides.pop() if len(sides) == 1 else None
     if side not in exam.SIDES:
         return None

@@ -248,7 +248,7 @@ def shared_facts(scans: Iterable[Mapping[str, str]]) -> dict[str, str]:
 def parse_estimate(document: object, path: Path) -> EstimateFile:
     """An estimate from its JSON object; messages name it by `path`."""
     schema = document.get("schema") if isinstance(document, dict) else None
-    if not isinstance(document, dict) or not isinstance(schema, str) or schema not in REPORTS:
+    if not isinstance(schema, str) or schema not in REPORTS:
         raise BadDataError(f"is {reading.schema_kind(schema) or 'no estimate'}", way_out=_WAY_OUT, path=str(path))
     report = checked_report(document, REPORTS[schema], path=path)
     return EstimateFile(

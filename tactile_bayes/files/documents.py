@@ -63,12 +63,11 @@ def read_toml_record(path: Path, kind: type[T], *, way_out: str) -> T:
 def parse_record(document: object, kind: type[T], *, path: Path) -> T:
     """Make a record of plain data; for the errors see `read_record`."""
     schema = schema_name(kind)
-    kind_expected = reading.schema_kind(schema)
-    kind_read = reading.schema_kind(document.get("schema")) if isinstance(document, dict) else ""
-    if kind_expected and kind_read and kind_read != kind_expected:
-        raise reading.of_another_kind(path, kind_read, kind_expected, way_out=f"give {kind_expected}")
-    if schema and isinstance(document, dict) and document.get("schema", schema) != schema:
-        raise BadDataError(f"schema is {short_repr(document['schema'])}", way_out=f"give {schema!r}", path=str(path))
+    if schema and isinstance(document, dict) and (stated := document.get("schema", schema)) != schema:
+        kind_expected, kind_read = reading.schema_kind(schema), reading.schema_kind(stated)
+        if kind_read not in ("", kind_expected):
+            raise reading.of_another_kind(path, kind_read, kind_expected, way_out=f"give {kind_expected}")
+        raise BadDataError(f"schema is {short_repr(stated)}", way_out=f"give {schema!r}", path=str(path))
     with in_file(path):
         return from_plain(kind, document)
 

@@ -319,7 +319,7 @@ def _where(cells: BoolArray) -> str:
     number = int(cells.sum())
     for axis, name in ((0, "column"), (1, "row")):
         whole = np.flatnonzero(cells.all(axis=axis)) + 1
-        if number and len(whole) * cells.shape[axis] == number:
+        if len(whole) * cells.shape[axis] == number:
             return f"{name} {whole[0]}" if len(whole) == 1 else f"{len(whole)} {name}s ({whole[0]} to {whole[-1]})"
     row, column = (int(i) + 1 for i in np.argwhere(cells)[0])
     return f"{number:,} cells (row {row}, column {column}...)" if number > 1 else f"row {row}, column {column}"

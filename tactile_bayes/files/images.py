@@ -128,7 +128,7 @@ def _grey_channel(pixels: np.ndarray[Any, Any], mode: str) -> tuple[np.ndarray[A
     colours = pixels if alpha is None else pixels[..., :-1]
     if mode == "YCbCr" and (colours[..., 1:] == 128).all():
         colours = colours[..., :1]
-    elif mode in ("YCbCr", "CMYK", "LAB", "HSV") or not (colours == colours[..., :1]).all():
+    elif mode in ("YCbCr", "CMYK", "LAB") or not (colours == colours[..., :1]).all():
         raise BadDataError(f"is a colour image (mode {mode})", way_out="save one channel of intensities")
     if alpha is not None:
         if between := int(((alpha != 0) & (alpha != 255)).sum()):

@@ -260,7 +260,7 @@ def quaternions(rotations: FloatArray, layout: str) -> FloatArray:
         raise BadDataError(f"rotations have shape {rotations.shape}", way_out=f"as {layout} they must be (m, {width})")
     if layout == "euler":
         return np.asarray(Rotation.from_euler("ZYX", rotations, degrees=True).as_quat(scalar_first=True))
-    return rotations[:, [3, 0, 1, 2]] if layout == "xyzw" else rotations
+    return rotations[:, [3, 0, 1, 2]]
 
 
 def _poses_of_matrices(matrices: FloatArray) -> tuple[FloatArray, FloatArray]:

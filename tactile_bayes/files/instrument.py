@@ -108,13 +108,13 @@ def read_simulated_head(path: Path) -> scenes.Head:
         return _head_of(file)
 
 
-def _head_file(document: object, path: Path) -> HeadFile:
+def _head_file(document: Any, path: Path) -> HeadFile:
     file = parse_record(document, HeadFile, path=path)
     grid = [name for name in ("rows", "columns", "radius_mm") if getattr(file, name) is not None]
     if file.surface_mm is not None and grid:
         what = f"gives both surface_mm and {grid[0]}"
         raise BadDataError(what, way_out="leave out one of the two descriptions", path=str(path))
-    if isinstance(document, dict) and "radius_mm" in document:  # null is a flat head
+    if "radius_mm" in document:  # null is a flat head
         grid.append("radius_mm")
     if file.surface_mm is None and (missing := {"rows", "columns", "radius_mm"} - set(grid)):
         raise BadDataError(f"lacks {min(missing)}", way_out=_WAY_OUT, path=str(path))

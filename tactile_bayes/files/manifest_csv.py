@@ -219,7 +219,7 @@ def _check_masses(table: Table, exams: Sequence[Exam]) -> None:
 def write_manifest(path: Path, rows: Sequence[Mapping[str, object]], *, force: bool = False) -> None:
     """Write a table of exams; keys of the rows are columns, those that no row has are left out."""
     filled = [name for name in columns_of("exams") if any(row.get(name) is not None for row in rows)]
-    write_text(path, table_text(rows, filled or columns_of("exams")), force=force)
+    write_text(path, table_text(rows, filled), force=force)
 
 
 def read_rows(path: Path) -> RawTable:

@@ -124,8 +124,6 @@ def read_map_and_header(path: Path) -> tuple[TactileMap, MapHeader]:
                 raise BadDataError(f"variable {name} is missing", way_out=_WAY_OUT)
         transforms = {name: file.array(name, kind="f8", dimensions=("row", "column")) for name in _TRANSFORMS}
         for name, transform in transforms.items():
-            if transform is not None and transform.shape != (4, 4):
-                raise BadDataError(f"variable {name} is not 4 by 4", way_out=_WAY_OUT)
             if transform is not None:
                 check_rigid(transform, name=name)
         _check_lattice({"x": arrays["x_mm"], "y": arrays["y_mm"]}, header.recipe.cell_mm)

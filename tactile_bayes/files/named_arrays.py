@@ -173,9 +173,8 @@ def _hdf5(path: Path, choose: Choose, *, begins_at: int = 0) -> Arrays:
 def _members(group: Group, prefix: str, *, levels: int) -> Iterator[tuple[str, Group]]:
     """Each array's name with its group; MATLAB's own groups (``#refs#``) are left out."""
     yield from ((f"{prefix}{name}", group) for name in group.variables())
-    for name in group.groups() if levels else ():
-        inner = group.group(name)
-        if inner is not None and not name.startswith("#"):
+    for name, inner in group.groups().items() if levels else ():
+        if not name.startswith("#"):
             yield from _members(inner, f"{prefix}{name}.", levels=levels - 1)
 
 

@@ -184,9 +184,9 @@ class Group:
         dataset = self._dataset(name)
         return as_declared(self._values(name, dataset), dataset.attrs) if dataset.dtype.kind in "iuf" else None
 
-    def groups(self) -> list[str]:
-        """Names of the groups in this one."""
-        return sorted(name for name in map(str, self._place) if isinstance(self._member(name), h5py.Group))
+    def groups(self) -> dict[str, Group]:
+        """The groups in this one by their names, in alphabetical order."""
+        return {name: group for name in sorted(map(str, self._place)) if (group := self.group(name)) is not None}
 
     def _values(self, name: str, dataset: Any) -> Any:
         """Values of a dataset, of whose chunks each unpacks to its declared size.

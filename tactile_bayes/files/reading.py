@@ -268,9 +268,9 @@ SCHEMES: Final = ("s3", "gs", "abfs")
 _ADDRESS: Final = re.compile(rf"({'|'.join(SCHEMES)})://[^/\s@:]+(/[^\x00-\x1f\x7f]*)?")
 
 
-def is_address(name: object) -> bool:
+def is_address(name: str) -> bool:
     """True when a name is the address of a file or folder in an object store, as ``s3://bucket/scan.mcap``."""
-    return isinstance(name, str) and name.startswith(tuple(f"{scheme}://" for scheme in SCHEMES))
+    return name.startswith(tuple(f"{scheme}://" for scheme in SCHEMES))
 
 
 def check_address(address: str) -> str:

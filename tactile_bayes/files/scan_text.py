@@ -323,7 +323,7 @@ _UNITS: Final = {
     "raw": "counts",
 }
 """Units by what programs call them, in small letters."""
-_NUMBER: Final = r"(\d+(?:[.,]\d+)?(?:e[+-]?\d+)?)"
+_NUMBER: Final = r"(?P<number>\d+(?:[.,]\d+)?(?:e[+-]?\d+)?)"
 _UNIT_LINE: Final = re.compile(r"^\W*(?:(?:pressure[ _])?units?\b|pressure values in\b)[^\w]*([\w/^²]+)", re.IGNORECASE)
 _UNIT_WORD: Final = re.compile(r"[\[(]\s*(kpa|psi|mmhg|n/cm2|n/cm²|n/cm\^2)\.?\s*[\])]", re.IGNORECASE)
 _FULL_SCALE: Final = re.compile(r"\b\d+ *= *full[ -]scale", re.IGNORECASE)
@@ -456,7 +456,7 @@ def _stated_by_line(text: str) -> Iterable[tuple[str, Any]]:
     elif word and word[1].lower() in _UNITS:
         yield "unit", _UNITS[word[1].lower()]
     for pattern, option in ((_PERIOD_LINE, "rate_hz"), (_RATE_LINE, "rate_hz"), (_SATURATION_LINE, "saturation")):
-        if (match := pattern.search(text)) and (value := float(match[match.lastindex or 1].replace(",", "."))) > 0:
+        if (match := pattern.search(text)) and (value := float(match["number"].replace(",", "."))) > 0:
             yield option, 1 / value if pattern is _PERIOD_LINE else value
 
 

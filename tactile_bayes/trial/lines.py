@@ -49,7 +49,7 @@ class PairAngles:
         slope = math.copysign(1.0, angle) if abs(angle) == math.pi / 4 else math.tan(angle)
         z = self._y - slope * self._x
         rounding = EQUAL * (np.abs(self._y).max() + abs(slope) * np.abs(self._x).max())
-        z = np.rint(z / rounding) if rounding > 0 else z
+        z = np.rint(z / rounding)
         vertical_pairs = self._upright if self._vertical < 0 else 0
         return _count_inversions(self._x, z, ties=inclusive) + vertical_pairs - (self._coincident if inclusive else 0)
 
@@ -233,13 +233,11 @@ def weighted_deming(
     r"""Fit a Deming line whose errors grow in proportion to size: weights 1 over the squared fitted size.
 
     Iterated from the unweighted line until intercept and slope both change by less than `threshold`, in their own
-    units, or for `max_iterations`; undefined when a size is not above 0.
+    units, or for `max_iterations`.
 
     The fitted size is the mean of the two coordinates of the foot, :math:`(\hat x + \lambda \hat y) / (1 + \lambda)`:
     Linnet (1990), and (1993) Clin. Chem. 39, 424. There is no analytic standard error; the jackknife is customary.
     """
-    if not (np.all(x > 0) and np.all(y > 0)):
-        raise UndefinedError("weights by size need every size above 0")
     line = deming(x, y, error_ratio=error_ratio)
     intercept, slope = line.intercept, line.slope
     for _ in range(max_iterations):
@@ -355,7 +353,7 @@ def concordance(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) -> Co
     324, with n - 2.
     """
     n = len(x)
-    if n < 2 or all_equal(x) or all_equal(y):
+    if all_equal(x) or all_equal(y):
         raise UndefinedError("concordance needs sizes and ex-vivo sizes that vary")
     sx2, sy2 = float(np.var(x)), float(np.var(y))
     sxy = float(np.mean((x - x.mean()) * (y - y.mean())))

@@ -156,12 +156,12 @@ def _interval(
             return None
         way_out = "an interval needs low_mm, high_mm and probability, or all three blank"
         raise fault(row, blank[0], "is blank while the interval's other cells are not", way_out=way_out)
-    if status != "detected":
+    if size_mm is None:
         way_out = "leave the interval blank, or give status detected"
         raise fault(row, "low_mm", f"is {low_mm:g} while status is {status}", way_out=way_out)
     if low_mm > high_mm:
         raise fault(row, "low_mm", f"is {low_mm:g}, above high_mm {high_mm:g}", way_out="exchange or correct them")
-    if size_mm is not None and not low_mm <= size_mm <= high_mm:
+    if not low_mm <= size_mm <= high_mm:
         problem = f"is {size_mm:g}, outside its own interval {low_mm:g} to {high_mm:g}"
         raise fault(row, "size_mm", problem, way_out="correct the size, low_mm or high_mm; all three are in mm")
     return Interval(low_mm, high_mm, probability)
