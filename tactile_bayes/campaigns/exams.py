@@ -425,25 +425,31 @@ def unnamed_masses(masses: Sequence[Sequence[MassPlace]]) -> list[Finding]:
 Visits = dict[str, list[Exam]]  #: Exams of one mass by the code of the visit, in order of time.
 
 
-def visits_by_mass(exams: Sequence[Exam]) -> dict[str, Visits]:
-    """Visits of each mass, by its name; `read_manifest` refuses visits whose order is not known."""
+def stated_days(exams: Iterable[Exam]) -> dict[str, date]:
+    """Latest day that the exams of each mass at a visit state, by `Exam.of_mass`."""
+    return dict(sorted((exam.of_mass, exam.day) for exam in exams if exam.day is not None))
+
+
+def visits_by_mass(exams: Sequence[Exam], days: Mapping[str, date]) -> dict[str, Visits]:
+    """Visits of each mass, by its name; `days`: `stated_days` of all exams of the table.
+
+    `read_manifest` refuses visits whose order is not known by all exams: those that came through may not tell it.
+    """
     by_mass: dict[str, Visits] = defaultdict(lambda: defaultdict(list))
     for exam in exams:
         by_mass[exam.of_visits][exam.visit].append(exam)
     return {
-        name: {visit: visits[visit] for visit in visits_in_order(visit_dates(visits)) or visits}
+        name: {visit: visits[visit] for visit in visits_in_order(visit_dates(visits, days)) or visits}
         for name, visits in by_mass.items()
     }
 
 
-def masses_with_visits(exams: Sequence[Exam]) -> dict[str, Visits]:
-    """Masses with exams at several visits, by their names."""
-    return {name: visits for name, visits in visits_by_mass(exams).items() if len(visits) > 1}
+def masses_with_visits(exams: Sequence[Exam], days: Mapping[str, date]) -> dict[str, Visits]:
+    """Masses with exams at several visits, as `visits_by_mass` has them."""
+    return {name: visits for name, visits in visits_by_mass(exams, days).items() if len(visits) > 1}
 
 
-def visit_dates(visits: Mapping[str, Sequence[Exam]]) -> dict[str, date | None]:
-    """Latest date of each visit's exams; None where none has one."""
-    return {
-        visit: max((exam.day for exam in exams if exam.day is not None), default=day_of(visit))
-        for visit, exams in visits.items()
-    }
+def visit_dates(visits: Visits, days: Mapping[str, date]) -> dict[str, date | None]:
+    """Latest date of each visit's exams, else of the visit in `days`; None where none has one."""
+    known = {**days, **stated_days(exam for exams in visits.values() for exam in exams)}
+    return {visit: known.get(exams[0].of_mass) or day_of(visit) for visit, exams in visits.items()}

@@ -223,14 +223,13 @@ def _trial_reading(row: ExamRow, modality: str, *, reader: str | None = None) ->
 def growth_rows(campaign: Campaign) -> list[Growth]:
     """Change of each mass with several visits, in order of the masses."""
     compared, rows = campaign.keys["compare"], list[Growth]()
-    for name, visits in masses_with_visits(campaign.exams).items():
+    for name, visits in masses_with_visits(campaign.exams, campaign.days).items():
         codes, exam = [*visits], next(iter(visits.values()))[0]
         place = f"{layout.GROWTH}/{name}"
         if name in compared:
             report = read_record(campaign.folder / place / layout.COMPARED, CompareReport)
-            of = {one.map for visit in report.visits for one in visit.maps}
-            sized = [code for code, exams in visits.items() if any(one.name in of for one in exams)]
-            rows += growths(exam.patient, exam.mass, sized, report, f"{place}/{layout.GROWTH_PAGE}")
+            compared_visits = [*campaign.growing[name]]
+            rows += growths(exam.patient, exam.mass, compared_visits, report, f"{place}/{layout.GROWTH_PAGE}")
         else:
             fault = campaign.faults.get(name)
             reason = "exams of fewer than two visits came through" if fault is None else fault.reason
@@ -425,8 +424,8 @@ def index_html(
     """The index: a row for each mass, in the order of the table."""
     changes = {(one.patient, one.mass): one for one in growth}  # the last one of each mass: to its last visit
     row_of, masses = {row.exam.name: row for row in rows}, []
-    for visits in visits_by_mass(campaign.exams).values():
-        dates, entries = visit_dates(visits), []
+    for visits in visits_by_mass(campaign.exams, campaign.days).values():
+        dates, entries = visit_dates(visits, campaign.days), []
         for code, of_visit in visits.items():
             some = [row_of[exam.name] for exam in of_visit]
             exams = tuple(_exam_entry(campaign, row, inline=len(rows) <= _MOST_INLINE) for row in some)

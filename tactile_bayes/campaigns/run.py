@@ -28,7 +28,7 @@ from tactile_bayes.api.repeatability import ExamFolder
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.batch import CLUSTER_LOST, BatchInterrupted, BatchStore, Outcome, run_batch
 from tactile_bayes.campaigns import steps
-from tactile_bayes.campaigns.exams import Breasts, Match, Visits, masses_with_visits, visit_dates
+from tactile_bayes.campaigns.exams import Breasts, Match, Visits, masses_with_visits, stated_days, visit_dates
 from tactile_bayes.campaigns.inputs import READ, SITE, DuplicateExams, read_sources, unchanged
 from tactile_bayes.declarations import Record, names_of, replace
 from tactile_bayes.errors import TactileBayesError
@@ -90,6 +90,7 @@ class Campaign:
     """By step, the first few exams or masses of `todo`."""
     not_pooled: str = ""  #: Why no mass is; empty where masses are.
     not_compared: str = ""  #: The same of visits; empty too where no mass has several.
+    growing: dict[str, Visits] = field(default_factory=dict)  #: Compared visits of each mass, by its name.
     unread: set[str] = field(default_factory=set)  #: Names of the exams whose file could not be read.
     repeatability: Repeatability | None = None  #: Learned from the repeats.
     not_learned: str = ""  #: Why it was not, where masses have repeats.
@@ -102,6 +103,7 @@ class Campaign:
 
     def __post_init__(self) -> None:
         self._block = max(_BLOCK, _AHEAD_IN_BLOCK * int(getattr(self.executor, "ahead", 0)))
+        self.days = stated_days(self.exams)  # of failed exams too
         self._breasts = Breasts(self.exams)
         self._recordings = DuplicateExams(self._breasts, "recording")
 
@@ -127,7 +129,7 @@ class Campaign:
             self.not_pooled = "no mass has several exams at one visit"
         masses = 0 if self.not_pooled else len({exam.of_mass for exam in sound})
         learns = steps.count_repeated_masses(sound, self.settings) >= steps.FEWEST_MASSES
-        grown = 0 if self.not_compared else len(masses_with_visits(sound))
+        grown = 0 if self.not_compared else len(masses_with_visits(sound, self.days))
         self._needed.update(self._steps(len(sound), masses, learns=learns, compared=grown))
         with self.bar("steps") as self._tell:
             for block in _blocks_of_patients(sound, self._block):
@@ -140,8 +142,9 @@ class Campaign:
                 self._needed.subtract(self._steps(0, spared))
                 self._pool(sound)
             if grown:
-                growing = masses_with_visits(self._with_estimate(sound))
-                self._run_masses("compare", growing, self._compare_task, masses=len(masses_with_visits(sound)))
+                self.growing = masses_with_visits(self._with_estimate(sound), self.days)
+                several = len(masses_with_visits(sound, self.days))
+                self._run_masses("compare", self.growing, self._compare_task, masses=several)
 
     def _steps(self, exams: int, masses: int, *, learns: bool = False, compared: int = 0) -> dict[str, int]:
         """Steps that so many exams and masses take, done or not.
@@ -438,7 +441,7 @@ class Campaign:
 
     def _compare_task(self, name: str, visits: Visits) -> steps.Task:
         settings, key = self._shared_settings([exam for exams in visits.values() for exam in exams])
-        days = [*visit_dates(visits).values()]
+        days = [*visit_dates(visits, self.days).values()]
         dates = tuple("" if day is None else day.isoformat() for day in days)
         first = next(iter(visits.values()))[0]
         course = Course("", "", first.patient, first.side or "", first.mass, tuple(visits), dates if any(dates) else ())

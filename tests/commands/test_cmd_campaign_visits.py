@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,10 @@ from few_draws import few_draws  # noqa: F401 - all tests of this file use it
 from in_process import run_here
 from posterior_maps import bump_values, correlated_field, grid_map
 
+from tactile_bayes.campaigns.exams import masses_with_visits, stated_days, visit_dates
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.documents import load_schema
+from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.tables import read_table
@@ -136,6 +139,14 @@ def test_visits_without_an_order_and_an_excision_before_all_are_refused_before_a
     assert "table of exams, line 2, column date: visit 1 is after excision on" in early.stderr
 
 
+def test_visits_keep_their_order_and_days_when_the_exam_that_states_one_failed() -> None:
+    stated = {("post", 1): date(2026, 4, 10), ("pre", 1): None, ("pre", 2): date(2026, 1, 10)}
+    exams = [Exam("a.nc", Path("a.nc"), "P1", visit, "1", number, day) for (visit, number), day in stated.items()]
+    (visits,) = masses_with_visits(exams[:2], stated_days(exams)).values()
+    days = visit_dates(visits, stated_days(exams))
+    assert [*days.items()] == [("pre", date(2026, 1, 10)), ("post", date(2026, 4, 10))]
+
+
 @pytest.mark.long
 def test_one_visit_has_no_growth_landmarks_are_not_needed_and_findings_have_the_tables_codes(tmp_path: Path) -> None:
     for visit, sigma in enumerate(WIDTHS["P1"]):
@@ -145,10 +156,12 @@ def test_one_visit_has_no_growth_landmarks_are_not_needed_and_findings_have_the_
     assert "growth" not in one
     assert not (tmp_path / "out" / "growth.csv").exists()
     (tmp_path / "ex.csv").write_text("patient,mass,ex_vivo_mm,date\nP1,1,20,2026-02-01\n")
-    both = campaign(tmp_path, lines, "--excision", "ex.csv").stdout
+    failed = "gone.nc,P1,pre,1,2,2026-01-10,left"  # the exam that alone says when its visit was
+    both = campaign(tmp_path, [lines[0].replace("2026-01-10", ""), failed, lines[1]], "--excision", "ex.csv").stdout
     assert "1 grown (growth.csv)" in both
     assert "visits after excision, left out of the report and in growth.csv with a caution: P1.vpost.m1" in both
     (row,) = rows_of(tmp_path / "out" / "growth.csv")
+    assert (row["earlier_visit"], row["later_visit"], row["days"]) == ("pre", "post", "90.0")
     assert "CAUTION: no landmarks show where the mass of visit 1 (coded pre) lies" in row["findings"]
     excised = "visit 2 (coded post) of 2026-04-10 is after the excision (2026-02-01)"
     assert row["findings"].startswith(f"CAUTION: {excised}")
