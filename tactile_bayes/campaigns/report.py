@@ -194,8 +194,8 @@ def trial_lines(
 
 
 def _pooled_row(campaign: Campaign, rows: Sequence[ExamRow], report: PooledReport | None) -> ExamRow:
-    """A mass at a visit, by all of its exams."""
-    exam = rows[-1].exam
+    """A mass at a visit, by all of its exams, the last day of which counts."""
+    exam = replace(rows[-1].exam, day=campaign.days.get(rows[-1].exam.of_mass))
     known = [row.synthetic for row in rows if row.synthetic is not None]  # a failed exam does not say
     synthetic = any(known) if known else None
     if report is None:

@@ -156,11 +156,14 @@ def test_one_visit_has_no_growth_landmarks_are_not_needed_and_findings_have_the_
     assert "growth" not in one
     assert not (tmp_path / "out" / "growth.csv").exists()
     (tmp_path / "ex.csv").write_text("patient,mass,ex_vivo_mm,date\nP1,1,20,2026-02-01\n")
-    failed = "gone.nc,P1,pre,1,2,2026-01-10,left"  # the exam that alone says when its visit was
-    both = campaign(tmp_path, [lines[0].replace("2026-01-10", ""), failed, lines[1]], "--excision", "ex.csv").stdout
+    failed = "gone.nc,P1,pre,1,1,2026-01-10,left"  # the exam that alone says when its visit was
+    undated = lines[0].replace(",1,1,2026-01-10", ",1,2,")
+    both = campaign(tmp_path, [failed, undated, lines[1]], "--excision", "ex.csv").stdout
     assert "1 grown (growth.csv)" in both
     assert "visits after excision, left out of the report and in growth.csv with a caution: P1.vpost.m1" in both
     (row,) = rows_of(tmp_path / "out" / "growth.csv")
+    pooled = [row["date"] for row in rows_of(tmp_path / "out" / "trial.csv") if row["modality"] == "tactile-pooled"]
+    assert pooled == ["2026-04-10", "2026-01-10"]
     assert (row["earlier_visit"], row["later_visit"], row["days"]) == ("pre", "post", "90.0")
     assert "CAUTION: no landmarks show where the mass of visit 1 (coded pre) lies" in row["findings"]
     excised = "visit 2 (coded post) of 2026-04-10 is after the excision (2026-02-01)"
