@@ -287,7 +287,7 @@ def _number(rows: Sequence[dict[str, Any]], listed: Iterable[Mapping[str, str]])
     last: dict[tuple[str, ...], int] = {}
     for row in (*listed, *(new for new in rows if "replicate" in new)):
         key = tuple(row[name] for name in _CODES)
-        last[key] = max(last.get(key, 0), int(row["replicate"]) if row["replicate"].isdigit() else 0)
+        last[key] = max(last.get(key, 0), int(row["replicate"]) if row["replicate"].isdecimal() else 0)
     for new in rows:
         key = tuple(new[name] for name in _CODES)
         if "replicate" not in new:

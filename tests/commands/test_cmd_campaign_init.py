@@ -129,7 +129,7 @@ def test_add_keeps_what_somebody_typed_and_adds_new_files(site: Path) -> None:
         "file;patient;visit;mass;replicate;known_depth_mm;reader\r\n"
         "Studie 1/B/p2.mcap;P02;baseline;1;1;12,5;B\r\n"
         "Studie 1/B/p1_li.mcap;P01;1;1;7;;B\r\n"
-        "Studie 1/B/away.mcap;P09;1;1;1;;B\r\n"
+        "Studie 1/B/away.mcap;P09;1;1;²;;B\r\n"
     )
     (site / "exams.csv").write_bytes(b"\xef\xbb\xbf" + typed.encode())
     write(site / "Studie 1" / "P02 spät.mcap", thinned(5, 20, subject="p02", side="right"))
@@ -146,7 +146,7 @@ def test_add_keeps_what_somebody_typed_and_adds_new_files(site: Path) -> None:
         "file;patient;visit;mass;replicate;known_depth_mm;reader;side",
         "Studie 1/B/p2.mcap;P02;baseline;1;1;12,5;B;",
         "Studie 1/B/p1_li.mcap;P01;1;1;7;;B;",
-        "Studie 1/B/away.mcap;P09;1;1;1;;B;",
+        "Studie 1/B/away.mcap;P09;1;1;²;;B;",
         "Studie 1/Köhler, M./P01 links – 1.mcap;P01;1;1;8;;A;left",
         "Studie 1/P02 spät.mcap;P02;1;1;1;;;right",
     ]
