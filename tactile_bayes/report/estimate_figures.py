@@ -126,26 +126,27 @@ def draw_size(
         ends = [float(end) for one in drawn.values() for end in np.quantile(one, _SHOWN)]
         ends += [end for _, q, _, _ in bars for end in (q.low, q.high)]
         margin = 0.05 * (max(ends) - min(ends)) or 1.0
-        axes.set_xlim(max(0.0, min(ends) - margin) if min(ends) >= 0 else min(ends) - margin, max(ends) + margin)
+        axes.set_xlim(max(0.0, min(ends) - margin), max(ends) + margin)
         axes.set_ylim(bottom=0)
         finish(axes, f"Size of the lump: {name}", "size (mm)", "posterior density (1/mm)", fontsize=8)
     return figure
 
 
 def _density(draws: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """400 sizes in mm and their smoothed density per mm: a histogram convolved with a Gaussian, mirrored at 0."""
+    """400 sizes in mm and their smoothed density per mm: a histogram convolved with a Gaussian, mirrored at 0.
+
+    `draws` are above 0, as finite sizes are.
+    """
     if len(draws) < 2:
         raise BadDataError(f"{len(draws)} finite draws cannot be drawn as a density", way_out="give two or more")
     spread = min(float(draws.std()), float(np.subtract(*np.quantile(draws, [0.75, 0.25]))) / 1.349 or np.inf)
     width = max(0.9 * spread * len(draws) ** -0.2, 1e-3 * max(1.0, float(np.abs(draws).max())))
     low, high = np.quantile(draws, [0.001, 0.999])
-    low = low - 4 * width
-    edges = np.linspace(max(low, 0.0) if draws.min() >= 0 else low, high + 4 * width, 401)
+    edges = np.linspace(max(low - 4 * width, 0.0), high + 4 * width, 401)
     middle = (edges[1:] + edges[:-1]) / 2
     weights = np.histogram(draws, edges)[0] / len(draws)
     kernel = np.exp(-0.5 * (np.subtract.outer(middle, middle) / width) ** 2)
-    if draws.min() >= 0:
-        kernel += np.exp(-0.5 * (np.add.outer(middle, middle) / width) ** 2)
+    kernel += np.exp(-0.5 * (np.add.outer(middle, middle) / width) ** 2)
     return middle, kernel @ weights / (width * np.sqrt(2 * np.pi))
 
 
