@@ -101,10 +101,9 @@ def remove_stale_files(
         for name in sorted(path.name for path in (folder / kind).glob("*")):
             if name not in names:
                 left.append(f"{kind}/{name}")
-            if name not in names or name in spared:
-                continue
-            made = {file for step in steps for file in files_of(step, name)}
-            _clear(folder / kind / name, known={file for step in steps for file in FILES[step]}, made=made)
+            elif name not in spared:
+                made = {file for step in steps for file in files_of(step, name)}
+                _clear(folder / kind / name, known={file for step in steps for file in FILES[step]}, made=made)
         _remove_if_empty(folder / kind)
     return left
 

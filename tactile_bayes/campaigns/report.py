@@ -319,7 +319,7 @@ def write_outputs(campaign: Campaign, *, unlisted: Sequence[str] = ()) -> Writte
     return Written(
         counts,
         tuple(filter(None, together)),
-        (*doubtful, *([f"no trial report: {fault}"] if fault and not report else [])),
+        (*doubtful, *([f"no trial report: {fault}"] if fault else [])),
         report,
     )
 

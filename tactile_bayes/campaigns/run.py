@@ -339,8 +339,7 @@ class Campaign:
             self._run("size", [], of=len(sound))
             return
         if not result:
-            fault = self.faults.pop(SITE, None)
-            self.not_learned = "" if fault is None else fault.reason
+            self.not_learned = self.faults.pop(SITE).reason
         elif steps.NOT_LEARNED in result:
             self.not_learned = result[steps.NOT_LEARNED]
         else:

@@ -357,8 +357,7 @@ def _estimate_lines(estimate: Estimate, report: EstimateReport, cautions: list[s
     """Lines of a short report between its cautions and its last lines; sources of width give way to masses."""
     quantities, largest = _quantities(report), report.max_size_mm
     shown = EXTREMES if largest is not None else WIDTHS
-    lines = cautions + size_table(report, (*shown, ANOTHER_LARGEST, ANOTHER_SMALLEST))
-    lines += _lump_line(report)
+    lines = [*cautions, *size_table(report, (*shown, ANOTHER_LARGEST, ANOTHER_SMALLEST)), _lump_line(report)]
     after = _no_size_lines(report)
     last = _quality_line(estimate, report, [quantities[name] for name in shown]) + checks
     room = MOST_LINES - 2 - len(lines) - len(after) - len(last)
@@ -370,7 +369,7 @@ def _estimate_lines(estimate: Estimate, report: EstimateReport, cautions: list[s
     return [*lines, *estimate_document.supposed_line(report.supposing, largest.median, places=size_decimals([largest]))]
 
 
-def _lump_line(report: EstimateReport) -> list[str]:
+def _lump_line(report: EstimateReport) -> str:
     """Probability of a lump, and its place; of several masses, which one it is."""
     chance, number = report.detected_probability, estimate_document.reported_number_words(report.masses)
     parts = [] if chance is None else [f"Probability of a lump {chance_text(chance)}"]
@@ -383,7 +382,7 @@ def _lump_line(report: EstimateReport) -> list[str]:
     if report.centre_mm is not None:
         parts.append(f"{estimate_document.at_place(*report.centre_mm.median)} on the map")
     text = ", ".join(parts)
-    return [f"{number}: {text[0].lower()}{text[1:]}." if number else f"{text}."] if parts else []
+    return f"{number}: {text[0].lower()}{text[1:]}." if number else f"{text}."
 
 
 def _mass_lines(masses: Sequence[MassReport], *, room: int) -> list[str]:
