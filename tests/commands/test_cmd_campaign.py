@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from datetime import date
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -371,16 +372,18 @@ def test_an_exam_that_cannot_show_a_lump_was_not_done(code: str, status: str) ->
     """Not held against the modality; the control is a map that could have shown a lump."""
     row = ExamRow.of(Listed("a.nc", Path("a.nc"), "P", "1", "1", 1), estimate_report(reason_code=code))
     assert row.status == status
-    without_faults: Any = SimpleNamespace(faults={})
+    by_another_exam = date(2026, 1, 10)
+    run: Any = SimpleNamespace(faults={}, days={row.exam.of_mass: by_another_exam})
     together = {row.exam.of_mass: pooled_report(reason="no size", maps=())}
-    assert [one["status"] for one in trial_lines(without_faults, [row], together, None)] == [status, status]
+    readings = trial_lines(run, [row], together, None)
+    assert [(one["status"], one["date"]) for one in readings] == [(status, None), (status, by_another_exam)]
 
 
 def test_the_index_gives_the_reason_of_a_visits_one_exam_not_a_count_of_maps() -> None:
     exam = Listed("a.nc", Path("a.nc"), "P", "1", "1", 1)
     row = ExamRow.of(exam, estimate_report(reason="no lump found within 20 mm of the place", reason_code="undetected"))
     pooled = {exam.of_mass: pooled_report(reason="a lump was found on 0 of 1 maps", maps=())}
-    run: Any = SimpleNamespace(exams=[exam], files=lambda *_: {}, repeatability=None, folder=Path("out"))
+    run: Any = SimpleNamespace(exams=[exam], files=lambda *_: {}, repeatability=None, folder=Path("out"), days={})
     page = index_html(run, [row], pooled, (), counts="0 sized", links={})
     assert "no lump found within 20 mm" in page
     assert "0 of 1 maps" not in page
