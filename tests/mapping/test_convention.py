@@ -110,6 +110,7 @@ def test_a_head_that_sinks_into_soft_tissue_is_not_refused(monkeypatch):
     refused = [verdict(told(scan, WRONG[0])) for scan in soft].count("refused")
     assert refused > 0.6 * SCANS
     monkeypatch.setattr(convention, "_without_sinking", lambda places, _: places)
+    monkeypatch.setattr(convention, "_agreement_on_a_sphere", lambda _: 0.0)  # it takes the pressure off, too
     assert [verdict(scan) for scan in soft].count("refused") > 0.5 * SCANS
 
 
