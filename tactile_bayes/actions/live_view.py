@@ -50,8 +50,7 @@ def live_view(
     head: HeadGeometry, calibration: ElementCalibration, *, terminal: bool, serve: str | None, size_calibration: str
 ) -> Iterator[Any]:
     """Start the view's process; yields an observer for the recorder."""
-    if serve:
-        live.parse_address(serve)  # an error before anything is recorded
+    address = live.parse_address(serve) if serve else None  # an error before anything is recorded
     calibration_file = size_calibration_path(size_calibration)
     if calibration_file is not None:
         read_size_calibration(calibration_file)  # likewise
@@ -60,7 +59,7 @@ def live_view(
         "calibration": calibration_document(calibration),
         "terminal": terminal,
         "keys": sys.stdin.isatty(),
-        "serve": serve,
+        "serve": address,
         "size_calibration": calibration_file and str(calibration_file),
     }
     theirs, ours = os.pipe()
@@ -212,7 +211,7 @@ def run(pipe: int, setup: dict[str, Any]) -> None:
         stack.callback(estimator.close)
         displays: list[Callable[[live.LiveState], None]] = []
         if setup["serve"]:
-            server = live.LiveServer(*live.parse_address(setup["serve"]))
+            server = live.LiveServer(*setup["serve"])
             stack.callback(server.close)
             print(f"live view: {server.url}", file=sys.stderr, flush=True)
             displays.append(server.show)
