@@ -77,8 +77,8 @@ def _pooled_answer(pooled: PooledEstimate, settings: Settings) -> tuple[SizeAnsw
 TIMES = 2
 
 
-def fresh_cpu_s(words: Sequence[str]) -> float | None:
-    """Least CPU seconds of a command in a fresh process, its start included; None where the system counts none."""
+def fresh_cpu_s(words: Sequence[str]) -> float:
+    """Least CPU seconds of a command in a fresh process, its start included."""
     spent = []
     for _ in range(TIMES):
         before = os.times()
@@ -91,8 +91,7 @@ def fresh_cpu_s(words: Sequence[str]) -> float | None:
         )
         after = os.times()
         spent.append(after.children_user - before.children_user + after.children_system - before.children_system)
-    least = min(spent)
-    return least if least > 0 else None
+    return min(spent)
 
 
 def forecast(seconds: float) -> None:
@@ -218,9 +217,8 @@ def tradeoff_estimate_action(
     words += [] if size_calibration is None else ["--size-calibration", size_calibration]
     words += [] if centre_mm is None else ["--centre-mm", *map(repr, centre_mm)]
     words += [] if settings_file is None else ["--settings", str(settings_file)]
-    if (cold_s := fresh_cpu_s(words)) is not None:
-        shared = {"start of the program and reading the map": max(cold_s - tradeoff.default.seconds, 0.0)}
-        tradeoff = replace(tradeoff, shared_cpu_s=shared)
+    shared = {"start of the program and reading the map": max(fresh_cpu_s(words) - tradeoff.default.seconds, 0.0)}
+    tradeoff = replace(tradeoff, shared_cpu_s=shared)
     options = {"size_calibration": size_calibration, "tolerance_mm": tolerance_mm, "runs": runs}
     provenance = [Provenance("tradeoff estimate", options, inputs, seed=seed)]
     by_title = {f"{maps[0].stem}: what more time for `estimate` buys": tradeoff}
