@@ -27,6 +27,7 @@ import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import date, time
 from functools import cache
+from operator import methodcaller
 from pathlib import Path
 from threading import RLock
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar, get_args, get_origin
@@ -65,7 +66,7 @@ class Record(_Struct, frozen=True, forbid_unknown_fields=True):
     """Base of all records: nothing is set later, and a file may hold no other keys.
 
     Options of a class are those of `msgspec.Struct`: ``eq=False`` where a record holds arrays, ``omit_defaults=True``
-    where its files leave defaults out, ``tag`` and ``tag_field`` for one of several forms.
+    where its files leave defaults out.
     """
 
     def __repr__(self) -> str:
@@ -104,9 +105,8 @@ def _fields(record: Any) -> tuple[msgspec.structs.FieldInfo, ...]:
 
 
 def default_of(record: Any, name: str) -> Any:
-    """The default of a field; None where it has none."""
-    default = next(info.default for info in _fields(record) if info.name == name)
-    return None if default is msgspec.NODEFAULT else default
+    """The default of a field of options, all of which have one."""
+    return next(info.default for info in _fields(record) if info.name == name)
 
 
 def value_type(kind: Any) -> Any:
@@ -206,7 +206,7 @@ def check_record(record: Record, where: str = "") -> None:
 
 def to_plain(record: object, *, digits: int = 9) -> Any:
     """Plain data of a record for JSON: arrays as nested lists, floats with this many significant digits."""
-    return rounded(msgspec.to_builtins(record, enc_hook=_encode_array, str_keys=True), digits, lists=True)
+    return rounded(msgspec.to_builtins(record, enc_hook=methodcaller("tolist"), str_keys=True), digits, lists=True)
 
 
 def rounded(value: T, digits: int = 9, *, lists: bool = False) -> T:
@@ -245,8 +245,6 @@ def _decode_value(kind: Any, value: object) -> object:
         raise BadDataError("", way_out="give the name of a file")
     import numpy as np  # a record without arrays is made without it: `--help` stays quick
 
-    if not _is_array(kind):
-        raise NotImplementedError(f"no way to read a {kind}")
     nested, first = float, value  # type: tuple[Any, Any]
     while isinstance(first, list):
         nested, first = list[nested], first[0] if first else 0.0
@@ -260,18 +258,12 @@ def _decode_value(kind: Any, value: object) -> object:
         raise BadDataError(what, way_out="give numbers, the same count in each row") from None
 
 
-def _encode_array(value: object) -> object:
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    raise NotImplementedError(f"no way to write a {type(value)}")
-
-
 # Errors
 
 
 def _fault(kind: Any, value: Any, where: str) -> BadDataError:
     """The error of a value that does not fit its kind; it names the innermost part at fault."""
-    record = _record_for(kind, value)
+    record = next(filter(_is_record, map(_bare, _members(kind))), None)
     if record is not None and isinstance(value, dict) and (fault := _key_fault(record, value, where)):
         return fault
     for part_path, part_kind, part in _parts_of(kind if record is None else record, value, where):
@@ -309,12 +301,10 @@ def _finite(value: Any) -> bool:
 
 def _key_fault(record: Any, value: Mapping[str, Any], where: str) -> BadDataError | None:
     """The error of the first key that is unknown or missing; None without any."""
-    config = record.__struct_config__
     fields = {info.encode_name: info for info in _fields(record)}
-    known = [*([config.tag_field] if config.tag_field else []), *fields]
-    for key in value if config.forbid_unknown_fields else ():
-        if key not in known:
-            return BadDataError(f"{_joined(where, _key_repr(key))} is not known", way_out=suggestion(str(key), known))
+    for key in value if record.__struct_config__.forbid_unknown_fields else ():
+        if key not in fields:
+            return BadDataError(f"{_joined(where, _key_repr(key))} is not known", way_out=suggestion(str(key), fields))
     missing = [name for name, info in fields.items() if info.required and name not in value]
     return BadDataError(f"{where or 'the document'} has no {missing[0]}", way_out="add it") if missing else None
 
@@ -344,18 +334,6 @@ def _parts_of(kind: Any, value: Any, where: str) -> Iterator[tuple[str, Any, Any
             yield from ((f"{where}[{i}]", part_kind, part) for i, (part_kind, part) in enumerate(pairs))
 
 
-def _record_for(kind: Any, value: Any) -> Any:
-    """The record type for a value: the only one of a kind, or the form that the value's tag names; else None."""
-    records = [one for one in map(_bare, _members(kind)) if _is_record(one)]
-    if len(records) == 1:
-        return records[0]
-    for record in records:
-        config = record.__struct_config__
-        if isinstance(value, dict) and config.tag_field and value.get(config.tag_field) == config.tag:
-            return record
-    return None
-
-
 def _members(kind: Any) -> tuple[Any, ...]:
     """Members of a union, each with its rules; a kind that is no union alone."""
     bare = _bare(kind)
@@ -377,10 +355,6 @@ def _is_array(kind: Any) -> bool:
 def _way_out(kind: Any, value: Any) -> str:
     """The advice on a refused value, such as "give a number above 0"."""
     members = [member for member in _members(kind) if member not in (type(None), UnsetType)]
-    forms = [one for one in map(_bare, members) if _is_record(one)]
-    if len(forms) > 1 and isinstance(value, dict):  # no form of that name
-        names = ", ".join(str(one.__struct_config__.tag) for one in forms)
-        return f"give as its {forms[0].__struct_config__.tag_field} one of {names}"
     choices = [str(one) for form in map(_bare, members) if get_origin(form) is Literal for one in get_args(form)]
     if isinstance(value, str) and len(choices) > 1 and (near := suggestion(value, choices)).startswith("did"):
         return f"{near} Give one of {', '.join(choices)}"
@@ -419,11 +393,9 @@ def _kind_words(kind: Any) -> str:
 
 
 def _text_words(rules: Mapping[str, Any]) -> str:
-    """A text's rule: its own words (``extra={"words": ...}``), its meaning in place of a pattern, or its length."""
+    """A text's rule: its own words (``extra={"words": ...}``), or its length."""
     if "words" in rules.get("extra", {}):
         return str(rules["extra"]["words"])
-    if "pattern" in rules and "description" in rules:
-        return f"a text in quotes: {rules['description'][0].lower()}{rules['description'][1:].rstrip('.')}"
     if "min_length" in rules or "max_length" in rules:
         least, most = rules.get("min_length", 0), rules.get("max_length")
         return f"a text of at least {least} letters" if most is None else f"a text of {least} to {most} letters"
