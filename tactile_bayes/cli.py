@@ -160,13 +160,12 @@ def _run() -> int:
     """Run the command of the command line; return its exit code."""
     try:
         status = cli.main(prog_name="tactile-bayes", standalone_mode=False)
-        if sys.stdout is not None:
-            sys.stdout.flush()
+        sys.stdout.flush()
     except click.Abort as error:
         progress = str(error.__cause__ or "")  # of a batch: how many items are done
         click.echo(f"interrupted: {progress}" if progress else "interrupted", err=True)
         return EXIT_INTERRUPTED
-    except click.ClickException as error:
+    except click.UsageError as error:  # click has others for editors and files of its own, which are not used
         _print_error(error)
         return error.exit_code
     except TactileBayesError as error:
@@ -183,16 +182,15 @@ def _run() -> int:
     return status if isinstance(status, int) else 0
 
 
-def _print_error(error: click.ClickException) -> None:
+def _print_error(error: click.UsageError) -> None:
     """Print an error of click's in one line, as all others; the help where no command or argument was given."""
-    context = error.ctx if isinstance(error, click.UsageError) else None
     if type(error).__name__ == "NoArgsIsHelpError":  # of click 8.2 and later
         error.show()
         return
     message = " ".join(error.format_message().split()).rstrip(".")
     message = message.replace("is not a valid float", "is not a number")
-    path = "" if context is None else context.command_path
-    if not path and isinstance(error, click.UsageError) and sys.argv[1:2] and sys.argv[1] in COMMANDS:
+    path = "" if error.ctx is None else error.ctx.command_path
+    if not path and sys.argv[1:2] and sys.argv[1] in COMMANDS:
         path = f"tactile-bayes {sys.argv[1]}"  # the parser's own errors have no context
     joint = " See" if message.endswith("?") else "; see"
     advice = f"{joint} `{path} --help`" if path else ""

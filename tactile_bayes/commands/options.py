@@ -77,14 +77,12 @@ class FilePath(click.Path):
 
 def is_folder(path: Path) -> bool:
     """True for a folder, and for a path that the call wrote with a slash at its end."""
-    context = click.get_current_context(silent=True)
-    return path.is_dir() or (context is not None and path in context.meta.get(_FOLDERS, ()))
+    return path.is_dir() or path in click.get_current_context().meta.get(_FOLDERS, ())
 
 
 def protect_inputs(*paths: Path | None) -> None:
     """Refuse the call if it would write one of these further inputs."""
-    context = click.get_current_context(silent=True)
-    seen: list[tuple[Path, bool]] = [] if context is None else context.meta.get(_SEEN, [])
+    seen: list[tuple[Path, bool]] = click.get_current_context().meta.get(_SEEN, [])
     refuse_same([path for path, written in seen if written], paths)
 
 
