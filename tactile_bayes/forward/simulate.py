@@ -414,8 +414,6 @@ def head_face(head: Head) -> HeadFace:
     """
     rows, columns, pitch_mm, radius_mm = head.rows, head.columns, head.pitch_mm, head.radius_mm
     rim_mm = 0.0 if head.shoulder_mm > 0 else head.rim_mm
-    if not 0 <= rim_mm < radius_mm:
-        raise BadDataError(f"rim_mm is {rim_mm:g}", way_out=f"it must lie in 0 to below radius_mm, {radius_mm:g} mm")
     half_x, half_y = rows * pitch_mm / 2, columns * pitch_mm / 2
     section = HeadSection(2 * half_x, radius_mm, rim_mm, SHOULDERS_OUTSIDE)
     rim_x = _rim_squares(half_x, section.half_face_mm, pitch_mm)
