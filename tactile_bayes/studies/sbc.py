@@ -90,12 +90,9 @@ def chi2_p(ranks: IntArray, draws: int) -> float:
 
 
 def coverage(ranks: IntArray, draws: int, probability: float) -> RankCoverage:
-    """Coverage by the central interval between two draws with exactly the nominal share of ranks; `ValueError` where
-    no interval between draws has the probability."""
-    tail = (1.0 - probability) / 2.0 * (draws + 1)
-    if abs(tail - round(tail)) > 1e-9:
-        raise ValueError(f"{draws} draws have no central interval of probability {probability:g}")
-    covered = (ranks >= round(tail)) & (ranks <= draws - round(tail))
+    """Coverage by the central interval between two draws with exactly the nominal share of ranks, see `DRAWS`."""
+    tail = round((1.0 - probability) / 2.0 * (draws + 1))
+    covered = (ranks >= tail) & (ranks <= draws - tail)
     error = float(np.sqrt(probability * (1.0 - probability) / len(ranks)))
     return RankCoverage(probability, float(covered.mean()), error)
 
