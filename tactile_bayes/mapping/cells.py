@@ -495,8 +495,6 @@ def add_frames(
 
     `pressure_kpa` and `valid` come from `Readout.pressure_kpa`.
     """
-    if not pressure_kpa.size:
-        return
     steps = pressure_kpa
     steps *= (1.0 / VALUE_STEP / level)[:, None]
     np.rint(steps, out=steps)
