@@ -205,7 +205,7 @@ class ElementCalibration(Record, eq=False):
     def __post_init__(self) -> None:
         gain = _check_finite(self.gain_kpa_per_count, name="gain_kpa_per_count", shape=(None, None))
         offset = _check_finite(self.offset_kpa, name="offset_kpa", shape=gain.shape)
-        if gain.size and not gain.min() >= 0:
+        if (gain < 0).any():
             index = tuple(int(i) for i in np.argwhere(gain < 0)[0])
             what = f"gain_kpa_per_count is negative at {index} ({gain[index]:.4g})"
             raise BadDataError(what, way_out="correct it, or calibrate anew")
@@ -230,7 +230,8 @@ class PressureFrames(Record, eq=False):
 
     def __post_init__(self) -> None:
         time = _check_times(self.time_s, name="frame_time_s")
-        if self.counts.dtype != np.uint16 or self.counts.ndim != 3 or len(self.counts) != len(time):
+        whole = self.counts.dtype == np.uint16 and self.counts.ndim == 3 and 0 not in self.counts.shape[1:]
+        if not whole or len(self.counts) != len(time):
             what = f"counts is {self.counts.dtype} of shape {self.counts.shape} for {len(time)} frame times"
             raise BadDataError(what, way_out="it must be uint16 (n, rows, columns), one frame per time")
         view = self.counts.view()

@@ -435,7 +435,7 @@ def select_frames(
     A head without a working taxel is a `BadDataError`.
     """
     faults, taxels = find_faults(scan), scan.head.shape[0] * scan.head.shape[1]
-    if len(faults) >= taxels > 0:
+    if len(faults) == taxels:
         look = "check the array's cable and its calibration"
         if 2 * sum(one.fault == "saturated" for one in faults) > taxels:
             look = "press less hard, or import it with the array's own --saturation"
@@ -543,8 +543,6 @@ def _counts_question(scans: Iterable[Scan]) -> str:
     """Question whether counts are shifted, already pressures or in another unit, where they would fit an exam then."""
     scan = max(scans, key=lambda one: len(one.frames))
     counts, calibration = scan.frames.counts[:: max(1, len(scan.frames) // _SAMPLE_FRAMES)], scan.element_calibration
-    if not counts.size:
-        return ""
     above, highest = float((counts >= calibration.saturation_count).mean()), int(counts.max())
     step = int(np.gcd.reduce(counts.ravel()))
     if above > SATURATED_SHARE and highest > calibration.saturation_count:
