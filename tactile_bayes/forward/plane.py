@@ -197,7 +197,7 @@ class LineFrames(Record, eq=False):
     def as_taxels(self, pitch_mm: float) -> LineFrames:
         """The same frames as sensors of width `pitch_mm` measure them: means over whole cells."""
         group = round(pitch_mm / self.cell_mm)
-        fits = group >= 1 and abs(group * self.cell_mm - pitch_mm) <= 1e-9 and not len(self.s_mm) % group
+        fits = abs(group * self.cell_mm - pitch_mm) <= 1e-9 and not len(self.s_mm) % group
         require(fits, "pitch_mm", pitch_mm, f"hold whole cells of {self.cell_mm:g} mm and fill the head")
         means = self.pressure_kpa.reshape(len(self.x_c_mm), -1, group).mean(axis=2)
         return LineFrames(self.x_c_mm, self.s_mm.reshape(-1, group).mean(axis=1), means)

@@ -12,7 +12,7 @@ from tactile_bayes.forward.scene import Background, Lump, Noise, Scene, Strokes,
 from tactile_bayes.forward.simulate import simulate
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.convention import corrected
-from tactile_bayes.mapping.map import broken_assumptions, skewed
+from tactile_bayes.mapping.map import broken_assumptions, handling_findings, skewed
 from tactile_bayes.scans import PressureFrames, Scan
 from validation.stress_frames import on_sphere
 
@@ -157,6 +157,29 @@ def test_a_figure_that_its_error_does_not_tell_from_0_says_nothing() -> None:
     assert not list(broken_assumptions({}))
     few = {"stroke_lag_mm": 255.7, "stroke_lag_sd_mm": 0.001, "frames_used": 12.0}
     assert not list(broken_assumptions(few))  # strokes 511 mm apart, of which it saw one
+
+
+@pytest.mark.parametrize(
+    ("at_limit", "beyond", "words"),
+    [
+        (
+            {"saturated_readings": 0.0},
+            {"saturated_readings": 12.0},
+            "12 readings were pressed beyond the array's range",
+        ),
+        ({"clipped_values": 0.0}, {"clipped_values": 3.0}, "3 values beyond the map's range were clipped"),
+        ({"gain_unsettled": 0.0}, {"gain_unsettled": 1.0}, "scan with overlapping strokes"),
+        ({"coverage": 0.5}, {"coverage": 0.4}, "only 40 % of the map's rectangle is covered"),
+        ({"tilt_deg": 10.0}, {"tilt_deg": 11.0}, "the head's face was tilted by 11 degrees"),
+        ({"yaw_sd_deg": 15.0}, {"yaw_sd_deg": 16.0}, "the head was turned by 16 degrees"),
+    ],
+)
+def test_how_the_head_was_held_and_read_is_told_beyond_its_limit(
+    at_limit: dict[str, float], beyond: dict[str, float], words: str
+) -> None:
+    assert not list(handling_findings(at_limit))
+    (found,) = handling_findings(beyond)
+    assert words in found.sentence()
 
 
 def test_a_scan_without_strokes_both_ways_has_no_lag_and_no_skew() -> None:
