@@ -24,7 +24,7 @@ SURFACE = np.zeros((3, 4, 3))
         (lambda: PressureFrames(np.array([0.0, np.nan]), COUNTS), "frame_time_s has 1 values that are not finite"),
         (lambda: PressureFrames(np.array([0.0]), COUNTS), "for 1 frame times"),
         (lambda: PressureFrames(np.array([0.0, 1.0]), COUNTS.astype(float)), "counts is float64"),
-        (lambda: PressureFrames(np.array([0.0, 1.0]), COUNTS[:, :0]), "counts is uint16 of shape (2, 0, "),
+        (lambda: PressureFrames(np.array([0.0, 1.0]), COUNTS[:, :0]), "counts is uint16 of shape .2, 0, "),
         (lambda: TrackerPoses(np.array([0.0, 1.0]), P, 2 * Q), "norm 2 at index 0"),
         (lambda: TrackerPoses(np.array([0.0, 1.0]), P[:1], Q), "position_mm has shape"),
         (lambda: HeadGeometry(SURFACE, 0.0, np.eye(4)), "pitch_mm is 0.0"),

@@ -84,9 +84,9 @@ class Body(Record):
     @property
     def layers(self) -> Layers:
         """The body without the lump."""
-        thickness = THICKNESS_MM if self.thickness_mm is None else self.thickness_mm
+        assert self.thickness_mm is not None
         fat = self.centre_mm + self.seat * self.radius_mm
-        return Layers(fat, thickness, self.fat_kpa, self.gland_ratio, self.poisson)
+        return Layers(fat, self.thickness_mm, self.fat_kpa, self.gland_ratio, self.poisson)
 
 
 def parse_seat(text: str) -> float:

@@ -270,10 +270,10 @@ class LiveMap:
             return None
         tactile_map = self._map.snapshot()
         notch, xiphoid = map(self._landmarks.get, ("sternal_notch", "xiphoid"))
-        if tactile_map.plane_from_base is None or notch is None or xiphoid is None:
+        if notch is None or xiphoid is None:
             return tactile_map
         with suppress(BadDataError):  # two landmarks in one place give no axes
-            axes = patient_from_plane(notch, xiphoid, tactile_map.plane_from_base)
+            axes = patient_from_plane(notch, xiphoid, self._map.plane_from_base)
             return replace(tactile_map, patient_from_plane=axes)
         return tactile_map
 
