@@ -95,8 +95,6 @@ def _inlined(schema: Any, definitions: Mapping[str, Any]) -> Any:
     if len(inlined.get("anyOf", ())) == 2 and {"type": "null"} in inlined["anyOf"]:
         for one in inlined["anyOf"]:
             inlined |= {"description": one.pop("description")} if "description" in one else {}
-    if "discriminator" in inlined:
-        del inlined["discriminator"]
     return inlined
 
 
