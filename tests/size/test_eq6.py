@@ -208,6 +208,9 @@ def put(value: Any, *where: Any) -> Callable[[dict[str, Any]], None]:
     return change
 
 
+LEFT_OUT = {"cases": 25, "geometries": 25, "least_stiffness_ratio": 8.0, "log_quadratic": {"both": 0.1}}
+
+
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
@@ -229,6 +232,8 @@ def put(value: Any, *where: Any) -> Callable[[dict[str, Any]], None]:
         (put(["m", "b", "e", "f"], "x", "coefficients"), "x.coefficients"),
         (put(1, "surprise"), "surprise"),
         (put(["z"], "axes"), "axes[0]"),
+        (put(LEFT_OUT | {"eq6": {"both": 0.1, "z": 0.1}}, "left_out"), "errors by other widths than x, y and both"),
+        (put(LEFT_OUT | {"eq6": {"both": 0.1, "x": 0.1}}, "left_out"), "errors by other widths than x, y and both"),
     ],
 )
 def test_a_broken_file_is_named_by_its_fault(

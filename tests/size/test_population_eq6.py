@@ -295,9 +295,38 @@ def test_a_file_holds_what_was_learned(learned, tmp_path: Path) -> None:
     assert back.recipe == learned.recipe
 
 
+MU_TO_3 = {"powers": [[3, 0, 0]], "mean": [0.0], "covariance": [[1.0]], "log_amplitude_one_deep": 0.0}
+ONE_HIDDEN = {"names": ["seat"], "expected": [[0.0]], "covariance": [[1.0]], "with_body": [0.1], "body_variance": 1.0}
+RESIDUAL = {
+    "points": [[0.0] * 3],
+    "lengths": [1.0, 0.0, 1.0],
+    "scale": 1.0,
+    "mean": [0.0],
+    "covariance_factor": [[1.0]],
+}
+DEPTH = {
+    "centre": [0.0] * 3,
+    "scale": [1.0] * 3,
+    "coefficients": [0.0] * 10,
+    "information_inverse": [[0.0] * 10] * 10,
+    "most_leverage": 1.0,
+    "log_sd": 0.1,
+    "fat_mm": [5.0, 30.0],
+    "expected": [0.0] * 6,
+    "expected_sd": 0.1,
+}
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
+        ({"eq6": MU_TO_3}, "powers names more than mu, f and b"),
+        ({"hidden": ONE_HIDDEN}, "hidden has arrays of other sizes"),
+        ({"hidden": ONE_HIDDEN | {"expected": []}}, "expected has 0 numbers for 1x0"),
+        ({"hidden": ONE_HIDDEN | {"expected": 0.0}}, "expected is 0.0; give a list of numbers"),
+        ({"residual": RESIDUAL}, "a length of the residual is not above 0"),
+        ({"depth": DEPTH | {"scale": [1.0, 0.0, 1.0]}}, "a scale of the profile is not above 0"),
+        ({"depth": DEPTH | {"profile": ["shoulder"]}}, "profile is shoulder"),
         ({"eq6": {"powers": [], "mean": [0.0] * 5, "covariance": [], "log_amplitude_one_deep": 0.0}}, "mean"),
         ({"most_leverage": 0}, "most_leverage"),
         ({"surplus": 1}, "surplus"),
@@ -311,3 +340,17 @@ def test_a_broken_file_is_refused(learned, tmp_path: Path, change, words) -> Non
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
     with pytest.raises(BadDataError, match=words):
         read_size_calibration(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"body": np.zeros(40)}, "1 bodies with a map"),
+        ({"d_mm": np.full(40, 12.0)}, "all rows have one d_mm"),
+        ({"log_width": np.full(40, 1.5)}, "all rows have one width"),
+        ({"half_log_ratio": np.full(40, np.nan)}, "a row holds a number that is not finite"),
+    ],
+)
+def test_bodies_that_cannot_teach_are_refused(change, words) -> None:
+    with pytest.raises(BadDataError, match=words):
+        learn_eq6(replace(table(20), **change))
