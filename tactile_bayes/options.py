@@ -186,7 +186,9 @@ class CompareOptions(Options):
     ] = presets.REGISTRATION_MM
 
     def check_visits(self, visits: int) -> None:
-        """Refuse days that are not one for each visit, or do not rise."""
+        """Refuse too many visits, and days that are not one for each, or do not rise."""
+        if visits > presets.MOST_VISITS:
+            raise UsageError(f"{visits} visits are given; compare 2 to {presets.MOST_VISITS}")
         if self.days is None:
             return
         if len(self.days) != visits:

@@ -73,6 +73,7 @@ FIELD_COSINES: Final = 18
 FINE_FIELD_COSINES: Final = 30
 MOST_FIELD_COSINES: Final = 40
 
+MOST_VISITS: Final = 10  #: Visits of one comparison.
 REGISTRATION_MM: Final = 5.0
 """SD each way of a mass's place in the patient between two visits; an assumption, see record 0115."""
 

@@ -87,13 +87,14 @@ class VisitsCommand(click.Command):
 
 
 def number_groups(args: Sequence[str], *, strict: bool = True) -> list[str]:
-    """The words with each file after ``--with`` as ``--with GROUP FILE``, groups numbered from 1.
+    """The words with each file after ``--with``, or ``--with=``, as ``--with GROUP FILE``, groups numbered from 1.
 
     With `strict` a ``--with`` without a file is refused; a shell that completes words drops it.
     """
     words: list[str] = []
     group, files = 0, -1  # files of the group so far; -1 outside one
-    for word in [*args, ""]:
+    parted = [part for word in args for part in (word.split("=", 1) if word.startswith(f"{WITH}=") else [word])]
+    for word in [*parted, ""]:
         if files >= 0 and word and not word.startswith("-"):
             words += [WITH, str(group), word]
             files += 1

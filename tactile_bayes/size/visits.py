@@ -24,7 +24,6 @@ import numpy as np
 from scipy.special import chdtrc, ndtri
 
 from tactile_bayes.declarations import Record
-from tactile_bayes.errors import UsageError
 from tactile_bayes.findings import Finding
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.inference import draws
@@ -33,7 +32,6 @@ from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, matched_draws, normal_log_density
 from tactile_bayes.size.pooling import POOLED_DRAWS, AveragedMaps, MassMaps, SizePriors, log_sizes, lump_shape
 
-MOST_VISITS: Final = 10
 DIMENSIONS: Final = 6
 """Coordinates of the points: the spread between exams, that of B, three for the lump's shape, and the exponent of
 `AmplitudeLaw`."""
@@ -270,13 +268,8 @@ def joint_sizes(
 
     The calibration is used at the depth of fat that each visit's maps tell; known properties of the body are
     ignored. `between` is a spread between exams in place of the priors', `law` how far B is the same at the visits, by
-    default `SHARED_BODY`, or `SHARED_WITHOUT_DEPTH` where maps tell no depth. None for
-    `amplitudes` leaves them out. `UsageError` for fewer than two visits, more than `MOST_VISITS`, or one without a map.
+    default `SHARED_BODY`, or `SHARED_WITHOUT_DEPTH` where maps tell no depth. None for `amplitudes` leaves them out.
     """
-    if not 2 <= len(visits) <= MOST_VISITS:
-        raise UsageError(f"{len(visits)} visits are given; compare 2 to {MOST_VISITS}")
-    if not all(visits):
-        raise UsageError("a visit has no map with a lump; leave it out")
     fits = visit_calibrations(visits, calibration)
     between = between or priors.between_maps or calibration.between_exams
     flat = [one for maps in visits for one in maps]

@@ -193,6 +193,11 @@ def test_a_stated_spread_between_exams_widens_the_change_and_leaves_one_interval
         (("a0.nc",), 2, "Missing option '--with'"),
         (("a0.nc", "--with", "same0.nc", "--days", 3, "--days", 9), 2, "times are given for 2 later visits"),
         (("a0.nc", "--with", "same0.nc", "--days", -3), 2, "each later than the one before"),
+        (
+            ("a0.nc", *" ".join(f"--with no{i}.nc" for i in range(10)).split()),
+            2,
+            "11 visits are given; compare 2 to 10",
+        ),
         (("a0.nc", "--with", "same0.nc", "--dates", "2026-01-01,soon"), 2, "'soon' is no date"),
         (("a0.nc", "--with", "same0.nc", "--days", 3, "--dates", "2026-01-01,2026-02-01"), 2, "give one of them"),
         (("a0.nc", "--with", "same0.nc", "--size-calibration", "none"), 2, "needs a size calibration"),
@@ -259,7 +264,7 @@ def test_the_figure_is_written_once_and_not_over_another(folder: Path, later: st
 
 
 def test_files_after_with_are_one_visit() -> None:
-    assert number_groups(["a", "--with", "b", "c", "--json", "--with", "d"]) == [
+    assert number_groups(["a", "--with", "b", "c", "--json", "--with=d"]) == [
         "a", "--with", "1", "b", "--with", "1", "c", "--json", "--with", "2", "d"
     ]  # fmt: skip
     for words in (["a", "--with"], ["--with", "--json"], ["a", "--with", "--with", "b"]):

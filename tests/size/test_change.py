@@ -10,7 +10,6 @@ import pytest
 from plain_calibration import plain_calibration
 
 from tactile_bayes.declarations import replace
-from tactile_bayes.errors import UsageError
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
 from tactile_bayes.report.compare import growth_rates
 from tactile_bayes.size.bodies import BodyCalibration
@@ -322,17 +321,6 @@ def test_odds_fall_with_the_growth_that_is_asked_for():
     assert odds == sorted(odds, reverse=True)
     assert odds[0] > 0.999 > 0.001 > odds[-1]
     assert change.percent(0.95).median == pytest.approx(100 * np.expm1(0.18), abs=1.0)
-
-
-@pytest.mark.parametrize("visits", [1, 11])
-def test_one_visit_and_very_many_are_refused(visits):
-    with pytest.raises(UsageError, match="compare 2 to 10"):
-        joint(*[[shape(2.7, seed=i)] for i in range(visits)])
-
-
-def test_a_visit_without_a_map_is_refused():
-    with pytest.raises(UsageError, match="no map"):
-        joint([shape(2.7)], [])
 
 
 @pytest.mark.parametrize(("profile", "law"), [(None, SHARED_WITHOUT_DEPTH), ((0.0, 0.0, 0.0), SHARED_BODY)])
