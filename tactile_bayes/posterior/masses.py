@@ -57,7 +57,7 @@ def other_rises(
     Structures of the lump's scene (a second lump, a rib) are not among them. Without a measured lump the map is only
     searched where a centre was given, for else it has been.
     """
-    if estimate.bump is None and options.centre_mm is None:
+    if estimate.bump is None and (options.centre_mm is None or not tactile_map.covered.any()):
         return (), ()
     proven_rises: list[Rise] = []
     faint: list[Rise] = []

@@ -45,6 +45,14 @@ def looked(
     return found, other_rises(tactile_map, found, options)[int(hardly)]
 
 
+@pytest.mark.filterwarnings("error")
+def test_nothing_rises_on_a_map_without_a_covered_cell() -> None:
+    empty = grid_map(np.full((9, 9), np.nan), normalise="none", background=None)
+    asked = SamplerSettings(background="free", centre_mm=(0.0, 0.0))
+    found = estimate_map(empty, calibration=None, options=asked, rng=np.random.default_rng(1))
+    assert other_rises(empty, found, asked) == ((), ())
+
+
 def test_another_lump_far_away_is_named_where_it_stands() -> None:
     found, rises = looked(values(second=0.1))
     assert found.fit is not None
