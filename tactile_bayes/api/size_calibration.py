@@ -113,7 +113,7 @@ def _eq6(table: Path | Sheet, options: LearnOptions, progress: Progress | None) 
         else:
             calibration = eq6.learn_size_calibration(lumps, recipe=recipe, rng=rng, progress=progress)
         other = eq6.other_fit(calibration, lumps)
-        one_axis = eq6.axis_in_two_stages if options.fit == "two-stage" else None
+        one_axis = eq6.axis_in_two_stages if options.fit == "two-stage" else eq6.axis_at_mode
         left_out, not_left_out = None, ""  # cross-validated errors, or why Eq 6 has none
         try:
             left_out = eq6.cross_validate(lumps, least_stiffness_ratio=least, fit=one_axis)

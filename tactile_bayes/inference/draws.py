@@ -319,12 +319,7 @@ MOST_DIMENSIONS = len(_POLYNOMIALS) + 1
 
 
 def sobol_integers(start: int, number: int, dimension: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint32]]:
-    """(number, dimension) points of the Sobol sequence from `start` on, as integers of `BITS` bits.
-
-    `ValueError` for more dimensions than the table holds.
-    """
-    if dimension > MOST_DIMENSIONS:
-        raise ValueError(f"{dimension} dimensions; the table holds {MOST_DIMENSIONS}")
+    """(number, dimension) points of the Sobol sequence from `start` on, as integers of `BITS` bits."""
     index = np.arange(start, start + number, dtype=np.uint32)
     gray = index ^ (index >> np.uint32(1))
     points = np.zeros((number, dimension), dtype=np.uint32)

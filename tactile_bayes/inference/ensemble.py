@@ -212,7 +212,7 @@ class _Ensemble:
         )
         # emcee's wrapper prints parameters and a traceback at any exception, Ctrl-C among them
         self._sampler.log_prob_fn = self._standardised(log_density)
-        if start is None or len(start) < self.walkers:
+        if start is None:
             first = _finite_start(log_density, centre, covariance, number=self.walkers, rng=rng)
         else:
             unique = np.unique(start, axis=0)

@@ -162,7 +162,7 @@ def laplace(
     Given the noise scale, of `dof` degrees of freedom, the approximation is normal. For a linear model it is exact.
     """
     mode, covariance, steps = mode_and_covariance(log_density, start, scale=scale)
-    widened = covariance if np.isinf(dof) else covariance * (dof + len(mode)) / dof
+    widened = covariance * (dof + len(mode)) / dof
     flat = student_draws(mode, widened, dof=dof, number=INDEPENDENT_DRAWS, rng=rng)
     return ParameterDraws(flat[None], "laplace", {"draws": float(INDEPENDENT_DRAWS), "newton_steps": float(steps)})
 

@@ -39,8 +39,6 @@ def cell_mean_gaussian(x_mm: FloatArray, y_mm: FloatArray, *, covariance_mm2: Fl
     v = pxy * x_mm + pyy * y_mm
     height = np.sqrt(np.clip(narrow_det, 0.0, None))[..., None] / np.sqrt(wide_det)
     gaussian = height * np.exp(-0.5 * (x_mm * u + y_mm * v))
-    if cell_mm == 0.0:
-        return np.asarray(gaussian)
     u2, v2 = u * u, v * v
     fourth = u2 * (u2 - 6.0 * pxx) + v2 * (v2 - 6.0 * pyy) + 3.0 * (pxx**2 + pyy**2)
     return np.asarray(gaussian * (1.0 - cell_mm**4 / 2880.0 * fourth))
@@ -417,8 +415,7 @@ def count_weights(cells: FitCells, residual_variance: float) -> FloatArray:
 def uncorrelated_errors(fit: LeastSquaresFit, weight: FloatArray) -> ErrorModel:
     """Error model under ``noise = "field"``, whose fits contain the correlation themselves."""
     k, p = fit.jacobian.shape
-    dof = max(k - p, 1)
-    return ErrorModel(float(np.sqrt(weight @ fit.residual**2 / dof)), 1.0, float(dof))
+    return ErrorModel(float(np.sqrt(weight @ fit.residual**2 / (k - p))), 1.0, float(k - p))
 
 
 def inflated_errors(cells: FitCells, fit: LeastSquaresFit, weight: FloatArray) -> ErrorModel:
@@ -431,11 +428,11 @@ def inflated_errors(cells: FitCells, fit: LeastSquaresFit, weight: FloatArray) -
     calibration maps share it, and `level_offset` reports it.
     """
     k, p = fit.jacobian.shape
-    dof = max(k - p, 1)
+    dof = k - p
     residual = fit.residual - fitted_tilt(cells, fit.residual, weight=weight)
     noise_variance = float(weight @ residual**2) / dof
     information = inverse_information(fit.jacobian, weight)
-    if not noise_variance > 0 or k <= p or not np.isfinite(information).all():
+    if not noise_variance > 0 or not np.isfinite(information).all():
         return ErrorModel(float(np.sqrt(max(noise_variance, 0.0))), 1.0, float(dof))
     white = residual * np.sqrt(weight / noise_variance)
     correlation, half = residual_autocorrelation(*cells.on_grid(np.stack([white, np.ones(k)])))

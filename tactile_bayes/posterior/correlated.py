@@ -200,7 +200,7 @@ def _split(plain: FieldFit) -> FloatArray | None:
     scene, mode = plain.scene, plain.mode
     p, q, r = (plain.at[name] for name in "pqr")
     ratio = float(np.hypot(q, r))
-    if ratio < np.log(LONG) / 2.0 or scene.shape == "round":
+    if ratio < np.log(LONG) / 2.0:
         return None
     along = 0.5 * np.arctan2(r, q)
     step = 0.9 * np.exp(p + ratio) * np.array([np.cos(along), np.sin(along)])

@@ -102,7 +102,7 @@ def _assessed_rise(
         return _rise_at_rim(rest, whole, candidates, at_place, estimate)
     detection, lump = assessment.detection, estimate.measured
     proven = detection.probability >= LEAST_PROBABILITY
-    if not proven and (lump is None or detection.probability < LEAST_BESIDE):
+    if detection.probability < LEAST_BESIDE:
         return None, False
     bump = assessment.bump()
     likely = lump is not None and bump.amplitude >= LEAST_SHARE * lump.amplitude

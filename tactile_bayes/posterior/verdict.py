@@ -13,7 +13,7 @@ from tactile_bayes.errors import CANNOT_SHOW, Abstention, UsageError
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap, orientation_of
 from tactile_bayes.mapping.plausibility import against_no_lump
-from tactile_bayes.options import PRIORS, BumpPrior, FitSettings
+from tactile_bayes.options import PRIORS, BumpPrior
 from tactile_bayes.posterior.bump import (
     RIM_MM,
     RIM_SHARE,
@@ -26,7 +26,7 @@ from tactile_bayes.posterior.bump import (
     value_scale,
     window_cells,
 )
-from tactile_bayes.posterior.draw import DETECTED, ModalBump
+from tactile_bayes.posterior.draw import DETECTED, ModalBump, SamplerSettings
 from tactile_bayes.posterior.marginal import CollapsedTarget, Scene
 from tactile_bayes.posterior.white import (
     AT_RIM,
@@ -172,10 +172,10 @@ def own_priors(prior: BumpPrior) -> list[str]:
     return [name for name in PRIORS if getattr(prior, name) != getattr(default, name)]
 
 
-def hiding_settings(options: FitSettings) -> Abstention | None:
+def hiding_settings(options: SamplerSettings) -> Abstention | None:
     """Reason why a fit with priors of one's own, or in a small window, excludes no lump; None with neither."""
     own = own_priors(options)
-    own += ["fit_radius_mm"] if (options.fit_radius_mm or FIT_RADIUS_MM) < 0.4 * FIT_RADIUS_MM else []
+    own += ["fit_radius_mm"] if options.fit_radius_mm < 0.4 * FIT_RADIUS_MM else []
     if not own:
         return None
     why = f"lumps are not detected reliably with {', '.join(f'{name} = {getattr(options, name):g}' for name in own)}"

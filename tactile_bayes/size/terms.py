@@ -160,8 +160,7 @@ class HiddenTerms(Record, eq=False, omit_defaults=True):
 
     def __post_init__(self) -> None:
         k = len(self.names)
-        features = self.expected.shape[-1] if self.expected.ndim else 0
-        check_shapes(self, finite=False, expected=(k, features), covariance=(k, k), with_body=(k,))
+        check_shapes(self, finite=False, expected=(k, self.expected.shape[-1]), covariance=(k, k), with_body=(k,))
 
     def share(self, *names: str) -> float:
         """Share of B's variance removed by knowing these properties, at most `MOST_SHARE`."""

@@ -42,11 +42,6 @@ def test_points_are_the_librarys(dimension: int, start: int) -> None:
     np.testing.assert_array_equal(ours, theirs[start : start + 200])
 
 
-def test_too_many_dimensions_are_refused() -> None:
-    with pytest.raises(ValueError, match="the table holds 8"):
-        sobol_integers(0, 4, 9)
-
-
 def test_a_digital_shift_keeps_the_points_even() -> None:
     shifts = np.random.default_rng(3).integers(2**BITS, size=(2, 4), dtype=np.uint32)
     points = shifted_sobol(0, 256, shifts=shifts)

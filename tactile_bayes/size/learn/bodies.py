@@ -278,8 +278,8 @@ def size_error(
     calibration: BodyCalibration, exams: regression.PopulationTable, *, known: Sequence[str] = ()
 ) -> tuple[float, float]:
     """Log error of one body by the mean of its exams, and its variance by the calibration."""
-    profiles = [None] * len(exams) if exams.profile is None else exams.profile.tolist()
-    calibrated = calibration.at_fat([tuple(one) if one and np.isfinite(one).all() else None for one in profiles])
+    profiles = [] if exams.profile is None else exams.profile[np.isfinite(exams.profile).all(axis=1)].tolist()
+    calibrated = calibration.at_fat([tuple(one) for one in profiles])
     a, p = exams.log_amplitude, exams.log_width
     by_a = (calibrated.log_size(a + _MAP_STEP, p) - calibrated.log_size(a - _MAP_STEP, p)) / (2 * _MAP_STEP)
     noise = regression.map_variance(exams, np.stack([by_a, calibrated.width_slope(a, p)]))

@@ -358,13 +358,13 @@ FitAxis = Callable[[AxisRows], AxisCalibration]
 
 
 def cross_validate(
-    table: SizeTable, *, least_stiffness_ratio: float = 0.0, fit: FitAxis | None = None
+    table: SizeTable, *, least_stiffness_ratio: float = 0.0, fit: FitAxis = axis_at_mode
 ) -> LeftOutErrors | None:
     """Cross-validated errors of Eq 6 and of a log-quadratic, leaving out each geometry in turn.
 
     None unless the table has `StudyCases` in at least eight geometries. Softer lumps take no part; a least ratio of 0
-    is `LEAST_HARD_RATIO`. `fit` is the joint posterior's mode when left out. Without one of the geometries Eq 6 may
-    have no mode (`NotConvergedError`), or the two-stage fit too few diameters (`BadDataError`).
+    is `LEAST_HARD_RATIO`. Without one of the geometries Eq 6 may have no mode (`NotConvergedError`), or the two-stage
+    fit too few diameters (`BadDataError`).
 
     A geometry is one seat, diameter and h/d. All stiffnesses of it go out together: they differ so little that one
     would tell the others' size. Where a lump's case at one diameter depth is out, so are the width changes against it.
@@ -387,7 +387,7 @@ def cross_validate(
         for name, sigma in (widths | {"both": both}).items():
             quadratic[name][out] = _predict_by_quadratic(table, sigma, ~out)[out]
             if name in widths:
-                eq6[name][out] = _predict_by_eq6(table, cases, sigma, ~out, fit or axis_at_mode)[out]
+                eq6[name][out] = _predict_by_eq6(table, cases, sigma, ~out, fit)[out]
     eq6["both"] = np.exp(np.mean([np.log(np.maximum(eq6[name], 1e-3)) for name in widths], axis=0))
     errors = [
         {

@@ -283,11 +283,10 @@ class LearnedSpread(Record, eq=False):
 
 
 def learn_repeatability(repeats: Sequence[RepeatedExams], *, fewest: int = FEWEST_MASSES) -> LearnedSpread:
-    """Learn the spread between exams of one mass, from `fewest` masses or more with two exams at a visit.
+    """Learn the spread between exams of one mass, from `fewest` masses or more with two exams or more at each visit.
 
     Those of one mass are left out together when its exams are compared with the others'.
     """
-    repeats = [repeat for repeat in repeats if len(repeat.centre) > 1]
     masses = sorted({one.mass for one in repeats})
     if len(masses) < fewest:
         what = f"{len(masses)} {'mass has' if len(masses) == 1 else 'masses have'} repeated exams with sizes"

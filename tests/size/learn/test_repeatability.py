@@ -101,10 +101,6 @@ def test_too_few_masses_are_refused_and_visits_count_once() -> None:
     again = [RepeatedExams(f"{one.name}, later", one.mass, one.centre + 0.1, one.noise) for one in two]
     with pytest.raises(BadDataError, match="2 masses"):
         learn_repeatability([*two, *again])
-    alone = RepeatedExams("m9", "m9", np.array([2.5]), np.array([1e-3]))
-    with pytest.raises(BadDataError, match="2 masses"):
-        learn_repeatability([*two, alone])
-    assert learn_repeatability([*exams(3, 0.1), alone]).repeatability.masses == 3
 
 
 def test_few_masses_leave_much_open_and_many_little() -> None:
