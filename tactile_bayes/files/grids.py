@@ -335,6 +335,7 @@ def _where(cells: BoolArray) -> str:
 # A map divided by its level has a median near 1; farther off than this, it was not divided.
 _NORMALISED_MEDIAN: Final = (0.2, 5.0)
 _LEAST_SPACING_MM: Final = 0.01
+_MOST_READINGS: Final = 1e9  #: In a cell: no exam has more frames.
 _MOST_KPA: Final = 1000.0  #: Median of a grid in kPa: no examination presses with more, and as Pa it is a light touch.
 _LONGEST_MM: Final = 500.0
 """No examined breast is longer; frames that stand one in a row, or one below the other, are."""
@@ -375,8 +376,8 @@ def grid_map(grid: Grid, options: GridOptions) -> tuple[TactileMap, list[str]]:
         values = np.where(is_no_value, np.nan, values)
         marked.append(f"{int(is_no_value.sum()):,} cells hold {number:g}, stated to be no value")
     arrays = {**grid.arrays, "mean": values}
-    if "count" in arrays and arrays["count"].shape == mean.shape:
-        arrays["count"] = np.where(np.isnan(values) & ~np.isnan(mean), 0, arrays["count"])
+    if "count" in arrays:
+        arrays["count"] = np.where(np.isnan(values) & ~np.isnan(mean), 0, _numbers(arrays, "count"))
         values = np.where(arrays["count"] > 0, values, np.nan)
     if ALL_ARE_VALUES not in options.no_value or (np.abs(values) > _BEYOND).any():
         _refuse_outlying(values)
@@ -480,7 +481,7 @@ def _map(arrays: dict[str, np.ndarray[Any, Any]], *, spacing_mm: float, normalis
     """
     mean = _numbers(arrays, "mean")
     count_values = _numbers(arrays, "count") if "count" in arrays else np.isfinite(mean).astype(np.float64)
-    if index := _first((count_values < 0) | (count_values != np.floor(count_values)) | np.isnan(count_values)):
+    if index := _first(~((count_values >= 0) & (count_values <= _MOST_READINGS) & (count_values % 1 == 0))):
         raise BadDataError(f"count is {count_values[index]:g} at {index}", way_out="give whole numbers from 0 up")
     count = count_values.astype(np.int64)
     if index := _first((count > 0) & np.isnan(mean)):

@@ -49,6 +49,7 @@ _BESIDE: Final = {
     "--rate-hz": ("frame_time_s",),
 }
 """Options that give the arrays which a file may lack."""
+_OF_AXES: Final = ("frames", "counts", "position_mm", "head_surface_mm")  # never one number
 _TEMPLATE: Final = "`tactile-bayes import SRC --template` prints a MAP.toml for --columns, which says what is what"
 _HELP: Final = "`tactile-bayes import --help` says what they are"
 
@@ -187,7 +188,7 @@ def combine_sources(sources: Sequence[Source], options: Stated) -> tuple[scans.S
     arrays = {name: arrays[name] for name in LAYOUT if name in arrays}
     for name, array in arrays.items():  # without axes of length 1 that MATLAB adds
         axes = len(LAYOUT[name].shape)
-        if axes < 2 and array.ndim > axes and array.size == max(array.shape):
+        if axes < 2 and array.ndim > axes and array.size == (max(array.shape) if axes else 1):
             arrays[name] = array.reshape(-1) if axes else array.reshape(())
     for name in _CALIBRATION:
         if name in arrays and arrays[name].size == 1 and arrays.get("counts", np.empty(0)).ndim == 3:
@@ -447,7 +448,7 @@ def _check_layout(arrays: Arrays) -> None:
             fits = fits and length == have
         if not fits:
             known = [f"{one} = {lengths[one][0]} as in {lengths[one][1]}" for one in want if one in lengths]
-            shape = "(" + ", ".join(map(str, want)) + ("," if len(want) == 1 else "") + ")"
+            shape = f"({in_words(want)}{',' if len(want) == 1 else ''})" if want else in_words(want)
             way_out = f"it must be {shape}" + (f" with {', '.join(known)}" if known else "")
             raise BadDataError(f"{name} has shape {array.shape}", way_out=way_out)
     counts = arrays["counts"]
@@ -464,6 +465,8 @@ def _check_numbers(arrays: Arrays) -> None:
         if array.dtype.kind not in "iuf":
             what = "not an array of numbers (a cell, a table or text?)" if array.dtype.kind in "OV" else array.dtype
             raise BadDataError(f"{name} is {what}", way_out="give real numbers")
+        if array.ndim == 0 and name in _OF_AXES:
+            raise BadDataError(f"{name} is a single number", way_out="give an array")
         if 0 in array.shape:
             raise BadDataError(f"{name} is empty (shape {array.shape})", way_out="give at least one frame and one pose")
         finite = np.isfinite(array)

@@ -110,7 +110,7 @@ def orient_by_axes(arrays: Arrays) -> tuple[tuple[str, ...], tuple[float, ...]]:
     for prefix in (*(f"{group}." for group in groups if group), ""):  # the file's own come last
         within = {name for name in grids if name.startswith(prefix)}
         x, y = (np.squeeze(arrays.get(prefix + axis, np.empty(0))) for axis in AXES)
-        if within and x.ndim == y.ndim == 2 and x.shape == y.shape:
+        if within and x.ndim == y.ndim == 2 and x.shape == y.shape and x.size:
             x, y = (x[0], y[:, 0]) if x[0, 0] != x[0, -1] else (x[:, 0], y[0])
         x, y = (line if line.ndim == 1 and line.dtype.kind in "iuf" else np.empty(0) for line in (x, y))
         for axis, line in zip(AXES, (x, y), strict=True):

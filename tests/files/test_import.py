@@ -13,7 +13,8 @@ import pytest
 from campaign_files import arrays_of
 
 from tactile_bayes.errors import BadDataError
-from tactile_bayes.files.imports import read_arrays
+from tactile_bayes.files.arrays_layout import ArrayMap
+from tactile_bayes.files.imports import import_arrays, read_arrays
 from tactile_bayes.forward.scene import Scene
 from tactile_bayes.forward.simulate import simulate
 
@@ -45,6 +46,8 @@ def test_landmarks_may_be_left_out_and_saturation_given(good: Arrays, tmp_path: 
     scan = read_arrays(tmp_path / "a.npz")
     assert scan.landmarks is None
     assert scan.element_calibration.saturation_count == 1023
+    stated, _ = import_arrays(tmp_path / "a.npz", ArrayMap(saturation=1000.2))
+    assert stated.element_calibration.saturation_count == 1001
 
 
 def drop(name: str) -> Callable[[Arrays], None]:

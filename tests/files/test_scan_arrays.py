@@ -347,6 +347,8 @@ def turns_alone(a: Arrays) -> None:
 
 FAULTS: list[tuple[str, Callable[[Arrays], Any], dict[str, Any], str]] = [
     ("NaN", nan("frames"), {"unit": "kPa"}, r"frames holds 26 values that are not finite \(first at \(3, 4, 0\)\)"),
+    ("one count", lambda a: a.update(frames=3.0), {"unit": "kPa"}, "frames is a single number; give an array"),
+    ("two pitches", lambda a: a.update(pitch_mm=[1.5, 1.5]), {"unit": "kPa"}, "pitch_mm has shape.* be one number"),
     ("no unit", dict.copy, {}, "lacks gain_kpa_per_count .*--unit or --array-calibration"),
     ("gain and unit", lambda a: a.update(offset_kpa=0.0), {"unit": "kPa"}, "offset_kpa is for counts.*in kPa"),
     ("no head", lambda a: a.pop("head_surface_mm"), {"unit": "kPa"}, "lacks head_surface_mm.*--head-geometry HEAD"),
