@@ -95,6 +95,8 @@ def instrument_of(
         head = like.head
     else:
         raise UsageError("the head's geometry is missing; give --head-geometry HEAD.json or --like SCAN.mcap")
+    if request.uncalibrated and request.array_calibration:
+        raise UsageError("--uncalibrated leaves --array-calibration unused; give one of them")
     if request.uncalibrated:
         calibration: ElementCalibration | None = None
     elif request.array_calibration:
@@ -110,7 +112,7 @@ def instrument_of(
 
 def calibration_age(request: Request, *, head_id: str, today: date) -> dict[str, str]:
     """Session fact on the age of the array calibration, in days; one that is stale or of another head is refused."""
-    if not request.array_calibration or request.uncalibrated:
+    if not request.array_calibration:
         return {}
     calibration = read_array_calibration(request.array_calibration)
     age, fault = (today - calibration.day).days, ""
@@ -396,7 +398,10 @@ def _run(recorder: Recorder, signals: list[str], head: HeadGeometry, request: Re
             recorder.stop(signals[-1])
 
     with keys.listening():
-        return recorder.run(poll)
+        report = recorder.run(poll)
+    if request.uncalibrated and request.tracker_url:
+        report.cautions.append("the nominal gain is for bladder steps: uneven taxels may hide a lump or pass for one")
+    return report
 
 
 # --- From scripts: the same recorder, started at once.
