@@ -20,7 +20,14 @@ from tactile_bayes.mapping.clock import ClockPosition, clock_position, clock_tex
 from tactile_bayes.mapping.map import FEW_READINGS, TactileMap
 from tactile_bayes.mapping.plausibility import WHY_NOT
 from tactile_bayes.posterior.verdict import chance_text
-from tactile_bayes.report.estimate_document import from_xiphoid, other_masses, patient_mm, share_words, size_words
+from tactile_bayes.report.estimate_document import (
+    from_xiphoid,
+    other_masses,
+    patient_mm,
+    share_words,
+    side_of,
+    size_words,
+)
 from tactile_bayes.report.estimate_text import shape_text, smallest_text, spread_percent
 from tactile_bayes.report.map import ellipse_of
 from tactile_bayes.report.pages import cut
@@ -279,14 +286,14 @@ def short_place(mass: ExamMass) -> str:
 
 
 def why_no_clock(exam: ShownExam) -> str:
-    """The facts missing for a clock position on a patient's scan; empty if there is one, or no patient."""
+    """The facts missing for a clock position on a patient's scan with a mass; empty if there is one, or no patient."""
     tactile_map = exam.main.tactile_map
     by_clock = any(mass.place is not None for mass in exam.main.masses)
     if by_clock or tactile_map is None or tactile_map.patient_from_plane is None:
         return ""
     lacks = ["nipple"] if tactile_map.nipple_mm is None else []
-    lacks += [] if any(scan.get("side") in ("left", "right") for scan in exam.scans) else ["side"]
-    return f"No clock position: the scan names no {' and no '.join(lacks)}." if lacks else ""
+    lacks += [] if side_of(exam.scans) in ("left", "right") else ["side"]
+    return f"No clock position: the scan names no {' and no '.join(lacks)}."
 
 
 def quality_rows(exam: ShownExam) -> Iterator[tuple[str, str]]:

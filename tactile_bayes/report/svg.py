@@ -274,8 +274,7 @@ def thumbnail_svg(exam: ExamMap, *, label: str) -> str:
     """
     tactile_map, report = _map_of(exam), exam.report
     scale = min(THUMB_SCALE, _THUMB_ROOM_MM / max(Frame(tactile_map, 1.0).size_mm))
-    values = tactile_map.mean[tactile_map.covered]
-    level = float(np.median(values)) if values.size else 1.0
+    level = float(np.median(tactile_map.mean[tactile_map.covered]))
     if report.background is not None and report.max_size_mm is not None:
         level = report.background.median
     low, high = sorted(level * end for end in THUMB_ENDS)

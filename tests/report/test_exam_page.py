@@ -404,6 +404,8 @@ def test_without_a_nipple_the_xiphoid_tells_the_place_and_the_page_says_why() ->
     assert "of the xiphoid and" in page.words
     assert "No clock position: the scan names no nipple and no side." in page.words
     assert page.named("svg", **{"class": "dial"}) == []
+    one_of_two = ShownExam((exam_map(tactile_map, report, side=""),), None, ({"side": "left"}, {}))
+    assert "No clock position: the scan names no side." in Page(exam_page(one_of_two)).words
 
 
 def test_a_nipple_off_the_map_is_pointed_to() -> None:
