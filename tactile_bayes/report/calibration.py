@@ -237,7 +237,7 @@ def calibration_text(
         fits = [f"m {m:.2f}, b {b:.2f} mm, e {e:.3f}, f {f:.3f}" for m, b, e, f in other_fit.coefficients]
         differences = " and ".join(f"{100 * share:.0f} %" for share in other_fit.difference)
         lines.append(f"{words}: {'; along '.join(fits)}; sizes differ by {differences} of d on average")
-    if calibration.left_out is None and not_left_out:
+    if not_left_out:
         lines.append(f"leave one geometry out: not known, {not_left_out}")
     recipe = calibration.recipe
     method = "declared" if recipe.declared else "as the maps were made here"

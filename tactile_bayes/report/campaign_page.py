@@ -106,10 +106,9 @@ class MassEntry(Record, eq=False):
     @property
     def badness(self) -> tuple[int, int, int, float]:
         """Sort key: masses to be looked at first come first."""
-        size, findings = self.last.size, [finding for exam in self.exams for finding in exam.findings]
         failed = sum(exam.failed for exam in self.exams)
-        doubts = sum(10 if one.severity == "caution" else 1 for one in findings)
-        return STATUSES.index(self.status), -failed, -doubts, 0.0 if size is None else -self.width
+        doubts = sum(10 if one.severity == "caution" else 1 for exam in self.exams for one in exam.findings)
+        return STATUSES.index(self.status), -failed, -doubts, -self.width
 
     @property
     def width(self) -> float:

@@ -134,13 +134,13 @@ NARROWED_ON_PAPER = {
 }
 
 
-def width_lines(variance_share: Mapping[str, float], *, paper: bool = False) -> list[str]:
+def width_lines(variance_share: Mapping[str, float] | None, *, paper: bool = False) -> list[str]:
     """Sources of a size's variance, largest first, and ways to narrow the interval.
 
-    `variance_share`: percent of the variance of the largest size, by source.
+    `variance_share`: percent of the variance of the largest size, by source; None without a size.
     """
     sources, narrowed = (ON_PAPER, NARROWED_BY | NARROWED_ON_PAPER) if paper else (SOURCES, NARROWED_BY)
-    ranked = sorted(variance_share.items(), key=lambda pair: -pair[1])
+    ranked = sorted((variance_share or {}).items(), key=lambda pair: -pair[1])
     parts = [f"{share:.0f} % {sources.get(name, name)}" for name, share in ranked if share >= 0.5]
     ways = [narrowed[name] for name, share in ranked if share >= WORTH_NARROWING and name in narrowed]
     lines = [f"What makes the interval wide: {', '.join(parts)}."] if parts else []
@@ -269,7 +269,7 @@ def _detail_lines(estimate: Estimate, report: EstimateReport) -> list[str]:
     if largest is not None:
         if report.another_exam is not None:
             lines.append(two_intervals_text(figures.get("between_map_sd"), report.another_exam.between_map_sd))
-        lines += width_lines(report.leading.variance_share or {})
+        lines += width_lines(report.leading.variance_share)
         if "repeatability" in figures:
             lines.append(site_interval_text(figures["repeatability"]))
         lines += estimate_document.supposed_lines(report.supposing, largest.median, places=size_decimals([largest]))
@@ -362,7 +362,7 @@ def _estimate_lines(estimate: Estimate, report: EstimateReport, cautions: list[s
     last = _quality_line(estimate, report, [quantities[name] for name in shown]) + checks
     room = MOST_LINES - 2 - len(lines) - len(after) - len(last)
     beside = _mass_lines(report.masses, room=min(MOST_MASSES, room))
-    widths = width_lines(report.leading.variance_share or {})
+    widths = width_lines(report.leading.variance_share)
     lines = [*lines, *beside, *after, *widths[: max(room - len(beside), 0)], *last]
     if largest is None or len(lines) >= MOST_LINES - 2:
         return lines

@@ -61,7 +61,7 @@ def exam_page(exam: ShownExam) -> str:
         size=size
         and {"ruler": svg.size_ruler(_intervals(exam, size)), "sentences": list(exam_words.size_sentences(exam, size))},
         nothing=[] if size else list(exam_words.nothing_sentences(exam)),
-        narrowing=width_lines(exam.report.leading.variance_share or {}, paper=True),
+        narrowing=width_lines(exam.report.leading.variance_share, paper=True),
         masses=[exam_words.mass_row(mass) for mass in masses],
         maps=len(exam.maps),
         repeats=list(zip(svg.small_pictures(shown, room_mm=_REPEAT_MM), alone, strict=True)) if shown else [],

@@ -203,7 +203,7 @@ def pooled_summary(report: PooledReport) -> str:
         bare = [f"Map {i}: {one.reason}." for i, one in enumerate(report.maps, 1) if one.max_size_mm is None]
         lines += first_lines(bare, 4)
     else:
-        lines += estimate_text.size_table(report) + estimate_text.width_lines(report.leading.variance_share or {})
+        lines += estimate_text.size_table(report) + estimate_text.width_lines(report.leading.variance_share)
         parts = [
             f"sizes by {report.site}" if report.site else "",
             report.known_words,
@@ -248,7 +248,7 @@ def pooled_text(report: PooledReport) -> str:
     sizes, figures = _sizes(report), report.figures
     worst, places = max(sizes, key=lambda q: q.mc_error), estimate_text.size_decimals(sizes)
     lines += ["", *estimate_text.size_table(report), ""]
-    lines += estimate_text.width_lines(report.leading.variance_share or {})
+    lines += estimate_text.width_lines(report.leading.variance_share)
     lines += supposed_lines(report.supposing, report.max_size_mm.median, places=places)
     lines.append(f"Spread between the maps of this mass: {100 * figures['between_map_sd']:.0f} %.")
     if report.one_size_probability is not None:
