@@ -775,12 +775,23 @@ def test_an_output_that_holds_something_else_is_refused(own: Path) -> None:
     assert os.listdir(own / "out") == ["thesis.tex"]  # noqa: PTH208
 
 
-@pytest.mark.long
-def test_exams_inside_the_output_are_refused(finished: Path) -> None:
-    write_table(finished / "exams.csv", [("out/exams/07.v1.m1.r1/map.nc", "07", 1, "left")])
-    done = campaign(finished)
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (("-o", "scans"), "scans/gone.mcap lies in the output folder scans; choose another folder"),
+        (("-o", "notes.txt"), "notes.txt is a file; give the name of a folder"),
+        (("-o", "out", "--settings", "fit.toml"), "a checkpoint is for one map; leave it out of the settings file"),
+    ],
+)
+def test_an_output_that_holds_exams_or_is_a_file_and_a_checkpoint_are_refused(
+    more: tuple[str, ...], words: str, tmp_path: Path
+) -> None:
+    write_table(tmp_path / "exams.csv", [("scans/gone.mcap", "07", 1, "left")])
+    (tmp_path / "fit.toml").write_text('checkpoint = "fit.npz"\n')
+    (tmp_path / "notes.txt").write_text("notes")
+    done = run_here("campaign", "run", "exams.csv", *more, cwd=tmp_path)
     assert done.returncode == 2
-    assert "lies in the output folder out" in done.stderr
+    assert words in done.stderr
 
 
 @pytest.mark.long

@@ -251,6 +251,22 @@ def test_a_pattern_that_cannot_be_read_is_refused(pattern: str, tmp_path: Path) 
     assert not (tmp_path / "exams.csv").exists()
 
 
+def test_a_folder_that_is_none_or_not_below_the_table_and_names_that_tables_do_not_take_are_refused(
+    tmp_path: Path,
+) -> None:
+    named(tmp_path, "P01_1.npz", " P01_2.npz")
+    scan = "Studie 1/P01_1.npz"
+    for folder, table, words in (
+        (scan, "exams.csv", f"{scan} is not a directory; give the folder of the scans"),
+        (".", "Studie 1/exams.csv", "is not inside Studie 1, the table's folder; write the table beside the scans"),
+    ):
+        done = run_here("campaign", "init", folder, "-o", table, cwd=tmp_path)
+        assert done.returncode == 2
+        assert words in done.stderr
+    inside = run_here("campaign", "init", ".", "-o", "exams.csv", cwd=tmp_path / "Studie 1")
+    assert "left out:  P01_2.npz: the table takes no such file name: rename it" in inside.stderr
+
+
 def test_a_folder_where_no_name_follows_the_pattern_gives_no_table(tmp_path: Path) -> None:
     named(tmp_path, "P01-1.npz")
     done = init(tmp_path, "--names", "{patient}_{visit}")

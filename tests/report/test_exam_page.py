@@ -404,8 +404,10 @@ def test_without_a_nipple_the_xiphoid_tells_the_place_and_the_page_says_why() ->
     assert "of the xiphoid and" in page.words
     assert "No clock position: the scan names no nipple and no side." in page.words
     assert page.named("svg", **{"class": "dial"}) == []
-    one_of_two = ShownExam((exam_map(tactile_map, report, side=""),), None, ({"side": "left"}, {}))
-    assert "No clock position: the scan names no side." in Page(exam_page(one_of_two)).words
+    dead = replace(tactile_map, masked_taxels=("row 3 column 7 dead",))
+    page = Page(exam_page(ShownExam((exam_map(dead, report, side=""),), None, ({"side": "left"}, {}))))  # of two scans
+    assert "No clock position: the scan names no side." in page.words
+    assert "sensor points 1 left out as faulty" in page.words
 
 
 def test_a_nipple_off_the_map_is_pointed_to() -> None:

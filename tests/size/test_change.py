@@ -5,13 +5,15 @@ Reference values are the closed form of a linear model with normal errors.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from plain_calibration import plain_calibration
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.size_json import read_size_calibration, size_calibration_path
-from tactile_bayes.report.compare import growth_rates
+from tactile_bayes.report.compare import TrendReport, growth_rates, rate_sentences
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.draws import BetweenMaps, ShapeDraws, ShapePrior
 from tactile_bayes.size.pooling import POOLED_DRAWS, SizePriors, pooled_size
@@ -379,6 +381,14 @@ def test_a_straight_line_through_equal_independent_visits_is_least_squares():
     bent = straight_line(np.array([2.6, 2.9, 2.6, 2.9]), own, list(days))
     assert bent.departure is not None
     assert bent.departure < 0.001 < line.departure
+
+
+@pytest.mark.parametrize(("chance", "lines"), [(0.049, 2), (0.05, 1), (None, 1)])
+def test_sizes_that_do_not_follow_one_growth_are_told(chance: float | None, lines: int):
+    trend = TrendReport(4, 90.0, *growth_rates([0.01, 0.005, 0.02], 0.9), chance)
+    told = rate_sentences(SimpleNamespace(trend=trend))
+    assert len(told) == lines
+    assert told[-1].startswith("The sizes do not follow one steady growth (probability 0.049)") == (lines == 2)
 
 
 def test_a_volume_that_grows_by_one_percent_a_day_doubles_in_69_days():
