@@ -275,6 +275,7 @@ def test_no_lump_found_is_told_with_what_was_covered_and_what_would_have_shown()
     assert "about" not in headline(without_lump())
     assert headline(without_lump("window")) == "No size"  # a rise that cannot be measured is not "no lump"
     assert headline(without_lump("ridge")) == "No lump found in the area covered"
+    assert headline(without_lump("cannot_show")) == "No answer: the data cannot show whether there is a lump"
 
 
 def test_one_cross_marks_the_rise_that_the_reason_is_about() -> None:
