@@ -122,11 +122,11 @@ class ClockPosition(Record):
 
 
 def clock_position(
-    tactile_map: TactileMap, centre_mm: tuple[float, float], *, side: str, covariance_mm2: FloatArray | None = None
+    tactile_map: TactileMap, centre_mm: tuple[float, float], *, side: str, covariance_mm2: FloatArray
 ) -> ClockPosition | None:
     """Clock position of a point of the plane; None without landmarks, a nipple, or a `side` that is a breast's.
 
-    `centre_mm` is x and y in `plane`, exact without a covariance. The line from xiphoid to sternal notch points up on
+    `centre_mm` is x and y in `plane`. The line from xiphoid to sternal notch points up on
     the plane, z away from the viewer: the patient's left is z cross up.
     """
     nipple, patient = tactile_map.nipple_mm, tactile_map.patient_from_plane
@@ -139,8 +139,7 @@ def clock_position(
     distance = math.hypot(right, above)
     outwards = np.array([right, above]) / distance if distance > 0 else np.array([0.0, 1.0])
     nipple_sd = max(NIPPLE_SD_MM, tactile_map.quality.get("landmark_spread_mm", 0.0))
-    centre = axes @ (np.zeros((2, 2)) if covariance_mm2 is None else covariance_mm2) @ axes.T
-    covariance = centre + nipple_sd**2 * np.eye(2)
+    covariance = axes @ covariance_mm2 @ axes.T + nipple_sd**2 * np.eye(2)
     sideways = np.array([outwards[1], -outwards[0]])
     sideways_sd = math.sqrt(float(sideways @ covariance @ sideways))
     return ClockPosition(

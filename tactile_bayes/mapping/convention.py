@@ -295,7 +295,7 @@ def check_convention(selections: Sequence[SelectedFrames]) -> dict[str, float]:
     return figures
 
 
-def convention_findings(quality: Mapping[str, float], others: Iterable[Finding] = ()) -> tuple[Finding, ...]:
+def convention_findings(quality: Mapping[str, float], others: Iterable[Finding]) -> tuple[Finding, ...]:
     """Findings on a map's rotations from its figures (`check_convention`); none where one of `others` says the same."""
     if "other_convention" in quality:
         other, agreement = list(CONVENTIONS)[int(quality["other_convention"])], quality["other_agreement"]

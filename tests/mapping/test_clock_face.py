@@ -18,6 +18,7 @@ from tactile_bayes.scans import Landmarks
 INTO_BODY = np.array([0.0, 0.0, 1.0])  # of `make_scan`: its head's z axis is the base's
 HEADS = (70, 270, 0, 180)
 UP_MM, ACROSS_MM = 20.0, 30.0
+EXACT = np.zeros((2, 2))
 
 
 def axes_of(head_deg: float) -> tuple[np.ndarray, np.ndarray]:
@@ -46,7 +47,7 @@ def position(head_deg: float, side: str, *, up_mm: float, left_mm: float) -> Clo
     up, left = axes_of(head_deg)
     tactile_map = map_of(head_deg)
     centre = on_plane(tactile_map, up_mm * up + left_mm * left)
-    found = clock_position(tactile_map, centre, side=side)
+    found = clock_position(tactile_map, centre, side=side, covariance_mm2=EXACT)
     assert found is not None
     return found
 
@@ -100,10 +101,13 @@ def test_hours_are_told_to_the_nearest_half(hours, text):
 
 def test_without_nipple_side_or_landmarks_there_is_no_clock():
     tactile_map = map_of(70)
-    assert clock_position(tactile_map, (0.0, 10.0), side="") is None
-    assert clock_position(tactile_map, (0.0, 10.0), side="phantom") is None
-    assert clock_position(map_of(70, nipple=False), (0.0, 10.0), side="left") is None
-    assert clock_position(replace(tactile_map, patient_from_plane=None), (0.0, 10.0), side="left") is None
+    assert clock_position(tactile_map, (0.0, 10.0), side="", covariance_mm2=EXACT) is None
+    assert clock_position(tactile_map, (0.0, 10.0), side="phantom", covariance_mm2=EXACT) is None
+    assert clock_position(map_of(70, nipple=False), (0.0, 10.0), side="left", covariance_mm2=EXACT) is None
+    assert (
+        clock_position(replace(tactile_map, patient_from_plane=None), (0.0, 10.0), side="left", covariance_mm2=EXACT)
+        is None
+    )
 
 
 def test_so_near_that_the_direction_is_unknown_it_is_behind_the_nipple():
@@ -150,9 +154,9 @@ def test_repeats_that_lie_apart_and_an_uncertain_centre_widen_it():
     tactile_map = map_of(70)
     up, left = axes_of(70)
     centre = on_plane(tactile_map, UP_MM * up + ACROSS_MM * left)
-    plain = clock_position(tactile_map, centre, side="left")
+    plain = clock_position(tactile_map, centre, side="left", covariance_mm2=EXACT)
     apart = replace(tactile_map, quality={**tactile_map.quality, "landmark_spread_mm": 12.0})
-    wider = clock_position(apart, centre, side="left")
+    wider = clock_position(apart, centre, side="left", covariance_mm2=EXACT)
     vague = clock_position(tactile_map, centre, side="left", covariance_mm2=np.eye(2) * 100.0)
     assert wider.distance_sd_mm == pytest.approx(12.0)
     assert vague.distance_sd_mm == pytest.approx(np.hypot(NIPPLE_SD_MM, 10.0))

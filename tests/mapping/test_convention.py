@@ -161,7 +161,7 @@ def test_an_array_that_seems_mirrored_may_be_a_left_handed_tracker(corrections, 
 
 def test_rotations_that_the_frames_ask_for_too_are_told_once():
     doubted = {"other_convention": 2.0, "other_agreement": 0.999, "normal_agreement": 0.95}
-    (alone,) = convention_findings(doubted)
+    (alone,) = convention_findings(doubted, [])
     assert "import the scan again with --correct inverse-rotation" in alone.remedy
     asked = finding("wrong_arrangement", "words", import_again(["rows-reversed", "inverse-rotation"]))
     assert convention_findings(doubted, [asked]) == ()
