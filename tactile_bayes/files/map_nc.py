@@ -126,6 +126,10 @@ def read_map_and_header(path: Path) -> tuple[TactileMap, MapHeader]:
         for name, transform in transforms.items():
             if transform is not None:
                 check_rigid(transform, name=name)
+        patient = transforms["patient_from_plane"]
+        if patient is not None and np.hypot(*patient[1, :2]) < 0.09:  # no map is made with less than 0.1
+            what = "patient_from_plane has sternal notch and xiphoid on a line through the plane"
+            raise BadDataError(what, way_out=_WAY_OUT)
         _check_lattice({"x": arrays["x_mm"], "y": arrays["y_mm"]}, header.recipe.cell_mm)
         tactile_map = TactileMap(
             **arrays,

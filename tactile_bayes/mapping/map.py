@@ -456,8 +456,7 @@ def orientation_of(tactile_map: TactileMap) -> Orientation:
     if tactile_map.patient_from_plane is None:
         return Orientation("-x", "+y", PLANE_WORDS)
     notch = tactile_map.patient_from_plane[1, :2]
-    length = float(np.hypot(*notch))
-    x, y = (float(value) / length for value in notch) if length > 0 else (0.0, 1.0)
+    x, y = (notch / np.hypot(*notch)).tolist()
     along = {"+y": y, "-y": -y, "+x": x, "-x": -x}
     up = max(along, key=lambda axis: along[axis])
     return Orientation(_RIGHT_OF_UP[up], up, PATIENT_WORDS, (along[_RIGHT_OF_UP[up]], along[up]))

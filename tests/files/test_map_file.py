@@ -171,6 +171,7 @@ def _flip(path: Path) -> None:
     path.write_bytes(bytes(data))
 
 
+UPRIGHT = rigid(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.zeros(3))
 FAULTS = {
     "text": (lambda path: path.write_text("mean,count\n"), "not a readable netCDF file"),
     "empty": (lambda path: path.write_bytes(b""), "not a readable netCDF file"),
@@ -210,6 +211,12 @@ FAULTS = {
     "an axis of NaN": (
         _edit(lambda file: file["x"].__setitem__(0, np.nan)),
         "variable x holds values that are not finite",
+    ),
+    "landmarks through the plane": (
+        lambda path: write_map(
+            path, replace(plain_map(), patient_from_plane=UPRIGHT), provenance=PROVENANCE, force=True
+        ),
+        "patient_from_plane has sternal notch and xiphoid on a line through the plane",
     ),
     "no rotation": (_edit(lambda file: file["plane_from_base"].__setitem__((0, 0), 2.0)), "not a rigid transform"),
     "a flipped bit": (_flip, "not a readable netCDF file"),
