@@ -203,6 +203,11 @@ def test_rotation_is_spent_where_the_map_asks_for_it() -> None:
     assert np.degrees(np.median(turned.map_posterior.angle_rad)) == pytest.approx(30.0, abs=4.0)
 
 
+def test_a_level_off_that_of_the_map_is_a_caution() -> None:
+    kinds = [[one.kind for one in run(WHITE + off, method="optimise").findings] for off in (0.0, -0.06)]
+    assert kinds == [[], ["uneven_level"]]
+
+
 def test_coarse_cells_are_flagged() -> None:
     noise = 0.005 * np.random.default_rng(74).standard_normal((13, 13))
     tactile_map = bump_map(cell_mm=4.0, half_mm=24.0, noise=noise)
