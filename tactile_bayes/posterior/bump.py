@@ -351,9 +351,6 @@ class Bump(Record):
 
     def predict(self, theta: FloatArray, cells: FitCells) -> FloatArray:
         """(m, k) map values of (m, p) parameter vectors: Eq 7 averaged over the cells."""
-        size = block_size(len(cells))
-        if len(theta) > size:
-            return np.concatenate([self.predict(theta[i : i + size], cells) for i in range(0, len(theta), size)])
         values = self.unit_bump(theta, cells)
         values *= theta[:, 0, None]
         values += self.level(theta)[:, None]

@@ -538,7 +538,7 @@ def _posterior(
     shifts = _random_shifts(fit, draws, position_covariance + exponent_covariance(fit), rng)
     theta = draws.theta + shifts.reshape(draws.theta.shape)
     sigma_x, sigma_y, angle = drawn_widths(*fit.scene.widths(theta))
-    amplitude, level, noise_sd = fit.target.draw_linear(draws.flat, rng, solved=cache)
+    amplitude, level, noise_sd = fit.target.draw_linear(draws.flat, rng, solve=cache)
     return MapPosterior(
         amplitude=amplitude[:, 0].reshape(shape),
         sigma_x_mm=sigma_x,

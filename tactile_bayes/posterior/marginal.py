@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from typing import Final, Literal
 
@@ -347,11 +347,12 @@ class CollapsedTarget:
         return solution._replace(level_slope=solution.level_slope[..., 0])
 
     def draw_linear(
-        self, theta: FloatArray, rng: np.random.Generator, *, solved: SolutionCache | None = None
+        self, theta: FloatArray, rng: np.random.Generator, *, solve: Callable[[FloatArray], Solution]
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Draw amplitudes (m, v), level (m,) and noise scale (m,) given the shape, exactly, after drawing the field."""
+        """Draw amplitudes (m, v), level (m,) and noise scale (m,) given the shape, exactly, after drawing the field;
+        `solve` is `conditional`, or a cache of it."""
         unique, index = distinct_rows(theta)
-        evidence, centre, power, slope, squares = (solved or self.conditional)(unique)
+        evidence, centre, power, slope, squares = solve(unique)
         at_zero = np.concatenate([field.level()[:, 0] for field in self.fields])
         level_variance = np.concatenate([one.inverse[:, 0, 0] for one in self.fields])
         h = choose_fields(evidence[index], rng)

@@ -182,7 +182,7 @@ def hiding_settings(options: SamplerSettings) -> Abstention | None:
     return cannot_show(why, f"leave {' and '.join(own)} out of the settings", "have it estimated anew without them")
 
 
-def cannot_show(why: str, advice: str = "", on_paper: str = "") -> Abstention:
+def cannot_show(why: str, advice: str, on_paper: str) -> Abstention:
     """Abstention for data that cannot show whether there is a lump, and the remedy."""
     return Abstention(CANNOT_SHOW, f"the data cannot show whether there is a lump: {why}", advice, on_paper)
 

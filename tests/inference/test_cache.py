@@ -31,8 +31,9 @@ def drawn(method: str) -> tuple[Counting, list[np.ndarray], list[np.ndarray], li
     counting = Counting(fit)
     solved = SolutionCache(counting)
     draws, _ = draw_parameters(fit, SamplerSettings(method=method), rng=np.random.default_rng(1), solved=solved)
-    kept = fit.target.draw_linear(draws.flat, np.random.default_rng(2), solved=solved)
-    again, other = (fit.target.draw_linear(draws.flat, np.random.default_rng(seed)) for seed in (2, 3))
+    kept = fit.target.draw_linear(draws.flat, np.random.default_rng(2), solve=solved)
+    anew = fit.target.conditional
+    again, other = (fit.target.draw_linear(draws.flat, np.random.default_rng(seed), solve=anew) for seed in (2, 3))
     return counting, list(kept), list(again), list(other)
 
 

@@ -220,7 +220,7 @@ def test_a_negative_amplitude_has_density_zero() -> None:
 def test_amplitude_and_noise_come_back() -> None:
     fit = fitted(cells_of(noise(4, white=0.01)))
     theta = np.repeat(fit.mode[None], 4000, axis=0)
-    amplitude, level, noise_sd = fit.target.draw_linear(theta, np.random.default_rng(0))
+    amplitude, level, noise_sd = fit.target.draw_linear(theta, np.random.default_rng(0), solve=fit.target.conditional)
     assert amplitude.mean() == pytest.approx(TRUTH["amplitude"], abs=4 * amplitude.std())
     assert level.mean() == pytest.approx(1.0, abs=0.005)
     # against dense algebra without a field: the spread of the level, and that it falls as the amplitude rises
