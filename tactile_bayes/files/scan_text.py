@@ -125,7 +125,7 @@ def is_identity(numbers: FloatArray, layout: str) -> BoolArray:
 def choose_tool(names: Sequence[str], stated: Stated, *, place: str) -> str:
     """The tool that is stated, or the only one."""
     if stated.tool is not None:
-        matches = [name for name in names if stated.tool in (name, name.split()[0], name.split("To")[0])]
+        matches = [name for name in names if stated.tool in (name, name.partition(" ")[0], name.split("To")[0])]
         if len(matches) == 1:
             return matches[0]
         what = f"has no one tool {stated.tool!r} in {place}"
@@ -488,6 +488,8 @@ def _frames_of_rows(
     rows: Sequence[Line], names: Sequence[str], options: Stated, stated: Stated, notes: list[str]
 ) -> Source:
     values = np.array([line.values for line in rows], dtype=np.float64)
+    if not np.isfinite(values).any():
+        raise BadDataError("holds no number other than NaN or infinity", way_out="give the array's readings")
     if is_label_sequence(values[0][np.isfinite(values[0])]) and len(rows) > 1:
         notes.append(f"line {rows[0].number} counts {values[0, -2]:g}, {values[0, -1]:g}: taken for labels")
         values = values[1:]

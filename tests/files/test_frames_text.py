@@ -162,6 +162,7 @@ FAULTS: dict[str, tuple[str | bytes, dict[str, Any], str]] = {
     "only counted": ("\n".join(f"{i},{row}" for i, row in enumerate(rows(FLAT))), {}, "lacks frame_time_s .*rate_hz"),
     "epoch in ms": ("\n".join(f"{1.7e12 + 5 * i},{row}" for i, row in enumerate(rows(FLAT))), {}, 'time_unit="ms"'),
     "poses": ("t,x,y,z,qw,qx,qy,qz\n" + "0.1,1,2,3,1,0,0,0\n" * 9, {}, "is a table of poses by line 1; .*poses"),
+    "NaN alone": ("nan,nan,nan\n" * 5, {}, "holds no number other than NaN or infinity; give the array's readings"),
     "a list": ("frame,row,col,kPa\n" + "0,1,2,3.5\n" * 99, {}, "names 4 columns .*give one row a frame"),
     "other columns": ("\n".join(["time," + NAMES + ",S416", *SUMMED]), {}, "418 columns .* 417 of which.*skip_columns"),
 }

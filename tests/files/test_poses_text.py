@@ -250,6 +250,11 @@ FAULTS: dict[str, tuple[list[str], dict[str, Any], str]] = {
         "has 2 tools in its rows: Port:1, Port:2; choose one",
     ),
     "no such tool": (["Time," + NDI, *with_times(ndi())], {"tool": "Port:9"}, "has no one tool 'Port:9'.*Port:1"),
+    "a tool without a name": (
+        ["Time," + NDI, *with_times(ndi()), *with_times(ndi(tool=""))],
+        {"tool": "Port:9"},
+        "has no one tool 'Port:9'",
+    ),
     "no times": ([NDI, *ndi()], {}, "has frame numbers but no times; .*pose_rate_hz"),
     "no unit": ([EULER.replace(" (cm)", ""), *polhemus()], {}, "does not say the unit of x, y and z.*length_unit"),
     "no unit and no names": (polhemus(), {"pose_layout": "euler"}, "does not say the unit of x, y and z.*length_unit"),
