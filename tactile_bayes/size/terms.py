@@ -47,11 +47,11 @@ In the second moments it comes out above 1, because SD(B) is learned apart from 
 """
 
 
-def check_shapes(record: object, **shapes: tuple[int, ...]) -> None:
+def check_shapes(record: object, *, finite: bool = True, **shapes: tuple[int, ...]) -> None:
     """Refuse arrays of a record, by name, that have another shape or hold a number that is not finite."""
     for name, shape in shapes.items():
         values = getattr(record, name)
-        if values.shape != shape or not np.isfinite(values).all():
+        if values.shape != shape or (finite and not np.isfinite(values).all()):
             actual, expected = ("x".join(map(str, one)) for one in (values.shape, shape))
             raise BadDataError(f"{name} has {actual} numbers for {expected} finite ones", way_out=LEARN_ANEW)
 
@@ -160,7 +160,8 @@ class HiddenTerms(Record, eq=False, omit_defaults=True):
 
     def __post_init__(self) -> None:
         k = len(self.names)
-        check_shapes(self, expected=(k, self.expected.shape[-1]), covariance=(k, k), with_body=(k,))
+        # a table that Eq 6 follows exactly gives terms that are not finite
+        check_shapes(self, finite=False, expected=(k, self.expected.shape[-1]), covariance=(k, k), with_body=(k,))
 
     def share(self, *names: str) -> float:
         """Share of B's variance removed by knowing these properties, at most `MOST_SHARE`."""
