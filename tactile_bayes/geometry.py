@@ -148,6 +148,7 @@ def fit_plane(centroid_mm: FloatArray, covariance_mm2: FloatArray, *, head_x: Fl
 
 
 LEAST_APART_MM: Final = 1.0  #: Landmarks at most so far apart are one place.
+LEAST_IN_PLANE: Final = 0.1  #: Least share of the line from xiphoid to sternal notch that lies in the plane.
 
 
 def patient_from_base(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, *, normal: FloatArray) -> FloatArray:
@@ -165,7 +166,7 @@ def patient_from_base(sternal_notch_mm: FloatArray, xiphoid_mm: FloatArray, *, n
     y_axis = along / length
     z_axis = normal - (normal @ y_axis) * y_axis
     size = float(np.linalg.norm(z_axis))
-    if size < 0.1:
+    if size < LEAST_IN_PLANE:
         what = "the line of the landmarks runs along the plane's normal"
         raise BadDataError(what, way_out="correct them, or touch both anew")
     z_axis = z_axis / size

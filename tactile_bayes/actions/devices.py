@@ -17,7 +17,7 @@ import numpy as np
 from tactile_bayes.actions.record import record_action
 from tactile_bayes.errors import BadDataError, DeviceError, UsageError
 from tactile_bayes.files.provenance import Provenance, hash_inputs
-from tactile_bayes.files.scan_mcap import is_recording, read_scan, read_scan_report, write_scan
+from tactile_bayes.files.scan_mcap import being_recorded, is_recording, read_scan, read_scan_report, write_scan
 from tactile_bayes.hardware.emulated import (
     Device,
     EmulatedHead,
@@ -188,7 +188,7 @@ def _emulated(scan: Path, speed: float, *, poses: bool) -> Iterator[dict[str, st
 def repair_action(*, scan: Path, output: Path | None, force: bool) -> None:
     """Repair a scan that was cut off or damaged: keep what is intact, report what is lost."""
     if output is None and is_recording(scan):
-        raise UsageError(f"{scan} is being recorded; wait for its end, or choose another name")
+        raise being_recorded(scan)
     file = read_scan_report(scan)
     if file.complete and output is None:
         click.echo(f"{scan}: is whole, nothing to repair")

@@ -451,5 +451,6 @@ def masses_with_visits(exams: Sequence[Exam], days: Mapping[str, date]) -> dict[
 
 def visit_dates(visits: Visits, days: Mapping[str, date]) -> dict[str, date | None]:
     """Latest date of each visit's exams, else of the visit in `days`; None where none has one."""
-    known = {**days, **stated_days(exam for exams in visits.values() for exam in exams)}
-    return {visit: known.get(exams[0].of_mass) or day_of(visit) for visit, exams in visits.items()}
+    own = stated_days(exam for exams in visits.values() for exam in exams)
+    of_visits = {visit: exams[0].of_mass for visit, exams in visits.items()}
+    return {visit: own.get(name) or days.get(name) or day_of(visit) for visit, name in of_visits.items()}

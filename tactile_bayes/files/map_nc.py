@@ -21,7 +21,7 @@ from tactile_bayes.files.netcdf import Contents, Group, Variable, grouped_netcdf
 from tactile_bayes.files.provenance import Provenance, scans_of
 from tactile_bayes.files.reading import CELLS, check_limit
 from tactile_bayes.findings import Finding
-from tactile_bayes.geometry import FloatArray, check_rigid
+from tactile_bayes.geometry import LEAST_IN_PLANE, FloatArray, check_rigid
 from tactile_bayes.mapping.map import MapRecipe, TactileMap
 from tactile_bayes.scans import HeadShape
 
@@ -127,7 +127,7 @@ def read_map_and_header(path: Path) -> tuple[TactileMap, MapHeader]:
             if transform is not None:
                 check_rigid(transform, name=name)
         patient = transforms["patient_from_plane"]
-        if patient is not None and np.hypot(*patient[1, :2]) < 0.09:  # no map is made with less than 0.1
+        if patient is not None and np.hypot(*patient[1, :2]) < 0.9 * LEAST_IN_PLANE:  # so low is no rounding
             what = "patient_from_plane has sternal notch and xiphoid on a line through the plane"
             raise BadDataError(what, way_out=_WAY_OUT)
         _check_lattice({"x": arrays["x_mm"], "y": arrays["y_mm"]}, header.recipe.cell_mm)

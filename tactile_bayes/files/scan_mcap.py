@@ -412,9 +412,14 @@ def create_exclusive(path: Path, *, force: bool) -> IO[bytes]:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             stream.close()
-            raise UsageError(f"{path} is being recorded; wait for its end, or choose another name") from None
+            raise being_recorded(path) from None
     stream.truncate(0)
     return stream
+
+
+def being_recorded(path: Path) -> UsageError:
+    """The error of a command that would write or repair a file which a recorder holds."""
+    return UsageError(f"{path} is being recorded; wait for its end, or choose another name")
 
 
 def is_recording(path: Path) -> bool:
