@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -18,13 +18,9 @@ from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.bump import FitCells
 from tactile_bayes.posterior.result import Estimate, fitted_cells
 from tactile_bayes.report.estimate_text import exams_label, no_estimate_line
-from tactile_bayes.report.figure_file import figure_file, finish, load_matplotlib
+from tactile_bayes.report.figure_file import Axes, Figure, figure_file, finish, load_matplotlib
 from tactile_bayes.report.map import draw_panel, map_figure
 from tactile_bayes.size.draws import SizePosterior
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # --- Picture of a fit: the window's data, the fitted values and what is left, side by side.
 

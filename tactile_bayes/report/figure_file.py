@@ -16,8 +16,10 @@ from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.presets import RESEARCH_USE
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
+else:
+    Axes = Figure = Any  # which take long to load
 
 
 # --- Names for the titles of figures: what the scans say of the exam, else the file's name; never digests.

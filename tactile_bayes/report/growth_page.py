@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -17,14 +17,10 @@ from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.mapping.map import PATIENT_WORDS, Orientation, TactileMap, orientation_of
 from tactile_bayes.report import compare, svg
 from tactile_bayes.report.estimate_text import spread_percent
-from tactile_bayes.report.figure_file import exam_title, figure_file
+from tactile_bayes.report.figure_file import Axes, Figure, exam_title, figure_file
 from tactile_bayes.report.map import draw_cells, draw_edges, ellipse_of
 from tactile_bayes.report.pages import cut, foot, page
 from tactile_bayes.size.visits import VisitComparison, straight_line
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # --- The maps of each visit, averaged on common axes about the mass.
 

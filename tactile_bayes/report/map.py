@@ -18,13 +18,10 @@ from tactile_bayes.mapping.plausibility import WHY_NOT
 from tactile_bayes.mapping.profile import SPAN_MM
 from tactile_bayes.mapping.select import CONTACT_KPA, intervals, missing_records
 from tactile_bayes.presets import CELL_PER_SIGMA, RESEARCH_USE
-from tactile_bayes.report.figure_file import figure_file, load_matplotlib
+from tactile_bayes.report.figure_file import Axes, Figure, figure_file, load_matplotlib
 from tactile_bayes.scans import Scan
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
     from tactile_bayes.files.reports import EstimateReport, MassReport, PassedOver
 
 

@@ -4,22 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from tactile_bayes.forward.scene import HeadSection
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.presets import RESEARCH_USE, SHOULDERS_INSIDE
-from tactile_bayes.report.figure_file import figure_file, finish, label
+from tactile_bayes.report.figure_file import Axes, figure_file, finish, label
 from tactile_bayes.report.study import COLOURS
 from tactile_bayes.studies.model_comparison import NEAR_MM, MeasuredScan, ModelComparison, centre_row
 from tactile_bayes.studies.paper import HomogeneousTissue, Uniformity, centre_line, most_even, narrowest
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.collections import QuadMesh
-
 
 # --- How evenly heads press, as text and as plain data.
 
@@ -181,7 +176,7 @@ def design_figure(
 
 def _draw_grid(
     axes: Axes, heads: Sequence[Uniformity], worst: Sequence[float], title: str, limit: float, answer: Uniformity
-) -> QuadMesh:
+) -> Any:
     """Radius across, shoulder up, colours on a logarithmic scale; the heads within the limit are outlined."""
     radii, shoulders = (sorted({getattr(one.head, name) for one in heads}) for name in ("radius_mm", "shoulder_mm"))
     cells: FloatArray = np.full((len(shoulders), len(radii)), np.nan)
@@ -358,7 +353,7 @@ def _draw_line(axes: Axes, measured: MeasuredScan, models: Sequence[ModelCompari
 
 def _draw_map(
     axes: Axes, measured: MeasuredScan, values: FloatArray, title: str, ends: tuple[float, float], colours: str
-) -> QuadMesh:
+) -> Any:
     made = measured.tactile_map
     mesh = axes.pcolormesh(made.x_mm, made.y_mm, values, cmap=colours, vmin=ends[0], vmax=ends[1], shading="nearest")
     axes.plot(*measured.place_mm, "+", color="black", markersize=10)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from tactile_bayes.forward.tissue import Layers
 from tactile_bayes.geometry import FloatArray
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.presets import HEAD_PITCH_MM, THICKNESS_MM
-from tactile_bayes.report.figure_file import figure_file, finish
+from tactile_bayes.report.figure_file import Axes, figure_file, finish
 from tactile_bayes.size.eq6 import AxisCalibration, SizeCalibration
 from tactile_bayes.size.learn.eq6 import SizeTable
 from tactile_bayes.studies.model_comparison import (
@@ -43,10 +43,6 @@ from tactile_bayes.studies.paper import (
     widths,
 )
 from tactile_bayes.studies.paper_solid import SolidSettings
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 # --- A forward study in a few lines.
 

@@ -6,14 +6,14 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from tactile_bayes.declarations import Meta, Record
 from tactile_bayes.findings import counted
 from tactile_bayes.posterior.verdict import LIKELY, chance_text
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.estimate_text import SOURCES
-from tactile_bayes.report.figure_file import figure_file
+from tactile_bayes.report.figure_file import Axes, Figure, figure_file
 from tactile_bayes.studies.estimate_tradeoff import (
     SIZE,
     WIDTHS,
@@ -25,11 +25,6 @@ from tactile_bayes.studies.estimate_tradeoff import (
     Tradeoff,
 )
 from tactile_bayes.studies.tradeoffs import AMPLITUDE, ELEMENT
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 # --- One paragraph at the end of a trade-off: which setting is enough, and what would help instead.
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtr
@@ -17,17 +17,13 @@ from scipy.special import ndtr
 from tactile_bayes.findings import counted
 from tactile_bayes.options import Aim
 from tactile_bayes.report import trial as trial_words
-from tactile_bayes.report.figure_file import FORMATS, figure_file, finish, plain_matplotlib
+from tactile_bayes.report.figure_file import FORMATS, Axes, figure_file, finish, plain_matplotlib
 from tactile_bayes.report.pages import Growth, page
 from tactile_bayes.trial.figures import Figures
 from tactile_bayes.trial.method_comparison import MethodComparison
 from tactile_bayes.trial.planning import PlanReport
 from tactile_bayes.trial.readings import FloatArray, ModalitySizes, Trial, mass_numbers
 from tactile_bayes.trial.summary import BINS, Calibration, ModalityReport, Prediction, TrialReport, prediction_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
 
 # --- Figures of a trial as SVG, equal for equal input: sizes, differences, integral transforms, coverage.
 
