@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 
 import numpy as np
@@ -13,100 +12,9 @@ from tactile_bayes.declarations import Record
 from tactile_bayes.trial.figures import Ends, UndefinedError, ratio
 from tactile_bayes.trial.readings import FloatArray
 
-# --- Ordered angles of the lines through all pairs of points: listed, or counted when there are many.
-
-# Up to so many points the pairs are listed (2 million of them); beyond, ranks are found by counting inversions.
-MOST_LISTED = 2000
-RESOLUTION = 1e-9  #: Error of an ordered angle in radians, for more points than `MOST_LISTED`.
 # Smaller differences, as a share of the numbers, are rounding: those between averages of equal replicates. Laboratory
 # programs take them as ties, too.
 EQUAL = 1e-12
-
-
-class PairAngles:
-    """Ordered angles in (-pi/2, pi/2] of all pairs of points that do not coincide.
-
-    `vertical` is the angle of a pair of equal x: pi/2 or -pi/2.
-    """
-
-    def __init__(self, x: FloatArray, y: FloatArray, *, vertical: float) -> None:
-        self._counted = len(x) > MOST_LISTED
-        self._vertical = vertical
-        if self._counted:
-            order = np.lexsort((y, x))
-            self._x, self._y = x[order], y[order]
-            self._coincident = _pairs_of_equals(np.stack([self._x, self._y], axis=1))
-            self._upright = _pairs_of_equals(self._x[:, None]) - self._coincident
-            self.number = len(x) * (len(x) - 1) // 2 - self._coincident
-        else:
-            self._angles = _sorted_angles(x, y, vertical)
-            self.number = len(self._angles)
-
-    def below(self, angle: float, *, inclusive: bool) -> int:
-        """Number of angles below `angle` (in (-pi/2, pi/2)), or not above it when inclusive."""
-        if not self._counted:
-            return int(np.searchsorted(self._angles, angle, side="right" if inclusive else "left"))
-        slope = math.copysign(1.0, angle) if abs(angle) == math.pi / 4 else math.tan(angle)
-        z = self._y - slope * self._x
-        rounding = EQUAL * (np.abs(self._y).max() + abs(slope) * np.abs(self._x).max())
-        z = np.rint(z / rounding)
-        vertical_pairs = self._upright if self._vertical < 0 else 0
-        return _count_inversions(self._x, z, ties=inclusive) + vertical_pairs - (self._coincident if inclusive else 0)
-
-    def ranked(self, rank: int) -> float:
-        """Angle of a rank, counted from 1."""
-        if not self._counted:
-            return float(self._angles[rank - 1])
-        low, high = -math.pi / 2, math.pi / 2
-        while high - low > RESOLUTION:
-            middle = (low + high) / 2
-            low, high = (low, middle) if self.below(middle, inclusive=True) >= rank else (middle, high)
-        return high
-
-    def shift(self, *, rising: bool) -> int:
-        """Twice the shift of the median's rank: 2 for each angle steeper than 45 degrees against the line, 1 at it."""
-        if rising:
-            return self.below(-math.pi / 4, inclusive=True) + self.below(-math.pi / 4, inclusive=False)
-        on_or_above = self.number - self.below(math.pi / 4, inclusive=False)
-        return -(on_or_above + self.number - self.below(math.pi / 4, inclusive=True))
-
-
-def kendall_sign(x: FloatArray, y: FloatArray) -> int:
-    """Sign of Kendall's tau: concordant less discordant pairs."""
-    concordant, discordant = (_count_inversions(x, z, ties=False) for z in (-y, y))
-    return (concordant > discordant) - (concordant < discordant)
-
-
-def _sorted_angles(x: FloatArray, y: FloatArray, vertical: float) -> FloatArray:
-    """Ascending angles of all pairs of points that do not coincide."""
-    first, second = np.triu_indices(len(x), 1)
-    dx, dy = _difference(x[second], x[first]), _difference(y[second], y[first])
-    distinct = (dx != 0) | (dy != 0)
-    dx, dy = dx[distinct], dy[distinct]
-    is_vertical = dx == 0
-    return np.sort(np.where(is_vertical, vertical, np.arctan(dy / np.where(is_vertical, 1.0, dx))))
-
-
-def _difference(a: FloatArray, b: FloatArray) -> FloatArray:
-    """a - b, 0 where it is rounding."""
-    difference = a - b
-    return np.where(np.abs(difference) < EQUAL * (np.abs(a) + np.abs(b)) / 2, 0.0, difference)
-
-
-def _pairs_of_equals(rows: FloatArray) -> int:
-    """Number of pairs of equal rows in (n, k) rows."""
-    _, number = np.unique(rows, axis=0, return_counts=True)
-    return int(np.sum(number * (number - 1) // 2))
-
-
-def _count_inversions(x: FloatArray, z: FloatArray, *, ties: bool) -> int:
-    """Number of pairs whose z falls as x rises; with `ties`, also pairs of equal z, or of equal x and z."""
-    insertion_point, earlier, count = bisect_left if ties else bisect_right, list[float](), 0
-    for value in z[np.lexsort((z, x))].tolist():
-        position = insertion_point(earlier, value)
-        count += len(earlier) - position
-        earlier.insert(position, value)
-    return count
 
 
 class Line(Record):
@@ -150,34 +58,61 @@ def passing_bablok(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) ->
     beyond the ordered slopes, both ends of both intervals are infinite.
     """
     _require_two_masses(x)
-    rising = kendall_sign(x, y) >= 0
-    angles = PairAngles(x, y, vertical=math.pi / 2 if rising else -math.pi / 2)
-    if angles.number == 0:
+    angles, rising = _pair_angles(x, y)
+    if not len(angles):
         raise UndefinedError("all points coincide, so no line is determined")
-    shift = angles.shift(rising=rising)
-    if (angles.number + shift) // 2 + 1 > angles.number or angles.number + shift < 1:
+    # angles steeper than 45 degrees against the line, and those at it
+    against = -math.pi / 4 if rising else math.pi / 4
+    below, not_above = (int(np.searchsorted(angles, against, side=side)) for side in ("left", "right"))
+    shift = below + not_above if rising else below + not_above - 2 * len(angles)  # twice that of the median's rank
+    if (len(angles) + shift) // 2 + 1 > len(angles) or len(angles) + shift < 1:
         raise UndefinedError("the shifted median lies beyond the slopes: the points neither rise nor fall")
-    slope = _slope_at_rank(angles, angles.number + shift)
+    slope = _slope_at_rank(angles, len(angles) + shift)
     if not abs(slope) < 1e15:
         raise UndefinedError("the middle slope is vertical")
     # slope ends beyond the slopes themselves, or among those of -1 (+1 for a falling line), say nothing of the line
-    n, against = len(x), -math.pi / 4 if rising else math.pi / 4
+    n = len(x)
     reach = math.floor(float(ndtri(0.5 + 0.5 * confidence)) * math.sqrt(n * (n - 1) * (2 * n + 5) / 18) + 0.5)
-    low, high = angles.number - reach + shift, angles.number + reach + shift
-    least = 2 * (angles.below(against, inclusive=True) - angles.below(against, inclusive=False)) + 1
+    low, high = len(angles) - reach + shift, len(angles) + reach + shift
     slopes = intercepts = (-math.inf, math.inf)
-    if (low + 1) // 2 >= least and (high + 1) // 2 <= angles.number - (high % 2 == 0):
+    if (low + 1) // 2 >= 2 * (not_above - below) + 1 and (high + 1) // 2 <= len(angles) - (high % 2 == 0):
         slopes = _slope_at_rank(angles, low), _slope_at_rank(angles, high)
         if all(abs(end) < 1e15 for end in slopes):
             intercepts = float(np.median(y - slopes[1] * x)), float(np.median(y - slopes[0] * x))
     return Line(float(np.median(y - slope * x)), slope, n, stated=(intercepts, slopes))
 
 
-def _slope_at_rank(angles: PairAngles, twice_rank: int) -> float:
-    """The slope at rank (twice + 1) / 2: one ordered angle, or the middle of two."""
+_AT_ONCE = 256  #: Masses whose pairs with all earlier ones are listed at a time: 10,000 masses have 50 million pairs.
+
+
+def _pair_angles(x: FloatArray, y: FloatArray) -> tuple[FloatArray, bool]:
+    """Ascending angles of all pairs of points that do not coincide, and True if Kendall's tau is 0 or more."""
+    angles, tau, number = list[FloatArray](), 0.0, np.arange(len(x))
+    for start in range(0, len(x), _AT_ONCE):
+        later, earlier = np.nonzero(number[start : start + _AT_ONCE, None] > number)
+        later += start
+        dx, dy = _difference(x[later], x[earlier]), _difference(y[later], y[earlier])
+        tau += float(np.sign(x[later] - x[earlier]) @ np.sign(y[later] - y[earlier]))
+        distinct = (dx != 0) | (dy != 0)
+        dx, dy = dx[distinct], dy[distinct]
+        angles.append(np.where(dx == 0, np.nan, np.arctan(dy / np.where(dx == 0, 1.0, dx))))
+    ordered = np.concatenate(angles)
+    ordered[np.isnan(ordered)] = math.pi / 2 if tau >= 0 else -math.pi / 2
+    ordered.sort()
+    return ordered, tau >= 0
+
+
+def _difference(a: FloatArray, b: FloatArray) -> FloatArray:
+    """a - b, 0 where it is rounding."""
+    difference = a - b
+    return np.where(np.abs(difference) < EQUAL * (np.abs(a) + np.abs(b)) / 2, 0.0, difference)
+
+
+def _slope_at_rank(angles: FloatArray, twice_rank: int) -> float:
+    """The slope at rank (twice + 1) / 2, counted from 1: one ordered angle, or the middle of two."""
     rank = (twice_rank + 1) // 2
-    first = angles.ranked(rank)
-    return math.tan(first if twice_rank % 2 else (first + angles.ranked(rank + 1)) / 2)
+    first = float(angles[rank - 1])
+    return math.tan(first if twice_rank % 2 else (first + float(angles[rank])) / 2)
 
 
 # --- Straight lines between two methods: least squares, Deming and weighted Deming regression.

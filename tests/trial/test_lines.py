@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tactile_bayes.trial import lines as pair_angles
+from tactile_bayes.trial import lines
 from tactile_bayes.trial.figures import UndefinedError
 from tactile_bayes.trial.lines import (
     deming,
@@ -185,43 +185,25 @@ def test_exchanging_the_methods_inverts_passing_and_babloks_line(seed: int) -> N
     assert other.stated[1] == pytest.approx(tuple(1 / end for end in reversed(one.stated[1])))
 
 
-@pytest.mark.parametrize("falling", [False, True])
-@pytest.mark.parametrize("digits", [None, 1, 0])
-def test_counting_pairs_finds_what_listing_them_finds(
-    digits: int | None, falling: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("digits", [None, 0])
+def test_pairs_listed_in_parts_are_all_pairs(digits: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
     x, y = cloud(9, 240, digits=digits)
-    y = 100 - y if falling else y
-    listed = passing_bablok(x, y)
-    monkeypatch.setattr(pair_angles, "MOST_LISTED", 10)
-    counted = passing_bablok(x, y)
-    # in tenths, differences are not exact: listing sees slopes beside -1 where counting sees -1 itself
-    near = 2e-3 if digits == 1 else 1e-8
-    assert counted.slope == pytest.approx(listed.slope, rel=near)
-    assert counted.stated[1] == pytest.approx(listed.stated[1], rel=near)
-    assert counted.stated[0] == pytest.approx(listed.stated[0], rel=20 * near)
-
-
-def test_inversions_by_brute_force() -> None:
-    rng = np.random.default_rng(10)
-    for n in (1, 2, 3, 17, 64, 65):
-        rank = rng.permutation(n)
-        expected = sum(a > b for a, b in combinations(rank.tolist(), 2))
-        assert pair_angles._count_inversions(np.arange(n), rank, ties=False) == expected
-        with_ties = sum(a >= b for a, b in combinations((rank // 2).tolist(), 2))
-        assert pair_angles._count_inversions(np.arange(n), rank // 2, ties=True) == with_ties
+    whole = passing_bablok(x, y)
+    monkeypatch.setattr(lines, "_AT_ONCE", 7)
+    assert passing_bablok(x, y) == whole
+    angles, _ = lines._pair_angles(x, y)
+    pairs = [(b - a, d - c) for (a, c), (b, d) in combinations(zip(x, y, strict=True), 2) if (a, c) != (b, d)]
+    expected = sorted(math.pi / 2 if dx == 0 else math.atan(dy / dx) for dx, dy in pairs)
+    assert angles == pytest.approx(expected, abs=1e-14)
 
 
 @pytest.mark.parametrize("digits", [None, 0])
-def test_kendalls_sign_is_scipys(digits: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    for limit in (pair_angles.MOST_LISTED, 5):
-        monkeypatch.setattr(pair_angles, "MOST_LISTED", limit)
-        for seed in range(6):
-            rng = np.random.default_rng(seed)
-            x, y = rng.normal(0, 3, (2, 30))
-            if digits is not None:
-                x, y = np.round(x), np.round(y)
-            assert pair_angles.kendall_sign(x, y) == np.sign(stats.kendalltau(x, y).statistic)
+def test_a_line_rises_where_kendalls_tau_is_not_negative(digits: int | None) -> None:
+    for seed in range(6):
+        x, y = np.random.default_rng(seed).normal(0, 3, (2, 30))
+        if digits is not None:
+            x, y = np.round(x), np.round(y)
+        assert lines._pair_angles(x, y)[1] == (stats.kendalltau(x, y).statistic >= 0)
 
 
 FITS = {
