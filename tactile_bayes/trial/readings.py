@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -369,9 +370,16 @@ def _visits_around_excision(
     first_row = {name: i for i, reading in reversed(rows) if (name := _visit(reading)) is not None}
     days = {}
     for name in first_row:
-        stated_days = [reading.day for _, reading in rows if _visit(reading) == name and reading.day is not None]
-        days[name] = max(stated_days, default=day_of(name))
+        stated = {reading.day: i for i, reading in rows if _visit(reading) == name and reading.day is not None}
+        days[name] = max(stated, default=day_of(name))
+        if excised is not None and stated and min(stated) <= excised < max(stated):
+            problem = f"is {max(stated)}, after excision on {excised}, and visit {name} has readings before it"
+            way_out = "correct the date, or give readings after excision a visit of their own"
+            raise fault(stated[max(stated)], "date", problem, way_out=way_out)
     after = {name for name, day in days.items() if excised is not None and day is not None and day > excised}
+    numbers = _numbers(days) or {}
+    first_after = min((numbers[name] for name in after & numbers.keys()), default=math.inf)
+    after |= {name for name, number in numbers.items() if number > first_after and days[name] is None}
     before = {name: day for name, day in days.items() if name not in after}
     if after and not before:
         first = min(after, key=lambda name: first_row[name])
@@ -386,7 +394,7 @@ def _visits_around_excision(
         problem = f"{names} of one mass do not say which was first"
         way_out = "give each reading its date, or number the visits in order of time"
         raise fault(max(first_row[name] for name in before), "visit", problem, way_out=way_out)
-    _check_dates(order, before, first_row, fault=fault)
+    _check_dates(days if numbers else before, first_row, fault=fault)
     return order, after
 
 
@@ -403,12 +411,10 @@ def _check_visits_named(rows: Sequence[Row], *, fault: CellFault) -> None:
             raise fault(i, "visit", problem, way_out="give every reading of the mass its visit")
 
 
-def _check_dates(
-    order: Sequence[str], days: Mapping[str, date | None], first_row: Mapping[str, int], *, fault: CellFault
-) -> None:
+def _check_dates(days: Mapping[str, date | None], first_row: Mapping[str, int], *, fault: CellFault) -> None:
     """Refuse dates that contradict the visits' numbers."""
-    numbers = _numbers(order) or {}
-    dated = {name: day for name in order if (day := days[name]) is not None and name in numbers}
+    numbers = _numbers(days) or {}
+    dated = {name: day for name, day in days.items() if day is not None and name in numbers}
     for earlier, later in pairwise(sorted(dated, key=lambda name: numbers[name])):
         if dated[later] < dated[earlier]:
             problem = f"visit {later} is of {dated[later]}, before visit {earlier} of {dated[earlier]}"

@@ -95,6 +95,27 @@ def test_an_excision_before_every_visit_is_refused() -> None:
         kept(reading("1", 16.0, MARCH), reading("2", 22.0, MAY), excised=JAN)
 
 
+def test_a_visit_numbered_after_one_that_follows_excision_follows_it_too() -> None:
+    rows = (reading("1", 16.0, JAN), reading("2", 5.0, MAY), reading("3", 4.0))
+    sizes, other = kept(*rows, excised=MARCH)
+    assert sizes == [16.0]
+    assert (other.earlier, other.later) == (0, 2)
+    assert kept(*rows, excised=None)[0] == [4.0]  # control: where nothing is known to follow it, the last is analysed
+
+
+def test_a_visit_with_readings_on_both_sides_of_excision_is_refused_at_the_later_one() -> None:
+    rows = (reading("1", 18.0, JAN), reading("2", 16.0, JAN), reading("2", 5.0, MAY))
+    for some in (rows, rows[1:]):
+        with pytest.raises(BadDataError, match=f"row {len(some) - 1}, column date: is 2026-05-10, after excision on"):
+            kept(*some, excised=MARCH)
+    assert kept(*rows, excised=MAY)[0] == [16.0, 5.0]
+
+
+def test_a_date_after_excision_that_contradicts_the_visits_numbers_is_refused() -> None:
+    with pytest.raises(BadDataError, match="visit 2 is of 2026-01-10, before visit 1 of 2026-05-10"):
+        kept(reading("1", 16.0, MAY), reading("2", 22.0, JAN), excised=MARCH)
+
+
 def test_visits_are_ordered_by_dates_numbers_or_codes_that_are_dates() -> None:
     assert visits_in_order({"V10": None, "V9": None}) == ["V9", "V10"]
     assert visits_in_order({"2026-03-01": None, "2025-12-31": None}) == ["2025-12-31", "2026-03-01"]
