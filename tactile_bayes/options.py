@@ -232,6 +232,7 @@ class PlanErrors(Options):
     tactile_bias: Annotated[float, Meta(ge=-3, le=3), "Mean of ln(size / ex vivo)."] = 0.02
     mass_sd: Annotated[float, Meta(ge=0, le=3), "SD of ln size shared by a mass's maps."] = 0.18
     map_sd: Annotated[float, Meta(ge=0, le=3), "SD of ln size of single maps."] = 0.15
+    tactile_miss: Annotated[float, Meta(ge=0, le=1), "Share of masses that the tactile maps miss."] = 0.0
     other_bias: Annotated[float, Meta(ge=-3, le=3), "Mean of ln(size / ex vivo) of the modality compared with."] = -0.08
     other_sd: Annotated[float, Meta(ge=0, le=3), "SD of ln size of the modality compared with."] = 0.40
     other_miss: Annotated[float, Meta(ge=0, le=1), "Share of masses that the modality compared with misses."] = 0.04

@@ -33,6 +33,7 @@ class PlanCase(Record, kw_only=True):
     tactile_bias: float
     mass_sd: float
     map_sd: float
+    tactile_miss: float
     other_bias: float
     other_sd: float
     other_miss: float
@@ -143,6 +144,7 @@ def first_guess(case: PlanCase, aim: Aim, target: float) -> int:
     tactile = np.abs(np.exp(shared + rng.normal(0, case.map_sd, (case.maps, n))).mean(axis=0) - 1)
     other = np.abs(np.expm1(rng.normal(case.other_bias, case.other_sd, n)))
     other[rng.random(n) < case.other_miss] = 1.0
+    tactile[rng.random(n) < case.tactile_miss] = 1.0
     z = float(ndtri(1 - LEVEL / 2))
     if aim == "precision":
         if tactile.std() <= 1e-9:
@@ -215,6 +217,7 @@ def _simulated_trial(case: PlanCase, number: int) -> tuple[float, ...]:
     other = ex_vivo * np.exp(rng.normal(case.other_bias, case.other_sd, n))
     other[rng.random(n) < case.other_miss] = 0.0
     tactile = ex_vivo * np.exp(shared + rng.normal(0, case.map_sd, (case.maps, n))).mean(axis=0)
+    tactile[rng.random(n) < case.tactile_miss] = 0.0
     tactile_sizes, other_sizes = _sizes("tactile", ex_vivo, tactile), _sizes("other", ex_vivo, other)
     difference = np.abs(tactile / ex_vivo - 1) - np.abs(other / ex_vivo - 1)
     p = sign_flip(difference, seed=number, flips=FLIPS)
@@ -245,7 +248,7 @@ def _median(values: FloatArray) -> float | None:
 def pilot_errors(
     tactile: ModalitySizes, other: ModalitySizes, *, map_sd: float | None = None
 ) -> dict[str, float] | None:
-    """Errors of a pilot trial: bias, SDs between and within masses, share missed.
+    """Errors of a pilot trial: bias, SDs between and within masses, shares missed.
 
     `map_sd`, of single maps, is estimated from the pilot's replicates if None. Without replicates it cannot be told
     from ``mass_sd``, and both are left out. None when a modality detected fewer than 3 masses.
@@ -255,6 +258,7 @@ def pilot_errors(
         return None
     errors = {
         "tactile_bias": float(tactile_errors.mean()),
+        "tactile_miss": 1 - len(tactile_errors) / len(tactile.size_mm),
         "other_bias": float(other_errors.mean()),
         "other_sd": float(other_errors.std(ddof=1)),
         "other_miss": 1 - len(other_errors) / len(other.size_mm),

@@ -116,6 +116,30 @@ def test_a_pilot_gives_the_errors() -> None:
     assert errors["other_miss"] == pytest.approx(1 / 25)
 
 
+def test_masses_that_the_pilots_maps_missed_are_missed_in_the_plan(tmp_path: Path) -> None:
+    """A third missed: the tactile error is a third of 100 % and two thirds of that of the masses found."""
+    lines = (DEMO / "trial.csv").read_text().splitlines()
+    missed = {f"S{i:02d}" for i in range(1, 9)}
+    blind = [
+        ",".join([*line.split(",")[:4], "", "not_detected", "", "", "", *line.split(",")[9:]])
+        if line.split(",")[0] in missed and ",tactile," in line
+        else line
+        for line in lines
+    ]
+    (tmp_path / "trial.csv").write_text("\n".join(blind) + "\n")
+    tables = {"pilot": tmp_path / "trial.csv", "excision": DEMO / "excision.csv"}
+    share = 9 / 25  # of these eight patients one has two masses
+    planned = tb.plan(**tables, patients=[24], maps=[3], trials=50)
+    found = tb.plan(**tables, patients=[24], maps=[3], trials=50, tactile_miss=0)
+    assert planned.report.errors["tactile_miss"] == pytest.approx(share)
+    (design,), (control,) = planned.report.designs, found.report.designs
+    assert design.tactile_percent == pytest.approx(100 * share + (1 - share) * control.tactile_percent, abs=2)
+    assert design.power == 0
+    assert control.power > 0.7
+    with pytest.raises(BadDataError, match="are not the smaller ones"):
+        tb.plan(**tables, power=0.8, trials=50)
+
+
 def test_masses_that_scatter_no_more_than_their_maps_are_told(tmp_path: Path) -> None:
     """The SD between masses is the root of a difference of variances, which chance makes negative."""
     readings, sizes = ["patient,mass,modality,replicate,size_mm,status"], ["patient,mass,ex_vivo_mm"]

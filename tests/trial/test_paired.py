@@ -192,6 +192,7 @@ def test_intervals_are_checked_and_half_intervals_found_out() -> None:
 
 def case(**changes: float) -> PlanCase:
     plain = {"patients": 24, "maps": 3, "tactile_bias": 0.0, "mass_sd": 0.1, "map_sd": 0.2, "other_bias": 0.0,
+             "tactile_miss": 0.0,
              "other_sd": 0.4, "other_miss": 0.0, "trials": 150, "seed": 1}  # fmt: skip
     return PlanCase(**(plain | changes))
 
@@ -212,9 +213,10 @@ def test_without_a_difference_power_is_the_tests_level() -> None:
 
 
 def test_errors_of_the_plan_are_the_expected_ones() -> None:
-    found = simulate_design(case(maps=1, patients=60, trials=200, other_miss=0.1))
+    found = simulate_design(case(maps=1, patients=60, trials=200, other_miss=0.1, tactile_miss=0.2))
     assert found.other_percent == pytest.approx(ErrorModel(0, 0.4, miss=0.1).true_mape_percent, rel=0.04)
-    assert found.tactile_percent == pytest.approx(ErrorModel(0, math.hypot(0.1, 0.2)).true_mape_percent, rel=0.04)
+    expected = ErrorModel(0, math.hypot(0.1, 0.2), miss=0.2).true_mape_percent
+    assert found.tactile_percent == pytest.approx(expected, rel=0.04)
 
 
 def test_a_pilot_gives_the_assumptions() -> None:
