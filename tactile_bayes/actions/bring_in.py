@@ -30,6 +30,7 @@ from tactile_bayes.report.map import describe_scan
 from tactile_bayes.scans import Scan
 from tactile_bayes.shell import progress_bar
 
+_LEAST_SPAN_MM: Final = 15.0  #: Range of the places along their longest axis: a stroke is longer.
 _SCAN_FILES: Final = ("poses", "head_geometry", "array_calibration", "landmarks")
 """Options of files beside the frames'; a later one stands for an earlier."""
 
@@ -170,8 +171,10 @@ def _lengths(scan: Scan) -> str:
     lever = float(np.linalg.norm(scan.head.scanhead_from_tracker[:3, 3]))
     sides = np.ptp(scan.poses.position_mm, axis=0)
     moved = " x ".join(f"{side:.0f}" for side in sides)
-    line = f"the sensor lies {lever:.3g} mm from the head, and moved by {moved} mm"
-    return f"{LEADS['check']}{line}: no breast is so large; check their unit" if sides.max() > MOST_SPAN_MM else line
+    turned = "" if np.ptp(scan.poses.quaternion_wxyz, axis=0).any() else " without turning"
+    line = f"the sensor lies {lever:.3g} mm from the head, and moved by {moved} mm{turned}"
+    odd = "no breast is so large" if sides.max() > MOST_SPAN_MM else "no breast is so small"
+    return line if _LEAST_SPAN_MM <= sides.max() <= MOST_SPAN_MM else f"{LEADS['check']}{line}: {odd}; check their unit"
 
 
 def _arrangement_lines(scan: Scan) -> list[str]:

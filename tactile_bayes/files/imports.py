@@ -243,6 +243,9 @@ def _arrange_poses(arrays: Arrays, stated: Stated, notes: list[str], findings: l
         if name in arrays and arrays[name].shape == (width, pose_count) and pose_count != width:
             arrays[name] = arrays[name].T
             notes.append(f"{name} of shape {(width, pose_count)} read along its columns")
+    if stated.pose_layout is None and (shape := np.shape(arrays.get("quaternion_wxyz", 0.0)))[1:] == (3,):
+        way_out = "give --pose-layout euler for degrees of azimuth, elevation, roll: about z, the new y, the new x"
+        raise BadDataError(f"quaternion_wxyz has shape {shape}", way_out=way_out)
     if "quaternion_wxyz" in arrays and stated.pose_layout in ("xyzw", "euler"):
         if stated.pose_layout == "euler" and np.abs(arrays["quaternion_wxyz"]).max() <= _TURN:
             text = f"angles lie within {_TURN:.1f} and are read as degrees"
@@ -464,7 +467,8 @@ def _check_numbers(arrays: Arrays) -> None:
     for name, array in arrays.items():
         if array.dtype.kind not in "iuf":
             what = "not an array of numbers (a cell, a table or text?)" if array.dtype.kind in "OV" else array.dtype
-            raise BadDataError(f"{name} is {what}", way_out="give real numbers")
+            way_out = "give s on one clock, as numbers" if name in _TIME_OPTIONS else "give real numbers"
+            raise BadDataError(f"{name} is {what}", way_out=way_out)
         if array.ndim == 0 and name in _OF_AXES:
             raise BadDataError(f"{name} is a single number", way_out="give an array")
         if 0 in array.shape:
@@ -514,6 +518,8 @@ def _check_clocks(arrays: Arrays) -> None:
     ends = []
     for name, (_, rate) in _TIME_OPTIONS.items():
         times = arrays[name]
+        if len(times) == 1 and name == "frame_time_s":
+            raise BadDataError("holds one frame", way_out="join a scan's frames in one file, one below the other")
         if len(times) > 1 and times[0] == times.min() == times.max():
             raise BadDataError(f"{name} is {times[0]:g} throughout", way_out="give its times, not a constant")
         if 2 * (repeats := int((np.diff(times) == 0).sum())) > len(times):
@@ -525,7 +531,7 @@ def _check_clocks(arrays: Arrays) -> None:
         what = f"frame_time_s ({a:.3f} to {b:.3f}) and pose_time_s ({c:.3f} to {d:.3f}) do not overlap"
         way_out = "give both on one clock: --pose-offset-s is added to the poses' times"
         hours = round((c - a) / 3600)
-        if hours and abs(c - a - 3600 * hours) < 60:
+        if 0 < abs(hours) <= 26 and abs(c - a - 3600 * hours) < 60:  # more is another clock
             way_out = f"{way_out}; is it {-3600 * hours}, of a time zone?"
         raise BadDataError(what, way_out=way_out)
 

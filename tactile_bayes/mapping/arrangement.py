@@ -202,7 +202,7 @@ class ArrangementCheck(Record, eq=False):
             return words, finding(
                 "frames_contradict",
                 "strokes over one place do not agree on what they felt there; size and place may be wrong",
-                "check the lever arm, both clocks, and that the breast lay still",
+                "check the lever arm, the unit of the positions, both clocks, and that the breast lay still",
                 "make sure that the breast lies still, and have the tracker's mounting and its clock checked",
             )
         if self.best is self.stated:

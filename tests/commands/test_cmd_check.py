@@ -66,9 +66,23 @@ def test_a_map_has_nothing_to_correct(tmp_path):
 
 def test_a_scan_in_another_unit_of_length_is_told_by_how_far_it_moved(tmp_path):
     arrays = arrays_of(tb.demo_scan())
-    np.savez(tmp_path / "far.npz", **arrays | {"position_mm": 100 * arrays["position_mm"]})
-    said = run_here("import", "far.npz", "-o", "far.mcap", cwd=tmp_path)
-    assert "no breast is so large; check their unit" in said.stdout
+    for factor, told in ((100.0, "no breast is so large"), (0.1, "no breast is so small")):
+        np.savez(tmp_path / "scan.npz", **arrays | {"position_mm": factor * arrays["position_mm"]})
+        said = run_here("import", "scan.npz", "-o", "scan.mcap", "--force", cwd=tmp_path)
+        assert f"{told}; check their unit" in said.stdout
+    assert "the unit of the positions" in said.stdout  # these frames contradict each other
+
+
+def test_a_scan_whose_rotations_are_all_the_same_is_told(tmp_path):
+    arrays = arrays_of(tb.demo_scan())
+    assert "without turning" not in run_import(arrays, tmp_path)
+    arrays["quaternion_wxyz"] = np.tile([1.0, 0, 0, 0], (len(arrays["pose_time_s"]), 1))
+    assert "mm without turning\n" in run_import(arrays, tmp_path)
+
+
+def run_import(arrays, folder):
+    np.savez(folder / "scan.npz", **arrays)
+    return run_here("import", "scan.npz", "-o", "scan.mcap", "--force", cwd=folder).stdout
 
 
 def test_a_scan_of_which_no_map_can_be_made_is_imported(tmp_path):

@@ -95,6 +95,7 @@ FAULTS: list[tuple[str, Callable[[Arrays], object], str]] = [
     ("time in ms", put("frame_time_s", lambda t: t * 1000), "frame_time_s steps by 5.*milliseconds"),
     ("two clocks", put("pose_time_s", lambda t: t + 100), r"do not overlap.*poses' times .options"),
     ("time zones", put("pose_time_s", lambda t: t + 7200), "do not overlap.*is it -7200, of a time zone"),
+    ("a date and none", put("pose_time_s", lambda t: t + 3600e5), r"do not overlap.*poses' times( .options.*)?$"),
     (
         "whole seconds",
         put("frame_time_s", lambda t: np.floor(t + 0.93)),

@@ -345,6 +345,10 @@ def turns_alone(a: Arrays) -> None:
     a["pose_matrix"] = np.tile(np.eye(3), (len(a.pop("quaternion_wxyz")), 1, 1))
 
 
+def first_frame_alone(a: Arrays) -> None:
+    a.update(frames=a["frames"][:1], frame_time_s=a["frame_time_s"][:1])
+
+
 FAULTS: list[tuple[str, Callable[[Arrays], Any], dict[str, Any], str]] = [
     ("NaN", nan("frames"), {"unit": "kPa"}, r"frames holds 26 values that are not finite \(first at \(3, 4, 0\)\)"),
     ("one count", lambda a: a.update(frames=3.0), {"unit": "kPa"}, "frames is a single number; give an array"),
@@ -358,6 +362,9 @@ FAULTS: list[tuple[str, Callable[[Arrays], Any], dict[str, Any], str]] = [
     ("ns", lambda a: a.update(frame_time_s=1e18 + a["frame_time_s"] * 1e9), {"unit": "kPa"}, "nano.*--time-unit ns"),
     ("still us", lambda a: a.update(frame_time_s=a["frame_time_s"] * 1e6), {"time_unit": "ms"}, "--time-unit us"),
     ("clocks", lambda a: a.update(pose_time_s=a["pose_time_s"] + 1e6), {"unit": "kPa"}, "overlap.*--pose-offset-s"),
+    ("times of the day", lambda a: a.update(frame_time_s=a["frame_time_s"].astype("M8[s]")), {}, "give s on one"),
+    ("one frame", first_frame_alone, {"unit": "kPa"}, "holds one frame; join a scan's frames"),
+    ("angles", lambda a: a.update(quaternion_wxyz=a["position_mm"]), {"unit": "kPa"}, "--pose-layout euler for de"),
     ("shape", dict.copy, {"unit": "kPa", "frame_shape": (26, 16)}, "16 x 26 taxels, not 26 x 16"),
     ("unknown", dict.copy, {"unit": "kPa", "arrays": {"count": "frames"}}, "'count' is no array.*mean counts"),
     ("not there", dict.copy, {"unit": "kPa", "arrays": {"counts": "P"}}, "has no array 'P' for counts; it has "),
