@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 from importlib import import_module
 from pathlib import Path
@@ -76,6 +77,29 @@ def test_figures_of_the_documents_keep_a_command_that_exists() -> None:
         "tests/fuzz/none.py",
     ]
     assert {path.name: missing(path.read_text(encoding="utf-8")) for path in TEXTS} == {p.name: [] for p in TEXTS}
+
+
+class _Parsed(Exception):  # noqa: N818 (no error: the command's words were taken)
+    pass
+
+
+def test_commands_of_the_pages_are_taken_as_printed(monkeypatch: pytest.MonkeyPatch) -> None:
+    parse = argparse.ArgumentParser.parse_known_args
+
+    def parsed(self: argparse.ArgumentParser, words: list[str], _: object = None) -> None:
+        raise _Parsed(parse(self, words)[1])
+
+    for way in ("parse_args", "parse_known_args"):
+        monkeypatch.setattr(argparse.ArgumentParser, way, parsed)
+    text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    commands = [re.sub(r"\s+", " ", one) for one in re.findall(r"`python -m validation ([^`]+)`", text)]
+    assert len(commands) > 10
+    for name, *words in map(str.split, commands):
+        with pytest.raises(_Parsed) as left:
+            import_module(f"validation.{name}").main(words)
+        assert left.value.args == ([],)
+    with pytest.raises(SystemExit):  # the control: a scan's folder is asked for
+        import_module("validation.known_scans").main([])
 
 
 def test_shares_have_their_exact_intervals() -> None:
