@@ -109,8 +109,7 @@ class TactileMap(Record, eq=False):
             view = getattr(self, name).view()
             view.flags.writeable = False
             set_fields(self, **{name: view})
-        infinite = np.isinf(self.mean)
-        if infinite.any() and (infinite & (self.count > 0)).any():
+        if (np.isinf(self.mean) & (self.count > 0)).any():
             raise BadDataError("mean holds infinite values", way_out="mark cells without data by count 0")
 
     @property

@@ -92,13 +92,11 @@ def _plateau(part: SelectedFrames, frames: IndexArray) -> tuple[int, int]:
 
     It is sought in a sample of the frames, and its readings are counted in all.
     """
-    if not len(frames):
-        return 0, 0
     good = np.flatnonzero(part.good_taxels)
     counts = part.scan.frames.counts.reshape(len(part.used), -1)
     end = part.scan.element_calibration.saturation_count
     sample = counts[frames[:: max(1, len(frames) // _SAMPLE_FRAMES)]][:, good]
-    histogram = np.bincount(sample.ravel(), minlength=4)
+    histogram = np.bincount(sample.ravel())
     histogram[end:] = 0
     present = np.flatnonzero(histogram)
     if len(present) < 4:
@@ -179,7 +177,7 @@ def _geometry(part: SelectedFrames) -> Iterator[tuple[str, float]]:
     if far_below and lowest > max(int(times[1:4].sum()), MOST_CUT * working.size):
         yield "cut_share", lowest / working.size
     yield from _weakest_lines(part, sample)
-    step = int(np.gcd.reduce(np.diff(present.astype(np.int64)))) if len(present) > 1 else 0
+    step = int(np.gcd.reduce(np.diff(present.astype(np.int64))))
     gain = float(np.median(part.scan.element_calibration.gain_kpa_per_count[part.good_taxels]))
     yield "count_share", step * gain / float(np.median(level))
 

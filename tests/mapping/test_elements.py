@@ -78,6 +78,15 @@ def test_a_taxel_that_sticks_for_a_moment_is_left_alone():
     assert find_faults(spoilt(lambda readings: readings.__setitem__(slice(20, 40), readings[20]))) == ()
 
 
+@pytest.mark.parametrize(("stretches", "faults"), [(1, []), (2, ["row 3 column 5 stuck"])])
+def test_a_taxel_that_sticks_in_a_twentieth_of_a_long_scan_is_left_out(stretches, faults):
+    """26 stretches of 32 frames: one is 4 %, two are 8 %."""
+    counts = np.tile(noisy_scan().frames.counts, (7, 1, 1))
+    counts[95 : 96 + 32 * stretches, 3, 5] = counts[95, 3, 5]
+    long = scans.with_counts(scans.make_scan(np.zeros((len(counts), 2))), counts)
+    assert [str(one) for one in find_faults(long)] == faults
+
+
 def test_an_edge_that_bears_nothing_is_no_single_fault():
     scan = noisy_scan()
     counts = scan.frames.counts.copy()

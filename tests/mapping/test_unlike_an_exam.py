@@ -16,10 +16,11 @@ from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import CANNOT_SHOW, BadDataError
+from tactile_bayes.findings import finding
 from tactile_bayes.geometry import rigid
 from tactile_bayes.mapping.arrangement import check_scan
 from tactile_bayes.mapping.build import build_map
-from tactile_bayes.mapping.plausibility import exam_findings, map_findings
+from tactile_bayes.mapping.plausibility import against_no_lump, exam_findings, map_findings
 from tactile_bayes.mapping.select import find_faults
 from tactile_bayes.posterior.verdict import no_verdict
 from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
@@ -358,8 +359,19 @@ def test_a_map_that_dips_where_a_lump_would_rise_is_told_and_a_slope_is_not() ->
     """Readings that fall where pressure rises, as of a white that is zero or an inverting amplifier."""
     assert any("the map dips by" in text for text in grid(lambda v: 2.0 - v))
     assert any("the map dips by" in text for text in grid(lambda v: 10.0 * (2.0 - v)))
+    assert grid(lambda v: v - 0.6 * np.roll(v - 1.0, 15, axis=1)) == []  # beside a higher rise
     slope = 0.5 * np.mgrid[-25:26, -25:26][1] / 51
     assert grid(lambda v: v + slope) == grid(lambda v: v * (1.0 + slope)) == []
+
+
+@pytest.mark.parametrize("kind", ["late_poses", "wrong_arrangement"])
+def test_another_arrangement_hides_a_lump_where_it_is_sure(kind: str) -> None:
+    """Odds from 10^4 on, below which the same finding is a caution."""
+    flat = grid_map(1.0 + 0.02 * np.random.default_rng(3).standard_normal((51, 51)), count=40)
+    told = finding(kind, "not as stated")
+    for odds, against in ((9e3, []), (1.1e4, [told])):
+        one = replace(flat, findings=(told,), quality={**flat.quality, "arrangement_log_odds": np.log(odds)})
+        assert against_no_lump(one) == against
 
 
 def test_a_grid_that_could_not_show_a_lump_is_reported() -> None:
@@ -378,6 +390,7 @@ def test_a_dead_line_and_a_plateau_are_told_and_a_lump_is_not() -> None:
     assert any("51 of 2601 cells lie far outside the rest" in text for text in grid(dead))
     assert any("cells stand at the highest value" in text for text in grid(lambda v: np.minimum(v, 1.2)))
     assert grid(lambda v: v) == []
+    assert grid(lambda v: np.minimum(v, np.sort(v, axis=None)[-20])) == []  # 20 cells at the top: too few to tell
     assert grid(lambda v: np.rint(100 * v)) == []  # whole numbers, as an image has them
 
 
@@ -419,5 +432,6 @@ def test_a_line_that_dies_on_the_way_is_left_out(value: int) -> None:
     ids=["psi", "mmHg", "Pa", "counts are kPa", "left-aligned"],
 )
 def test_a_refusal_asks_about_the_unit_that_fits(made: Callable[[Scan], Scan], asked: str) -> None:
-    with pytest.raises(BadDataError, match=asked.removeprefix("or ")):
-        build_map(made(scan()))
+    for refuses in (build_map, check_scan):
+        with pytest.raises(BadDataError, match=asked.removeprefix("or ")):
+            refuses(made(scan()))

@@ -199,6 +199,23 @@ def test_missing_strokes_are_counted_from_the_centre(reached: int) -> None:
     assert coverage_shortfall(grid_map(bump_values()), (0.0, 0.0), reach_mm=12.0) == {}
 
 
+@pytest.mark.parametrize(
+    ("covered", "short_mm"),
+    [
+        (lambda _, y: y % 2 == 0, 0.0),  # half of the breadth
+        (lambda _, y: y % 8 == 0, 6.5),  # an eighth
+        (lambda x, y: abs(y) > x, 6.5),  # only what belongs to the sectors above and below
+        (lambda _, y: abs(y) <= 1, 5.5),  # three cells: a quarter up to the sixth column
+    ],
+)
+def test_a_flank_ends_where_less_than_a_quarter_of_its_breadth_is_covered(covered, short_mm: float) -> None:
+    """Covered in full up to 5.5 mm and beyond that in part; no other side falls short."""
+    x, y = np.arange(51) - 25, np.arange(51)[:, None] - 25
+    values = np.where((x <= 5) | covered(x, y), bump_values(), np.nan)
+    short = coverage_shortfall(grid_map(values), (0.0, 0.0), reach_mm=12.0)
+    assert short == ({"the picture's right (+x)": short_mm} if short_mm else {})
+
+
 def test_a_posterior_as_wide_as_its_prior_is_no_answer() -> None:
     rng = np.random.default_rng(2)
     vague = np.exp(np.log(5.0) + 0.8 * rng.standard_normal(4000))
