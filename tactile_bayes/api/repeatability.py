@@ -65,7 +65,7 @@ def exams_of_campaign(folder: Path) -> list[ExamFolder]:
             raise BadDataError(f"has no column {missing}", way_out=_AGAIN, path=str(table)) from None
         of_mass = mass_name(patient=patient, visit=visit, mass=mass)
         name = exam_name(of_mass, replicate)
-        if Path(name).name != name:
+        if Path(name).name != name or not name.isprintable():
             raise BadDataError(f"names an exam {name!r}", way_out=_AGAIN, path=str(table))
         exams.append(ExamFolder(name, of_mass, f"{patient} {mass}", folder / EXAMS / name))
     return exams

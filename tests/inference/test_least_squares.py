@@ -91,6 +91,22 @@ def test_a_model_that_breaks_down_is_not_called_converged() -> None:
     assert not fit.converged
 
 
+def test_no_step_leaps_onto_a_plateau_where_the_sum_of_squares_is_lower_but_has_no_slope() -> None:
+    """The full step from there is 20 long; the minimum is known, as the logistic function has an inverse."""
+
+    def logistic(theta: np.ndarray) -> np.ndarray:
+        return 1.0 / (1.0 + np.exp(-theta)) * np.ones(3)
+
+    share, start = 0.9, np.array([-3.0])
+    slope = np.exp(3.0) / (1.0 + np.exp(3.0)) ** 2
+    leap = start + (share - logistic(start)[0]) / slope
+    assert leap > 14.0
+    assert abs(logistic(leap)[0] - share) < abs(logistic(start)[0] - share)  # the sum of squares would not stop it
+    fit = fit_least_squares(logistic, start, data=np.full(3, share), weight=np.ones(3), scale=np.ones(1))
+    assert fit.converged
+    np.testing.assert_allclose(fit.theta, np.log(share / (1.0 - share)), rtol=1e-6)
+
+
 def test_the_jacobian_is_that_of_calculus() -> None:
     x = np.linspace(0, 2, 7)
     theta = np.array([1.3, -0.7])
