@@ -18,7 +18,14 @@ from tactile_bayes.posterior.bump import Detection
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.posterior.verdict import WeighedRise, coverage_shortfall, no_bump_reason, shape_fault, stroke_advice
+from tactile_bayes.posterior.verdict import (
+    WeighedRise,
+    coverage_shortfall,
+    no_bump_reason,
+    shape_fault,
+    stroke_advice,
+    undetected_reason,
+)
 from tactile_bayes.posterior.white import AT_RIM, Candidate, fit_bump
 
 FIELD = SamplerSettings(background="free", noise="field")
@@ -216,12 +223,36 @@ def test_a_flank_ends_where_less_than_a_quarter_of_its_breadth_is_covered(covere
     assert short == ({"the picture's right (+x)": short_mm} if short_mm else {})
 
 
+@pytest.mark.parametrize(
+    ("detection", "features", "code", "reason"),
+    [
+        (Detection(50.0, ridge="a ridge along x"), (4.0, 0.0, 0.0, 0.0, 0.0), "ridge", "is rather a ridge along x"),
+        (Detection(-1.0), (0.0, 2.0, 2.0, 1.0, 0.0), "undetected", "errors of the map explain what rises"),
+        (Detection(50.0), (4.0, np.log(6.0), 0.0, 0.0, 0.0), "ridge", "is a ridge, not a lump"),
+        (Detection(50.0), (4.0, np.log(2.0), 2.0, 0.9, 0.0), "undetected", "is wider or less covered than a lump"),
+    ],
+    ids=["a ridge by its evidence", "errors", "a ridge by its shape", "too wide"],
+)
+def test_what_rises_and_is_no_lump_is_told_by_its_strongest_fault(
+    detection: Detection, features: tuple[float, ...], code: str, reason: str
+) -> None:
+    answer = undetected_reason(WeighedRise(detection, (3.0, -4.0), features), where="here")
+    assert answer.code == code
+    assert reason in answer.reason
+    assert answer.reason.startswith("no lump found here: ")
+    assert ("feel whether it is a rib" in answer.advice) == (code == "ridge")
+    # errors are at no place: nothing to look at is named
+    assert (answer.about_mm == (3.0, -4.0)) == ("near (3.0, -4.0) mm" in answer.reason) == ("errors" not in reason)
+
+
 def test_a_posterior_as_wide_as_its_prior_is_no_answer() -> None:
     rng = np.random.default_rng(2)
     vague = np.exp(np.log(5.0) + 0.8 * rng.standard_normal(4000))
     fault = shape_fault(vague, vague, cell_mm=1.0, prior=BumpPrior())
     assert fault is not None
     assert fault.code == "prior"
+    of_prior = 0.8 / np.hypot(BumpPrior().log_width_sd, BumpPrior().log_ratio_sd)
+    assert f"the SD of its widths is {of_prior:.2f} of what it is without a map (at most 0.5)" in fault.reason
     sharp = np.exp(np.log(5.0) + 0.2 * rng.standard_normal(4000))
     assert shape_fault(sharp, sharp, cell_mm=1.0, prior=BumpPrior()) is None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,14 +20,14 @@ import tactile_bayes as tb
 from tactile_bayes.api.estimating import estimate_one
 from tactile_bayes.api.settings import Settings
 from tactile_bayes.api.sized import SizeEstimate
-from tactile_bayes.declarations import replace
+from tactile_bayes.declarations import as_dict, replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.findings import finding
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior import masses as masses_module
 from tactile_bayes.posterior.bump import Detection
-from tactile_bayes.posterior.draw import ModalBump, SamplerSettings
+from tactile_bayes.posterior.draw import MapPosterior, ModalBump, SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.masses import by_evidence, with_masses
 from tactile_bayes.posterior.result import Estimate, Mass, Rise
@@ -348,3 +349,65 @@ def test_a_rise_whose_centre_lies_off_the_map_is_a_mass_without_a_size(monkeypat
     assert places(masses) == [(0, 8), (0, 31)]
     assert masses[1].estimate.code == "window"
     assert masses[1].estimate.reason == "its centre lies off the map"
+
+
+def measured(amplitude: float, place: tuple[float, float]) -> Estimate:
+    """An estimate with a size whose draws are all alike."""
+    bump = ModalBump(amplitude, *place, 4.0, 4.0)
+    nothing = {name: np.zeros((1, 3)) for name in ("background", "noise_sd", "angle_rad")}
+    draws = {name: np.full((1, 3), value) for name, value in as_dict(bump).items()}
+    size = SizePosterior(*[np.full((1, 3), 12.0)] * 2, {}, 0, np.zeros(3))
+    drawn = MapPosterior(**nothing | draws)
+    return Estimate("estimate", "", detection=Detection(40.0), size=size, bump=bump, map_posterior=drawn)
+
+
+@pytest.mark.parametrize(("share", "sized"), [(0.2, True), (0.1, False)])
+def test_a_lump_that_only_the_map_less_a_much_higher_one_shows_has_no_size(
+    monkeypatch: pytest.MonkeyPatch, share: float, sized: bool
+) -> None:
+    """The misfit of the first is some per cent of it: beside one 13 times as high a size was twice too large."""
+    two, first, rise = scene(narrow=0.2), measured(0.3, WIDE), Rise(0.3 * share, *NARROW, 4.0, 4.0, 33.0, 0.99)
+    monkeypatch.setattr(masses_module, "other_rises", lambda *_: ((rise,), ()))
+    unseen = Estimate("no_estimate", "errors explain it", code="undetected")
+
+    def by_the_rest(a_map: TactileMap, _: SamplerSettings) -> Estimate:
+        return unseen if a_map is two else measured(rise.amplitude, NARROW)
+
+    masses = with_masses(two, first, SamplerSettings(), by_the_rest).masses
+    assert places(masses) == [WIDE, NARROW]
+    assert (masses[1].largest_mm is not None) == sized
+    told = "it stands in the flank of a lump more than 7 times as high, which hides its shape"
+    assert masses[1].estimate.reason == ("" if sized else told)
+    # what the whole map shows by itself has a size, however low
+    masses = with_masses(two, first, SamplerSettings(), lambda *_: measured(rise.amplitude, NARROW)).masses
+    assert masses[1].largest_mm == 12.0
+
+
+def test_a_second_lump_of_the_window_that_nothing_shows_by_itself_is_listed_without_a_size(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    two, rise = scene(narrow=0.2), Rise(0.1, *NARROW, 4.0, 4.0, 33.0, 0.99)
+    unseen = Estimate("no_estimate", "errors explain it", code="undetected")
+    beside, elsewhere = "_second_lump_of_scene", "other_rises"
+    for of_scene, of_map, reasons in (
+        ([rise], ((), ()), ["", "the map shows it beside the first lump only, not by itself"]),
+        ([], ((rise,), ()), [""]),
+        ([], ((), (rise,)), ["", "the map shows too little of it for a size"]),
+    ):
+        monkeypatch.setattr(masses_module, beside, lambda *_, found=of_scene: found)
+        monkeypatch.setattr(masses_module, elsewhere, lambda *_, found=of_map: found)
+        masses = with_masses(two, measured(0.3, WIDE), SamplerSettings(), lambda *_: unseen).masses
+        assert [one.estimate.reason for one in masses] == reasons
+
+
+@pytest.mark.parametrize(("share", "listed"), [(0.2, True), (0.1, False)])
+def test_a_rise_without_proof_is_listed_only_where_it_has_a_share_of_the_lumps_height(
+    monkeypatch: pytest.MonkeyPatch, share: float, listed: bool
+) -> None:
+    two, lump = scene(narrow=0.2), measured(0.3, WIDE)
+    found = measured(0.3 * share, NARROW).bump
+    for log_odds, expected in ((1.0, listed), (10.0, True)):  # the control: with proof it needs none
+        assessed = SimpleNamespace(detection=Detection(log_odds), bump=lambda: found)
+        monkeypatch.setattr(masses_module, "search", lambda *_, one=assessed: ((), one))
+        rise, proven = masses_module._assessed_rise(NARROW, two, two, lump, SamplerSettings())
+        assert ((rise is not None), proven) == (expected, log_odds > 5.0)
