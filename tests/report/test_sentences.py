@@ -1,0 +1,194 @@
+"""Rows and sentences of reports, of numbers that are known: no figure stands in another's row, and none is left out."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from plain_reports import estimate_report, pooled_report
+from posterior_maps import bump_map
+
+from tactile_bayes.campaigns.report import repeatability_words
+from tactile_bayes.declarations import replace
+from tactile_bayes.files.reports import AnotherExam, EstimateReport, Interval, MassReport, Place, Point, PooledMap
+from tactile_bayes.inference.draws import Quantity
+from tactile_bayes.posterior.fit import Structure
+from tactile_bayes.posterior.result import Sensitivity
+from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report.compare import Doubling, GrowthRate, Rate, Visit, VisitMap, _rate_words, _visit_line
+from tactile_bayes.report.estimate_document import mass_lines, odds_text, sensitivity_line
+from tactile_bayes.report.estimate_text import _lump_line, decimals, size_table
+from tactile_bayes.report.exam_words import ShownExam, _scan_rows, exam_map, size_sentences
+from tactile_bayes.report.map import _notes
+from tactile_bayes.report.pooled import pooled_text
+from tactile_bayes.report.trial import ratio_line
+from tactile_bayes.trial.accuracy import ModalityRatio
+
+
+def around(median: float, half: float) -> Quantity:
+    ends = {"low": median - half, "high": median + half}
+    return Quantity(median=median, mean=median, sd=half / 2, mc_error=0.01, probability=0.95, kind="eti", **ends)
+
+
+def sized(**more: Any) -> EstimateReport:
+    """Sizes with two intervals: 20 and 11 mm for exams of patients, 21 and 12 mm for exams that are alike."""
+    another = AnotherExam(0.15, around(20.0, 5.0), around(11.0, 4.0), {})
+    sizes = {"max_size_mm": around(21.0, 2.0), "min_size_mm": around(12.0, 1.0)}
+    told = {"diagnostics": {"between_map_sd": 0.025}, "status": "estimate"}
+    return estimate_report(**sizes | told | {"another_exam": another} | more)
+
+
+def test_the_table_has_each_interval_in_the_row_of_what_it_supposes() -> None:
+    rows = [" ".join(row.split()) for row in size_table(sized(amplitude=around(0.4, 0.1)))]
+    assert rows == [
+        "median 95 % interval (equal-tailed)",
+        "largest size 20.0 15.0 to 25.0 mm",
+        "smallest size 11.0 7.0 to 15.0 mm",
+        "if exams differ by 2.5 % 21.0 19.0 to 23.0 mm",
+        "amplitude 0.40 0.30 to 0.50",
+    ]
+    plain = [" ".join(row.split()) for row in size_table(sized(another_exam=None))]
+    assert plain[1:] == ["largest size 21.0 19.0 to 23.0 mm", "smallest size 12.0 11.0 to 13.0 mm"]
+
+
+@pytest.mark.parametrize("error", [0.004, 0.04, 0.2, 0.4])
+def test_the_last_decimal_is_of_the_size_of_the_monte_carlo_error(error: float) -> None:
+    unit = 10.0 ** -decimals(error)
+    assert unit <= 2.0 * error < 10.0 * unit
+    assert (decimals(0.0), decimals(1e-9), decimals(0.004, most=1), decimals(30.0)) == (3, 3, 1, 0)
+
+
+def test_a_page_has_both_intervals_and_the_smallest_size_of_the_one_that_leads() -> None:
+    exam = ShownExam((exam_map(bump_map(), sized(), side="left"),), None, ())
+    told = " ".join(size_sentences(exam, around(20.0, 5.0)))
+    assert "between 15.0 and 25.0 mm, if exams of a lump differ by 15 %, as those of patients did" in told
+    assert "differed by 2.5 % only, as those of simulated bodies do, it would lie between 19.0 and 23.0 mm" in told
+    assert "The smallest diameter is about 11.0 mm (95 %: 7.0 to 15.0 mm)." in told
+    alike = replace(exam.maps[0], report=sized(diagnostics={}))
+    assert "If exams of one lump did not differ, " in " ".join(
+        size_sentences(replace(exam, maps=(alike,)), around(20.0, 5.0))
+    )
+
+
+def test_a_page_and_a_map_say_why_frames_and_taxels_are_left_out() -> None:
+    left_out = {"dropped_low": 1.0, "dropped_high": 2.0, "dropped_no_pose": 3.0, "dropped_elements": 4.0}
+    counted = replace(bump_map(), quality={"frames_total": 60.0, "frames_used": 50.0} | left_out)
+    masked = replace(counted, masked_taxels=("(3, 7)", "(4, 0)"))
+    rows = dict(_scan_rows(masked))
+    assert rows["sensor frames"] == (
+        "50 of 60 used; left out: 1 pressed too lightly, 2 pressed too hard, 3 without the tracker's position, "
+        "4 with too few working sensor points"
+    )
+    assert rows["sensor points"] == "2 left out as faulty"
+    assert rows["landmarks"] == "none touched"
+    assert "no gaps inside" in rows["covered"]
+    assert "taxels left out: (3, 7); (4, 0)" in _notes(masked)
+    assert not any("left out" in one for one in _notes(counted))
+
+
+def test_the_short_report_says_where_the_lump_lies_in_the_best_axes_there_are() -> None:
+    place = {"centre_mm": Point(around(-9.8, 1.0), around(2.0, 1.0)), "detected_probability": 0.97}
+    assert _lump_line(sized(**place)) == "Probability of a lump 0.97, at (-9.8, 2.0) mm on the map."
+    patient = {"centre_patient_mm": Point(around(50.0, 1.0), around(-12.0, 1.0))}
+    assert "50" in _lump_line(sized(**place | patient))
+
+
+@pytest.mark.parametrize(
+    ("size", "reason", "outcome"),
+    [
+        (around(8.0, 1.0), "", "largest size 8.0 mm (95 % interval 7.0 to 9.0 mm)"),
+        (None, "its centre lies off the map", "no size: its centre lies off the map"),
+    ],
+)
+def test_a_mass_besides_has_its_size_or_the_reason_for_none(size: Quantity | None, reason: str, outcome: str) -> None:
+    nothing = dict.fromkeys(("centre_patient_mm", "amplitude", "d_x_mm", "d_y_mm", "angle_deg", "another_exam"))
+    first, second = (
+        MassReport(
+            number=number,
+            reported=number == 1,
+            centre_mm=Place(x, 0.0),
+            max_size_mm=size,
+            min_size_mm=size,
+            detected_probability=0.97,
+            reason=reason,
+            reason_code="",
+            advice="",
+            **nothing,
+        )
+        for number, x in ((1, 0.0), (2, 40.0))
+    )
+    (line,) = mass_lines((first, second))
+    assert line.startswith("Mass 2 at (40.0, 0.0) mm, 40 mm from mass 1")
+    assert line.endswith(f": {outcome}; probability of a lump 0.97.")
+
+
+def test_odds_have_no_more_digits_than_they_are_worth() -> None:
+    told = [odds_text(Structure("tilt", odds, False, False)) for odds in (0.001, 0.5, 12.3, 5000.0)]
+    assert told == ["below 0.01 to 1", "0.5 to 1", "12 to 1", "above 1000 to 1"]
+    assert odds_text(Structure("rib", 0.2, False, False, odds_are_a_bound=True)) == "at most 0.2 to 1"
+
+
+def test_a_result_that_hardly_follows_the_prior_is_told_by_how_little() -> None:
+    still = Sensitivity(median={"max_size_mm": 0.001}, ends={"max_size_mm": -0.002}, pareto_k=0.1)
+    assert "twice as wide would move the largest size by less than 0.005 SD" in sensitivity_line(still)
+    moved = sensitivity_line(replace(still, median={"max_size_mm": -0.3}, ends={"max_size_mm": 0.4}))
+    assert "the median of the largest size by -0.30 SD and its interval's ends by up to +0.40 SD" in moved
+
+
+@pytest.mark.parametrize(
+    ("times", "words"),
+    [
+        (Doubling(None, None, None), ""),
+        (Doubling(None, 90.0, None), ", doubling in no less than 90 days"),
+        (Doubling(120.0, 90.0, 200.0), ", doubling in 120 days (90 to 200)"),
+    ],
+)
+def test_a_growth_rate_has_the_doubling_time_that_its_interval_holds(times: Doubling, words: str) -> None:
+    rate = GrowthRate(100.0, Rate(0.5, -0.1, 1.1, 0.95), times)
+    assert _rate_words(rate) == f"+0.50 % of the volume a day (-0.10 to +1.10 %){words}"
+
+
+def test_a_visit_has_its_day_maps_and_size() -> None:
+    one = VisitMap("a.nc", "estimate", "", 1.0)
+    none = replace(one, status="no_estimate")
+    visit = Visit(2, 91.0, around(14.0, 2.0), None, (one, none))
+    assert _visit_line(visit) == "Visit 2 (1 of 2 maps, day 91): largest size 14.0 mm (12.0 to 16.0, 95 % interval)"
+    assert _visit_line(replace(visit, max_size_mm=None, maps=(none,))) == "Visit 2 (1 map, day 91): no size"
+
+
+def test_a_mass_without_a_common_size_has_the_size_of_each_map_and_the_reason() -> None:
+    first = PooledMap(
+        map="a.nc",
+        mass=(1, 2),
+        status="estimate",
+        reason="",
+        detected_probability=0.97,
+        max_size_mm=Interval(14.0, 12.0, 16.0, 0.95),
+        outlying=False,
+    )
+    second = replace(first, map="b.nc", mass=(), status="no_estimate", reason="an odd map", max_size_mm=None)
+    lines = pooled_text(pooled_report(reason="too few maps", maps=(first, second))).splitlines()
+    assert lines == [
+        "1. a.nc: 14.0 (12.0 to 16.0) mm alone, if exams repeat as simulated ones do  (mass 1 of 2 on this map)",
+        "2. b.nc: no estimate (an odd map)",
+        "No estimate: too few maps.",
+        RESEARCH_USE,
+    ]
+
+
+def test_a_modality_without_common_masses_has_no_ratio_and_says_why() -> None:
+    none = ModalityRatio(0, 0, None, None, None, None, {})
+    assert ratio_line("us", none) == (
+        "us: no MAPE ratio: no mass was looked for by both this modality and the tactile one"
+    )
+
+
+def test_a_campaign_without_a_learned_spread_says_what_its_intervals_suppose() -> None:
+    campaign: Any = SimpleNamespace(repeatability=None, not_learned="2 masses have repeats, 5 are needed")
+    assert repeatability_words(campaign) == (
+        "spread between exams not learned: 2 masses have repeats, 5 are needed; intervals in the tables are for exams "
+        "as alike as simulated ones"
+    )
+    campaign.not_learned = ""
+    assert repeatability_words(campaign) == ""
