@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -152,6 +153,18 @@ def test_masses_that_scatter_no_more_than_their_maps_are_told(tmp_path: Path) ->
     pilot = ("--pilot", tmp_path / "trial.csv", "--excision", tmp_path / "excision.csv")
     assert "its mass sd is taken as 0" in plan(*SMALL, *pilot).stdout
     assert "its mass sd is taken as 0" not in plan(*SMALL, *pilot, "--mass-sd", 0).stdout
+
+
+def test_a_pilot_of_single_readings_needs_the_sd_of_maps(tmp_path: Path) -> None:
+    """Without repeats the SD within masses cannot be told from that between them."""
+    once = [line for line in (DEMO / "trial.csv").read_text().splitlines() if not re.search(r",tactile,[^1],", line)]
+    (tmp_path / "trial.csv").write_text("\n".join(once) + "\n")
+    pilot = ("--pilot", tmp_path / "trial.csv", "--excision", DEMO / "excision.csv")
+    error = plan(*SMALL, *pilot).exception
+    assert isinstance(error, BadDataError)
+    assert "no mass with two tactile readings, so the SD of single maps is unknown; give it with --map-sd" in str(error)
+    given = json.loads(plan(*SMALL, *pilot, "--map-sd", 0.15, "--json").stdout)["errors"]
+    assert given["map_sd"] == 0.15
 
 
 def test_refusals_name_the_way_out() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from in_process import run_here
+from matplotlib.figure import Figure
 from posterior_maps import bump_map
 
 import tactile_bayes as tb
@@ -16,6 +17,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.files.posterior_nc import read_posterior
 from tactile_bayes.posterior.result import fitted_cells
 from tactile_bayes.report.figure_file import exam_title
+from tactile_bayes.report.map import draw_panel, map_figure
 
 NOISE_SD = 0.004
 SLOPE = 0.003
@@ -111,3 +113,15 @@ def test_a_posterior_file_names_its_scans_for_the_titles_of_its_figures(tmp_path
     done = run_here("diagnose", "post.nc", "--corner", "corner.svg", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "P07 (post), method laplace" in (tmp_path / "corner.svg").read_text()
+
+
+@pytest.mark.parametrize("landmarks", [False, True])
+def test_a_panel_of_the_fit_has_the_sides_of_the_maps_picture(landmarks: bool) -> None:
+    """With landmarks the patient's left is on the right; a grid without any is drawn as its file reads."""
+    tactile_map = replace(bump_map(), patient_from_plane=np.eye(4) if landmarks else None)
+    panel, whole = Figure().subplots(), map_figure(tactile_map, None).axes[0]
+    draw_panel(panel, tactile_map.mean, tactile_map, label="values", title="Data")
+    assert panel.xaxis_inverted() == whole.xaxis_inverted() == landmarks
+    assert panel.yaxis_inverted() == whole.yaxis_inverted() == (not landmarks)
+    assert panel.get_xlabel() == whole.get_xlabel()
+    assert panel.get_title(loc="left") == "Data"

@@ -212,6 +212,26 @@ def test_a_bump_that_no_cell_shows_overflows_nothing() -> None:
     assert factor[0] < factor[1]
 
 
+@pytest.mark.parametrize(
+    ("width", "offset", "clear", "apart"),
+    [
+        (4.0, 9.0, True, True),  # two widths of the bump and of the rib are 8 mm
+        (4.0, 7.0, False, True),  # it runs under the bump, as wide as it
+        (10.0, 9.0, False, False),  # the bump lies in the flank of so wide a rib: the curvature of the level
+        (10.0, 21.0, True, True),
+        (2.0, 7.0, False, True),  # of a narrow rib the bump's width counts
+    ],
+)
+def test_a_rib_is_clear_of_a_bump_by_the_larger_of_their_widths(
+    width: float, offset: float, clear: bool, apart: bool
+) -> None:
+    scene = Scene("round", extra="rib")
+    at = {"u": np.log(4.0), "x": 13.0, "y": -7.0, "angle": np.pi, "offset": -3.0 - offset, "w2": np.log(width)}
+    theta = np.array([[at[name] for name in scene.names]])
+    assert scene.rib_clear(theta, (10.0, 5.0)) == clear
+    assert scene.rib_apart(theta, (10.0, 5.0)) == apart
+
+
 def test_a_negative_amplitude_has_density_zero() -> None:
     target = target_of(cells_of(noise(3), amplitude=-0.3))
     assert target(START[None])[0] == -np.inf
