@@ -98,10 +98,10 @@ def frame_rows(runs: int) -> list[dict[str, Any]]:
         lumps = placed[:count]
         seconds = least_cpu(lambda lumps=lumps: sweep(head, lumps), runs)
         rows.append({"what": f"frame, {count} lumps", "ms": 1000 * seconds / 60})
-    face = head_face(Head())
-    rows_, columns = face.sensing.shape
+    surface, sensing = head_face(Head())
+    rows_, columns = sensing.shape
     compliance = taxel_compliance(geometry.layers, rows=rows_, columns=columns, pitch_mm=1.5)
-    height = -face.surface_mm[..., 2].ravel()
+    height = -surface[..., 2].ravel()
     plain = least_cpu(lambda: solve_contact(ContactStiffness.of(compliance), height, mean_kpa=9.5), runs)
     return [*rows, {"what": "frame, inverse anew", "ms": 1000 * plain}]
 

@@ -182,11 +182,11 @@ class _Model:
             )
             stages.append((_kept_head(scene.head, stiffened), replace(change, x_mm=lump.x_mm, y_mm=lump.y_mm)))
         grid = None if physics.varying is None else _grid(scene, layers, physics.varying, stages[0][0])
-        face = stages[0][0].face
+        head = stages[0][0]
         shear: tuple[FloatArray, ...] = ()
         if physics.friction:
-            shear = _shear_sinking(layers, face.sensing.shape, face.pitch_mm)
-        return cls(physics, stages, [float(one) for one in kpa], grid, shear, _near(face.surface_mm))
+            shear = _shear_sinking(layers, head.sensing.shape, head.pitch_mm)
+        return cls(physics, stages, [float(one) for one in kpa], grid, shear, _near(head.surface_mm))
 
     def frame(
         self, rotation: FloatArray, origin: FloatArray, *, kpa: float, way: float, before: Contact | None
@@ -196,7 +196,7 @@ class _Model:
         if self.grid is not None:
             head = self._on_grid(origin)
         lumps = [replace(one, x_mm=one.x_mm + self.physics.lag_mm * way) for one in lumps]
-        head = replace(head, face=replace(head.face, surface_mm=self._surface(head, way * rotation[0], before)))
+        head = replace(head, surface_mm=self._surface(head, way * rotation[0], before))
 
         def solved(head: SolidHead, lumps: Sequence[Any]) -> tuple[FloatArray, Contact]:
             touching = None if before is None else before.touching
@@ -242,7 +242,7 @@ class _Model:
 
         `way` is the direction of the stroke in the head's axes.
         """
-        surface = head.face.surface_mm.copy()
+        surface = head.surface_mm.copy()
         surface[..., 2] -= (surface[..., 0] ** 2 + surface[..., 1] ** 2) / (2.0 * self.physics.skin_radius_mm)
         if self.shear and before is not None:
             along_x, along_y = (one @ before.pressure_kpa for one in self.shear)
@@ -273,12 +273,12 @@ def _scaled_head(head: SolidHead, root: FloatArray) -> SolidHead:
 
 def _grid(scene: Scene, layers: Layers, varying: VaryingLayers, head: SolidHead) -> tuple[FloatArray, list[SolidHead]]:
     """The head at places 5 mm apart along the direction in which the layers vary; yaw is the strokes' own."""
-    lump, strokes, face = scene.solid_lumps[0], scene.strokes, head.face
+    lump, strokes = scene.solid_lumps[0], scene.strokes
     angle = varying.angle_rad
     reach = np.hypot(strokes.half_length_mm, strokes.lines * strokes.spacing_mm / 2) + 2 * strokes.wander_mm + _GRID_MM
     place: FloatArray = np.arange(-reach, reach + _GRID_MM, _GRID_MM)
     turned = angle - np.radians(strokes.yaw_deg)
-    across = face.surface_mm[..., 0].ravel() * np.cos(turned) + face.surface_mm[..., 1].ravel() * np.sin(turned)
+    across = head.surface_mm[..., 0].ravel() * np.cos(turned) + head.surface_mm[..., 1].ravel() * np.sin(turned)
     middle = (across[:, None] + across[None, :]) / 2
     lump_at = lump.x_mm * np.cos(angle) + lump.y_mm * np.sin(angle)
     own = layers.fat_mm if varying.layer == "fat" else layers.thickness_mm
@@ -293,9 +293,9 @@ def _grid(scene: Scene, layers: Layers, varying: VaryingLayers, head: SolidHead)
 
     ends = depth(np.linspace(place[0] + across.min(), place[-1] + across.max(), 400))
     table_mm = np.geomspace(ends.min() * 0.999, ends.max() * 1.001, _DEPTHS)
-    rows, columns = face.sensing.shape
+    rows, columns = head.sensing.shape
     table = np.stack(
-        [_by_offset(_with_depth(layers, varying.layer, one), rows, columns, face.pitch_mm) for one in table_mm]
+        [_by_offset(_with_depth(layers, varying.layer, one), rows, columns, head.pitch_mm) for one in table_mm]
     )
     row, column = np.divmod(np.arange(rows * columns), columns)
     offset = np.abs(row[:, None] - row) * columns + np.abs(column[:, None] - column)
@@ -305,7 +305,7 @@ def _grid(scene: Scene, layers: Layers, varying: VaryingLayers, head: SolidHead)
         below = np.minimum(index.astype(np.int64), _DEPTHS - 2)
         share = index - below
         compliance = (1.0 - share) * table[below, offset] + share * table[below + 1, offset]
-        heads.append(SolidHead(face, ContactStiffness.of(compliance)))
+        heads.append(replace(head, plain=ContactStiffness.of(compliance)))
     return place, heads
 
 

@@ -394,23 +394,12 @@ def square_mean(
     return np.asarray((2.0 * function(np.minimum(r_mm, last_mm)) + 5.0 * ring) / 7.0)
 
 
-class HeadFace(Record, eq=False):
-    """Squares of the face of a rigid head that can touch the skin: the taxels and the rounded rim around them.
+def head_face(head: Head) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Squares of a head's face, taxels and those with centres on its rim, and the mask of the taxels; see `SolidHead`.
 
-    Without a rim a flat end would press like a punch, with a singular pressure along its edge.
-    """
-
-    surface_mm: FloatArray
-    """(rows, columns, 3) array: Centres in `scanhead`: origin at the apex of the face, z into the tissue."""
-    sensing: NDArray[np.bool_]  #: (rows, columns) bool array: True for taxels, False for the rim.
-    pitch_mm: float
-
-
-def head_face(head: Head) -> HeadFace:
-    """Taxels of a head, and squares whose centres lie on its rim: a quarter round, none with shoulders inside.
-
-    Across the head the face is a `scene.HeadSection` with its shoulders outside; along it the rim is tangent to a
-    line.
+    Across the head the face is a `scene.HeadSection` with its shoulders outside; along it the rim, a quarter round, is
+    tangent to a line. Without a rim a flat end would press like a punch, with a singular pressure along its edge; with
+    shoulders inside there is none.
     """
     rows, columns, pitch_mm, radius_mm = head.rows, head.columns, head.pitch_mm, head.radius_mm
     rim_mm = 0.0 if head.shoulder_mm > 0 else head.rim_mm
@@ -425,7 +414,7 @@ def head_face(head: Head) -> HeadFace:
     sensing = np.zeros(surface.shape[:2], dtype=bool)
     sensing[rim_x : rim_x + rows, rim_y : rim_y + columns] = True
     surface[sensing] = head.surface_mm().reshape(-1, 3)
-    return HeadFace(surface, sensing, pitch_mm)
+    return surface, sensing
 
 
 def _rim_squares(half_mm: float, reach_mm: float, pitch_mm: float) -> int:
@@ -434,9 +423,12 @@ def _rim_squares(half_mm: float, reach_mm: float, pitch_mm: float) -> int:
 
 
 class SolidHead(Record, eq=False):
-    """A rigid head on a layered body; made by `solid_head`."""
+    """A rigid head on a layered body, by the squares of its face that can touch the skin; made by `solid_head`."""
 
-    face: HeadFace  #: Squares that can touch.
+    surface_mm: FloatArray
+    """(rows, columns, 3) array: Centres in `scanhead`: origin at the apex of the face, z into the tissue."""
+    sensing: NDArray[np.bool_]  #: (rows, columns) bool array: True for taxels, False for the rim around them.
+    pitch_mm: float
     plain: ContactStiffness  #: Stiffness of the skin under the face, without lumps.
 
     def frame(
@@ -453,11 +445,11 @@ class SolidHead(Record, eq=False):
         ``p_plane = rotation @ p_scanhead + (*at_mm[:2], contact.depth_mm)``: z = 0 is the undisturbed skin, and only
         the depth adapts. `mean_kpa` is over the taxels; `touching`, a neighbouring frame's, is the solver's start.
         """
-        place, sensing = self.face.surface_mm.reshape(-1, 3) @ rotation.T, self.face.sensing
+        place, sensing = self.surface_mm.reshape(-1, 3) @ rotation.T, self.sensing
         parts, signs = [np.zeros((len(place), 0))], []
         for lump in lumps:
             values, sign = lump.vectors(place[:, 0] + at_mm[0], place[:, 1] + at_mm[1])
-            values = values * self.face.pitch_mm  # a pressure of 1 kPa on a square is a force of pitch^2
+            values = values * self.pitch_mm  # a pressure of 1 kPa on a square is a force of pitch^2
             weight = np.einsum("nk,nk->k", values, values)
             counts = weight > _LEAST_WEIGHT * float(np.diag(self.plain.plain).mean()) ** -1
             parts.append(values[:, counts])
@@ -471,10 +463,10 @@ class SolidHead(Record, eq=False):
 
 def solid_head(head: Head, layers: Layers) -> SolidHead:
     """Head on a body without lumps; its curvature and tilt enter as heights over flat skin (Johnson 1985, ch. 4)."""
-    face = head_face(head)
-    rows, columns = face.sensing.shape
-    compliance = taxel_compliance(layers, rows=rows, columns=columns, pitch_mm=face.pitch_mm)
-    return SolidHead(face, ContactStiffness.of(compliance))
+    surface, sensing = head_face(head)
+    rows, columns = sensing.shape
+    compliance = taxel_compliance(layers, rows=rows, columns=columns, pitch_mm=head.pitch_mm)
+    return SolidHead(surface, sensing, head.pitch_mm, ContactStiffness.of(compliance))
 
 
 # --- Three-dimensional scans of lumps of tissue in a layered body, solved frame by frame.

@@ -17,10 +17,8 @@ from tactile_bayes.forward.contact import ContactStiffness, solve_contact
 from tactile_bayes.forward.mesh import LumpGeometry, MeshSize
 from tactile_bayes.forward.scene import Head, rotation_from_vector
 from tactile_bayes.forward.simulate import (
-    HeadFace,
     SkinPerturbation,
     SolidHead,
-    head_face,
     skin_perturbation,
     solid_head,
 )
@@ -32,8 +30,8 @@ HEAD = Head(pitch_mm=PITCH, radius_mm=35.0, rim_mm=3.0)
 
 
 @cache
-def face() -> HeadFace:
-    return head_face(HEAD)
+def face() -> SolidHead:
+    return on_fat(15.0)
 
 
 @cache

@@ -136,13 +136,13 @@ def test_a_head_that_is_not_pressed_hangs_over_the_skin() -> None:
 
 def test_the_rim_is_tangent_to_the_face_and_feels_nothing() -> None:
     taxels = Head().surface_mm()
-    face = head_face(Head(radius_mm=35.0, rim_mm=3.0))
-    assert face.sensing.shape == (18, 30)
-    np.testing.assert_array_equal(face.surface_mm[face.sensing].reshape(16, 26, 3), taxels)
-    across = face.surface_mm[:, 15]
+    surface, sensing = head_face(Head(radius_mm=35.0, rim_mm=3.0))
+    assert sensing.shape == (18, 30)
+    np.testing.assert_array_equal(surface[sensing].reshape(16, 26, 3), taxels)
+    across = surface[:, 15]
     centre = 32.0 * np.array([12 / 35, np.sqrt(1 - (12 / 35) ** 2)]) - [0.0, 35.0]
     assert np.hypot(*(across[-1, [0, 2]] - centre)) == pytest.approx(3.0)
-    along = face.surface_mm[9, :, 2] - face.surface_mm[9, 15, 2]
+    along = surface[9, :, 2] - surface[9, 15, 2]
     np.testing.assert_allclose(along[:3], [np.sqrt(9 - 2.25**2) - 3, np.sqrt(9 - 0.75**2) - 3, 0.0], atol=1e-12)
-    bare = head_face(Head(radius_mm=35.0, rim_mm=0.0))
-    np.testing.assert_array_equal(bare.surface_mm, taxels)
+    bare, _ = head_face(Head(radius_mm=35.0, rim_mm=0.0))
+    np.testing.assert_array_equal(bare, taxels)

@@ -174,8 +174,8 @@ def test_a_rib_is_a_row_of_balls_and_no_lump() -> None:
 
 
 def test_shoulders_inside_the_array_leave_no_rim() -> None:
-    assert head_face(Head()).sensing.shape == (18, 30)
-    assert head_face(Head(shoulder_mm=3.0)).sensing.shape == (16, 26)
+    assert head_face(Head())[1].shape == (18, 30)
+    assert head_face(Head(shoulder_mm=3.0))[1].shape == (16, 26)
 
 
 LUMP = "[[lump]]\nd_mm = 15\n"
