@@ -34,6 +34,7 @@ from tactile_bayes.posterior.white import (
     LEAST_COVERED_SHARE,
     LEAST_WIDTH_IN_CELLS,
     MOST_AXIS_RATIO,
+    NARROW,
     Candidate,
 )
 from tactile_bayes.posterior.window import Problem, Window, independent_variance
@@ -325,7 +326,7 @@ def rim_fault(tactile_map: TactileMap, bump: ModalBump, *, radius_mm: float) -> 
         side, millimetres = max(shortfall.items(), key=lambda one: one[1])
         return f"{AT_RIM} (with a sigma of {wide:.3g} mm its flank to {side} is {millimetres:.0f} mm short)"
     if narrow < LEAST_WIDTH_IN_CELLS * cell:
-        return f"narrower than a cell (sigma {narrow:.2g} mm on {cell:g} mm cells): not resolved"
+        return NARROW.format(narrow, cell)
     typical = float(np.median(tactile_map.count[tactile_map.covered]))
     cells = window_cells(tactile_map, centre_mm, radius_mm=max(1.5 * wide, cell))
     typical_here = float(np.median(cells.count))
@@ -375,7 +376,7 @@ def width_fault(x: float, y: float, *, cell_mm: float, margin: float) -> Abstent
     """Reason for widths beyond the cells' or a ridge's limit by a factor of `margin`; else None."""
     wide, narrow = max(x, y), min(x, y)
     if narrow * margin < LEAST_WIDTH_IN_CELLS * cell_mm:
-        return _coarse(f"narrower than a cell (sigma {narrow:.2g} mm on {cell_mm:g} mm cells): not resolved", narrow)
+        return _coarse(NARROW.format(narrow, cell_mm), narrow)
     if wide / narrow > MOST_AXIS_RATIO * margin:
         reason = f"what rises is a ridge, not a lump (sigma {wide:.3g} by {narrow:.3g} mm)"
         return Abstention("ridge", reason, FEEL_A_RIB, FEEL_A_RIB_ON_PAPER)

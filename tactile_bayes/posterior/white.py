@@ -111,6 +111,7 @@ PATIENCE = 16  #: Iterations: a clear lump takes 4 to 15.
 OUTGROWN = "wider than the window measures"
 AT_RIM = "at the rim of the map"
 FEW_CELLS = "too few covered cells"
+NARROW = "narrower than a cell (sigma {:.2g} mm on {:g} mm cells): not resolved"
 FIT_TOLERANCE = 1e-8
 """Tolerance of the least squares, in units of `Bump.step_scale`: far below any error that a map has."""
 PLACE_TOLERANCE = 1e-2  #: The same where least squares only gives a start for the posterior's mode.
@@ -345,7 +346,7 @@ def lump_fault(result: BumpFit, options: SamplerSettings) -> str:
     if not np.isfinite(result.covariance).all():
         return "its cells do not determine a bump"
     if narrow < LEAST_WIDTH_IN_CELLS * cell:
-        return f"narrower than a cell (sigma {narrow:.2g} mm on {cell:g} mm cells): not resolved"
+        return NARROW.format(narrow, cell)
     if wide > WIDEST_IN_RADII * options.fit_radius_mm:
         return f"{OUTGROWN} (sigma {wide:.3g} mm, at most {WIDEST_IN_RADII * options.fit_radius_mm:g} mm)"
     if result.covered_share < LEAST_COVERED_SHARE:

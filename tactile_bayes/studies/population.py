@@ -151,7 +151,6 @@ def _log_uniform(ends: Range, rng: np.random.Generator) -> float:
 
 UNKNOWNS = ("depth_mm", "stiffness_ratio", "seat", "fat_kpa", "gland_ratio", "thickness_mm")
 SHAPE_COVARIANCE = ("var_log_a", "cov_log_a_p", "cov_log_a_q", "var_p", "cov_p_q", "var_q")
-FIT_RADIUS_MM = 20.0
 _DRAWS_SEED = 1
 BODY_COLUMNS = names_of(BodyPrior)
 
