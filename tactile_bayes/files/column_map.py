@@ -66,10 +66,15 @@ class ColumnMap(Record):
     excision: ExcisionColumns | None = None
 
     def __post_init__(self) -> None:
-        named = Counter(name for one in self.reading or () for name in (one.size, one.low, one.high) if name)
+        readings = self.reading or ()
+        named = Counter(f"column {name}" for one in readings for name in (one.size, one.low, one.high) if name)
+        named.update(f"replicate {one.replicate} of {one.modality}" for one in readings)
         for name, times in named.items():
             if times > 1:
-                raise BadDataError(f"column {name} is named {times} times", way_out="give each reading its own")
+                raise BadDataError(f"{name} is named {times} times", way_out="give each reading its own")
+        for word in self.not_detected:
+            if word in self.not_done:
+                raise BadDataError(f"{word} stands in not_detected and in not_done", way_out="leave it in one of them")
 
     def key_columns(self) -> list[str]:
         return [self.patient] if self.mass is None else [self.patient, self.mass]
