@@ -168,7 +168,10 @@ def fit_modalities(
         if len(detected.patients) < MIN_PATIENTS:
             left_out[name] = f"needs at least {MIN_PATIENTS} patients with a mass found (has {len(detected.patients)})"
             continue
-        posteriors[name] = _posterior(sizes, caliper, sample=sample, rng=rng)
+        try:
+            posteriors[name] = _posterior(sizes, caliper, sample=sample, rng=rng)
+        except NotConvergedError as error:
+            left_out[name] = str(error).partition(";")[0]
     return posteriors, left_out
 
 

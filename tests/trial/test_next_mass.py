@@ -117,6 +117,23 @@ def test_few_patients_get_no_model_and_are_told_why() -> None:
     assert found.probability_less_error == {}
 
 
+@pytest.mark.long
+def test_a_modality_whose_draws_do_not_converge_has_no_model_and_the_others_have() -> None:
+    made, ex_vivo = readings(2, patients=12)
+    made = [one for one in made if one.modality == "tactile"]
+    exact = [Reading(key, "exact", 1, "detected", size_mm=mm) for key, mm in ex_vivo.items()]
+
+    def failing(log_density, centre, covariance, *, rng):
+        if abs(centre[0]) < 1e-9:  # the bias of sizes that are those after excision
+            raise NotConvergedError("not converged after 9 steps: R-hat 2; run longer (max_steps = 99)")
+        return quick(log_density, centre, covariance, rng=rng)
+
+    found = next_mass(Trial([*made, *exact], ex_vivo), sample=failing, rng=np.random.default_rng(0))
+    assert found.left_out == {"exact": "not converged after 9 steps: R-hat 2"}
+    assert [*found.modalities] == ["tactile"]
+    assert found.lines()[-1] == "exact: no model: not converged after 9 steps: R-hat 2"
+
+
 def test_a_total_sd_splits_into_its_parts() -> None:
     theta = np.array([[0.0, 1.0, math.log(0.3), math.log(0.25 / 0.75), math.log(0.6 / 0.4)]])
     rho2, tau2, omega2 = (float(one[0]) for one in variances(theta))
