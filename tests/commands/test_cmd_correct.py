@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas
 import pytest
+from campaign_files import thinned, write
 from in_process import run_here
 
 import tactile_bayes as tb
@@ -143,7 +144,9 @@ def test_python_gives_what_the_file_holds(folder: Path) -> None:
 @pytest.mark.long
 def test_map_files_are_estimated_and_keep_the_depth_of_fat(folder: Path) -> None:
     for i in range(3):
-        shutil.copyfile(folder / "demo.nc", folder / f"m{i}.nc")
+        write(folder / f"m{i}.mcap", thinned(i, 3))
+        assert run_here("map", f"m{i}.mcap", "-o", f"m{i}.nc", cwd=folder).returncode == 0
+    mapped = (folder / "m1.nc").read_bytes()
     rows = "".join(f"m{i}.nc,15,1.0,100,centred\n" for i in range(3))
     (folder / "maps.csv").write_text("file,d_mm,depth_ratio,stiffness_ratio,seat\n" + rows)
     words = ("calibrate", "size", "maps.csv", "--correct", "solid", "-o", "maps.json", "--force")
@@ -155,10 +158,14 @@ def test_map_files_are_estimated_and_keep_the_depth_of_fat(folder: Path) -> None
     assert {"table", "size_calibration", "map_1", "map_2", "map_3"} <= {one["role"] for one in inputs}
     over = run_here(*words[:-2], "m1.nc", "--force", cwd=folder)
     assert over.returncode == 2
-    assert (folder / "m1.nc").read_bytes() == (folder / "demo.nc").read_bytes()
+    assert (folder / "m1.nc").read_bytes() == mapped
     refused = run_here(*words, "--noise", "field", cwd=folder)
     assert refused.returncode == 2
     assert "map files state how they were made" in refused.stderr
+    shutil.copyfile(folder / "m0.nc", folder / "copy.nc")
+    (folder / "maps.csv").write_text("file,d_mm,phantom\nm0.nc,15,A\nm1.nc,15,B\nm2.nc,15,C\ncopy.nc,15,D\n")
+    refused = run_here(*words, cwd=folder)  # a copied map would count as another lump
+    assert "line 5, column file: is of the same scan as m0.nc; list each scan once" in refused.stderr
     # one lump mapped three times is one lump
     (folder / "maps.csv").write_text("file,d_mm,phantom\n" + "".join(f"m{i}.nc,15,A\n" for i in range(3)))
     refused = run_here(*words, cwd=folder)
