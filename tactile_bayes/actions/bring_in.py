@@ -31,6 +31,7 @@ from tactile_bayes.scans import Scan
 from tactile_bayes.shell import progress_bar
 
 _LEAST_SPAN_MM: Final = 15.0  #: Range of the places along their longest axis: a stroke is longer.
+_LEVERS_MM: Final = (10, 300)  #: Lengths of lever arms; 0 is that of poses of the head.
 _SCAN_FILES: Final = ("poses", "head_geometry", "array_calibration", "landmarks")
 """Options of files beside the frames'; a later one stands for an earlier."""
 
@@ -173,8 +174,13 @@ def _lengths(scan: Scan) -> str:
     moved = " x ".join(f"{side:.0f}" for side in sides)
     turned = "" if np.ptp(scan.poses.quaternion_wxyz, axis=0).any() else " without turning"
     line = f"the sensor lies {lever:.3g} mm from the head, and moved by {moved} mm{turned}"
-    odd = "no breast is so large" if sides.max() > MOST_SPAN_MM else "no breast is so small"
-    return line if _LEAST_SPAN_MM <= sides.max() <= MOST_SPAN_MM else f"{LEADS['check']}{line}: {odd}; check their unit"
+    if sides.max() > MOST_SPAN_MM or sides.max() < _LEAST_SPAN_MM:
+        odd = f"no breast is so {'large' if sides.max() > MOST_SPAN_MM else 'small'}"
+    elif lever and not _LEVERS_MM[0] <= lever <= _LEVERS_MM[1]:
+        odd = f"most sensors lie {_LEVERS_MM[0]} to {_LEVERS_MM[1]} mm from it"
+    else:
+        return line
+    return f"{LEADS['check']}{line}: {odd}; check their unit"
 
 
 def _arrangement_lines(scan: Scan) -> list[str]:

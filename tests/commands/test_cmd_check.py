@@ -73,6 +73,14 @@ def test_a_scan_in_another_unit_of_length_is_told_by_how_far_it_moved(tmp_path):
     assert "the unit of the positions" in said.stdout  # these frames contradict each other
 
 
+def test_a_lever_arm_in_cm_is_told_and_none_at_all_is_not(tmp_path):
+    arrays = arrays_of(tb.demo_scan())
+    lever = arrays["array_from_tracker"].copy()
+    for factor, told in ((1.0, False), (0.1, True), (0.0, False)):
+        arrays["array_from_tracker"] = lever * np.array([[1.0, 1, 1, factor]] * 3 + [[1.0] * 4])
+        assert ("To check: the sensor lies 5.59 mm" in run_import(arrays, tmp_path)) is told
+
+
 def test_a_scan_whose_rotations_are_all_the_same_is_told(tmp_path):
     arrays = arrays_of(tb.demo_scan())
     assert "without turning" not in run_import(arrays, tmp_path)

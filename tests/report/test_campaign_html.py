@@ -148,6 +148,7 @@ def test_what_speaks_against_a_comparison_is_told_once_beside_what_speaks_agains
     page = page_of(row)
     assert page.count("two places") == 1
     assert ">grown<" in page
+    assert "for exams that differ as simulated ones do where this site's own are not known" in page
 
 
 def test_each_mass_can_be_filtered_and_put_in_order() -> None:

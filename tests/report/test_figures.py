@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from plain_reports import estimate_report
 
+import tactile_bayes as tb
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.files.reports import PassedOver, Point
@@ -136,6 +137,15 @@ def test_a_users_matplotlib_settings_do_not_change_the_picture(tmp_path):
         map_figure(bump_map(), tmp_path / "b.png")
         assert matplotlib.rcParams["font.size"] == 30
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+@pytest.mark.long
+def test_a_notebooks_backend_that_is_not_installed_here_does_not_keep_a_command_from_drawing(run_cli, tmp_path):
+    scan = Path(tb.__file__).parent / "demo" / "scan.mcap"
+    words = ("map", scan, "-o", "m.nc", "--figure", "m.svg")
+    done = run_cli(*words, cwd=tmp_path, env={"MPLBACKEND": "module://not_installed.backend_inline"})
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "m.svg").stat().st_size > 1000
 
 
 @pytest.mark.long_repeats
