@@ -33,6 +33,7 @@ from tactile_bayes.posterior.masses import by_evidence, with_masses
 from tactile_bayes.posterior.result import Estimate, Mass, Rise
 from tactile_bayes.posterior.verdict import LIKELY
 from tactile_bayes.size.draws import SizePosterior
+from tactile_bayes.size.pooling import SizePriors
 
 WIDE, NARROW = (-17.0, 2.0), (16.0, 2.0)
 
@@ -411,3 +412,28 @@ def test_a_rise_without_proof_is_listed_only_where_it_has_a_share_of_the_lumps_h
         monkeypatch.setattr(masses_module, "search", lambda *_, one=assessed: ((), one))
         rise, proven = masses_module._assessed_rise(NARROW, two, two, lump, SamplerSettings())
         assert ((rise is not None), proven) == (expected, log_odds > 5.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "reported"),
+    [
+        (SamplerSettings(), 1),
+        (SamplerSettings(centre_mm=WIDE), 0),
+        (SamplerSettings(size_priors=SizePriors(known={"depth_mm": 15.0})), 0),
+        (SamplerSettings(size_priors=SizePriors(known={"fat_stiffness": 1.0})), 1),
+    ],
+    ids=["the surest", "the place that was given", "whose depth is known", "what is known of the body"],
+)
+def test_the_lump_that_was_asked_about_stays_the_answer_beside_a_surer_one(
+    monkeypatch: pytest.MonkeyPatch, options: SamplerSettings, reported: int
+) -> None:
+    two, first = scene(narrow=0.2), measured(0.3, WIDE)
+    surer = replace(measured(0.3, NARROW), detection=Detection(80.0))
+    rise = Rise(0.3, *NARROW, 4.0, 4.0, 33.0, 0.99)
+    monkeypatch.setattr(masses_module, "other_rises", lambda *_: ((rise,), ()))
+    answer = with_masses(two, first, options, lambda *_: surer)
+    assert places(answer.masses) == [NARROW, WIDE]
+    assert [one.reported for one in answer.masses] == [reported == 1, reported == 0]
+    assert answer.bump == (first, surer)[reported].bump
+    (other,) = answer.other_rises
+    assert (other.x_mm, other.distance_mm) == ((NARROW, WIDE)[reported][0], 33.0)

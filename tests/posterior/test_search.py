@@ -14,8 +14,8 @@ from tactile_bayes.posterior.bump import Detection, levelled
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.result import Estimate
-from tactile_bayes.posterior.verdict import NO_EVIDENCE
-from tactile_bayes.posterior.white import BumpFit, WhiteAssessment
+from tactile_bayes.posterior.verdict import NO_EVIDENCE, cut_by_rim
+from tactile_bayes.posterior.white import BumpFit, Candidate, WhiteAssessment
 
 FIELD = SamplerSettings(method="laplace", background="free", rotation="off", noise="field")
 
@@ -69,6 +69,45 @@ def test_the_search_goes_on_past_a_rise_without_evidence(monkeypatch: pytest.Mon
     assert found is not None
     assert found.fit.centre_mm == pytest.approx(lump, abs=1.0)
     assert [one.fault for one in candidates] == [NO_EVIDENCE, ""]
+
+
+def test_the_search_ends_after_three_rises_without_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each further test may give a false lump."""
+    places = [(x, y) for x in (-15.0, 0.0, 15.0) for y in (-12.0, 12.0)]
+    values = 1.0 + sum(
+        bump_values(half_mm=25.0, amplitude=0.3, x=x, y=y, sigma_x=3.0, sigma_y=3.0, level=0.0) for x, y in places
+    )
+    weighed = []
+
+    def no_lump(tactile_map: TactileMap, fit: BumpFit, _: SamplerSettings) -> WhiteAssessment:
+        weighed.append(fit.centre_mm)
+        return WhiteAssessment(tactile_map, fit, Detection(-1.0))
+
+    monkeypatch.setattr(estimate, "assess", no_lump)
+    candidates, found = estimate.search(grid_map(values + noise(3, 51)), SamplerSettings(rotation="off"))
+    assert len(weighed) == 3
+    assert len(candidates) < len(places)
+    assert found is not None
+    assert found.fit.centre_mm == weighed[0]
+
+
+@pytest.mark.parametrize(
+    ("place", "normalise", "cut"),
+    [((30.0, -5.0), "gain", True), ((0.0, -5.0), "gain", False), ((30.0, -5.0), "none", False)],
+    ids=["at the rim", "inside", "level unknown"],
+)
+def test_a_high_rise_at_the_rim_needs_no_bump_that_fits_it(
+    place: tuple[float, float], normalise: str, cut: bool
+) -> None:
+    """On a map that is wider than it is high, so that rows and columns are told apart."""
+    made = bump_values(half_mm=30.0, amplitude=0.8, x=place[0], y=place[1], sigma_x=6.0, sigma_y=6.0)[15:-15]
+    whole = grid_map(made + noise(7, 61)[15:-15], normalise=normalise, background=1.0 if normalise == "gain" else None)
+    reason = cut_by_rim(whole, [Candidate(place, None, "a fit that ended elsewhere")])
+    assert (reason is not None) == cut
+    if reason is not None:
+        assert reason.code == "window"
+        assert reason.reason == "the map's rim cuts the rise near (30.0, -5.0) mm"
+        assert reason.advice == "extend the strokes beyond it"
 
 
 def test_no_place_is_weighed_twice_for_an_empty_map(monkeypatch: pytest.MonkeyPatch) -> None:

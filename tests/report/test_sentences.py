@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from plain_reports import estimate_report, pooled_report
 from posterior_maps import bump_map
@@ -13,11 +14,18 @@ from tactile_bayes.campaigns.report import repeatability_words
 from tactile_bayes.declarations import replace
 from tactile_bayes.files.reports import AnotherExam, EstimateReport, Interval, MassReport, Place, Point, PooledMap
 from tactile_bayes.inference.draws import Quantity
-from tactile_bayes.posterior.fit import Structure
+from tactile_bayes.posterior.fit import SceneChoice, Structure
+from tactile_bayes.posterior.marginal import Scene
 from tactile_bayes.posterior.result import Sensitivity
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.report.compare import Doubling, GrowthRate, Rate, Visit, VisitMap, _rate_words, _visit_line
-from tactile_bayes.report.estimate_document import mass_lines, odds_text, sensitivity_line
+from tactile_bayes.report.estimate_document import (
+    mass_lines,
+    odds_text,
+    scene_line,
+    scene_lines,
+    sensitivity_line,
+)
 from tactile_bayes.report.estimate_text import _lump_line, decimals, size_table
 from tactile_bayes.report.exam_words import ShownExam, _scan_rows, exam_map, size_sentences
 from tactile_bayes.report.map import _notes
@@ -73,7 +81,9 @@ def test_a_page_has_both_intervals_and_the_smallest_size_of_the_one_that_leads()
 
 def test_a_page_and_a_map_say_why_frames_and_taxels_are_left_out() -> None:
     left_out = {"dropped_low": 1.0, "dropped_high": 2.0, "dropped_no_pose": 3.0, "dropped_elements": 4.0}
-    counted = replace(bump_map(), quality={"frames_total": 60.0, "frames_used": 50.0} | left_out)
+    pressed = {"mean_pressure_kpa": 9.5, "level_p05_kpa": 6.25, "level_p95_kpa": 12.5}
+    counted = replace(bump_map(), quality={"frames_total": 60.0, "frames_used": 50.0} | left_out | pressed)
+    counted = replace(counted, recipe=replace(counted.recipe, pressure_window_kpa=(5.0, 14.0)))
     masked = replace(counted, masked_taxels=("(3, 7)", "(4, 0)"))
     rows = dict(_scan_rows(masked))
     assert rows["sensor frames"] == (
@@ -81,7 +91,10 @@ def test_a_page_and_a_map_say_why_frames_and_taxels_are_left_out() -> None:
         "4 with too few working sensor points"
     )
     assert rows["sensor points"] == "2 left out as faulty"
+    assert rows["pressure"] == "mean 9.5 kPa, nine frames in ten 6.2 to 12.5 kPa (wanted 5 to 14 kPa)"
     assert rows["landmarks"] == "none touched"
+    touched = replace(masked, patient_from_plane=np.eye(4), quality=masked.quality | {"landmark_spread_mm": 3.4})
+    assert dict(_scan_rows(touched))["landmarks"] == "sternal notch, xiphoid; no nipple; repeats within 3.4 mm"
     assert "no gaps inside" in rows["covered"]
     assert "taxels left out: (3, 7); (4, 0)" in _notes(masked)
     assert not any("left out" in one for one in _notes(counted))
@@ -127,6 +140,35 @@ def test_odds_have_no_more_digits_than_they_are_worth() -> None:
     told = [odds_text(Structure("tilt", odds, False, False)) for odds in (0.001, 0.5, 12.3, 5000.0)]
     assert told == ["below 0.01 to 1", "0.5 to 1", "12 to 1", "above 1000 to 1"]
     assert odds_text(Structure("rib", 0.2, False, False, odds_are_a_bound=True)) == "at most 0.2 to 1"
+
+
+def scene(structures: tuple[Structure, ...]) -> SceneChoice:
+    """A straight ellipse with the tests of other structures."""
+    fit: Any = SimpleNamespace(scene=Scene("ellipse"), target=SimpleNamespace(problem=SimpleNamespace(radius_mm=20.0)))
+    return SceneChoice(fit, fit, structures)
+
+
+def test_the_scene_names_what_the_map_supports_and_what_it_does_not() -> None:
+    ellipse = Structure("ellipse", 5.0, True, True, False, 0.1, -0.2)
+    tilt = Structure("tilt", 0.2, False, True, False, 0.3, 0.0)
+    rib = Structure("rib", 2000.0, True, True, False, 1.5, -0.5, "along 90 deg")
+    second = Structure("second lump", 0.004, False, False, odds_are_a_bound=True)
+    choice = scene((ellipse, tilt, rib, second))
+    assert choice.supported == "ellipse"
+    assert scene((replace(ellipse, supported=False), tilt, rib)).supported == "round"
+    assert scene_line(choice) == (
+        "The map supports an ellipse along the head's axes and a rib in this window; not needed: a second lump within "
+        "20 mm."
+    )
+    lines = scene_lines(choice)
+    assert lines[0].startswith("Scene in the fit window of 20 mm about the lump: an ellipse along the head's axes and ")
+    assert "a rib in this window along 90 deg, the simplest that the map supports." in lines[0]
+    assert lines[1] == (
+        "A rib in this window is in the model (odds above 1000 to 1): without it sigma_x would change by +1.5 SD and "
+        "sigma_y would change by -0.5 SD."
+    )
+    assert "Also in the model: a sloping level (odds 0.2 to 1): without it sigma_x would change by +0.3 SD." in lines
+    assert lines[-1] == "Not in the model: a second lump in this window (odds below 0.01 to 1)."
 
 
 def test_a_result_that_hardly_follows_the_prior_is_told_by_how_little() -> None:

@@ -239,6 +239,9 @@ def test_disagreement_counts_joint_errors() -> None:
     other = ParameterDraws(rng.standard_normal((1, 8000, 2)), "importance", {"end_error_sd": 0.03})
     assert disagreement(one, other) < 4.0
     assert disagreement(one, replace(other, theta=other.theta + 0.4)) > methods.DISAGREEMENT
+    for end in (-1.0, 1.0):  # each end counts
+        tail = np.where(end * other.theta > 1.0, 1.3 * other.theta, other.theta)
+        assert disagreement(one, replace(other, theta=tail)) > methods.DISAGREEMENT
 
 
 def test_a_rib_of_which_only_a_flank_shows_is_sampled_all_the_same() -> None:

@@ -125,6 +125,12 @@ def test_a_rib_is_found_along_its_edge() -> None:
     assert choice.fit.scene.extra == "rib"
     assert np.degrees(choice.fit.mode[-3]) % 180.0 == pytest.approx(90.0, abs=6.0)
     assert "along" in asked(choice, "rib").place
+    # what the widths would change by without the rib, in their SDs then; across it they do
+    without = (choice.plain.mode[:2] - choice.fit.mode[:2]) / np.sqrt(np.diag(choice.plain.covariance)[:2])
+    told = asked(choice, "rib").change_sigma_x_sd, asked(choice, "rib").change_sigma_y_sd
+    np.testing.assert_allclose(told, without)
+    assert abs(told[1]) > 0.5
+    assert told[0] != told[1]
 
 
 def test_two_lumps_under_one_long_bump_are_told_apart() -> None:
