@@ -270,6 +270,9 @@ def test_the_page_needs_nothing_else_and_is_the_same_every_time(tmp_path: Path) 
     assert hashlib.sha256(TRIAL.read_bytes()).hexdigest() in page
     for words in ("synthetic", "Passing-Bablok", "p Holm", "ICC", "mean error, %", RESEARCH_USE):
         assert words in page
+    plain = tmp_path / "plain.html"
+    assert validate(TRIAL, "--excision", EXCISION, "--intervals", "jackknife", "--html", plain).exit_code == 0
+    assert "intervals of MAPE hold less often than they say" in plain.read_text()
     assert "exists" in refusal(TRIAL, "--excision", EXCISION, "--html", tmp_path / "a.html")
 
 
@@ -402,6 +405,43 @@ def test_masses_of_one_patient_are_no_new_trials_of_whether_masses_are_found(tmp
         words = small(tmp_path, rows, [(one, i, x) for i, (one, x) in enumerate(zip(patients, e, strict=True), 1)])
         low, high = document(*words)["modalities"]["tactile"]["detected_interval"]
         assert (low, high) == (pytest.approx(0.025 ** (1 / number), abs=1e-6), 1.0)
+
+
+def test_every_figure_of_the_text_stands_in_the_row_of_what_it_is_of() -> None:
+    lines = validate(TRIAL, "--excision", EXCISION, "-v").stdout.splitlines()
+    found = document(TRIAL, "--excision", EXCISION)
+    for pair in found["paired_comparisons"]:
+        (line,) = (
+            one for one in lines if one.startswith(f"{pair['first']} - {pair['second']} on {pair['masses']} com")
+        )
+        assert f": MAPE {pair['difference_percent']:+.1f} [" in line
+        assert f" points, ratio {pair['ratio']:.2f} [" in line
+        assert line.endswith(f"; p {pair['p_value']:.4f}, p Holm {pair['p_holm']:.4f}")
+    assert any(line.endswith("looked for, corrected for 3 pairs by Holm.") for line in lines)
+    for name, one in found["modalities"].items():
+        assert any(
+            line.startswith(f"{name}: concordance {one['method_comparison']['concordance']:.2f} [") for line in lines
+        )
+    repeats = found["modalities"]["tactile"]["replicates"]
+    low, high = repeats["repeatability_low_percent"], repeats["repeatability_high_percent"]
+    (line,) = (line for line in lines if "two readings of one mass differ by" in line)
+    assert re.fullmatch(rf"tactile: .* by {low:.0f} \[.*\] to \+{high:.0f} \[.*\] % at most in 95 % of pairs", line)
+    for name, one in found["mape_ratio_to_tactile"].items():
+        (line,) = (line for line in lines if line.startswith(f"{name}: MAPE "))
+        assert line.startswith(f"{name}: MAPE {one['ratio']:.2f} [")
+        assert f" common masses; {one['ratio_detected']:.2f} [" in line
+        assert line.endswith(f" times on the {one['masses_detected']} that both found")
+
+
+def test_intervals_that_few_misses_make_too_narrow_have_a_caution() -> None:
+    words = (
+        "1 of 25 masses missed: intervals of MAPE hold less often than they say; --intervals corrected allows for it"
+    )
+    plain = validate(TRIAL, "--excision", EXCISION, "--intervals", "jackknife").stdout.splitlines()
+    assert [line for line in plain if "less often" in line] == [
+        f"{name}: only {words}" for name in ("cbe", "ultrasound")
+    ]
+    assert "less often" not in validate(TRIAL, "--excision", EXCISION).stdout  # the control: corrected by default
 
 
 def test_a_p_value_that_few_patients_cannot_make_small_says_so(tmp_path: Path) -> None:

@@ -437,3 +437,18 @@ def test_the_lump_that_was_asked_about_stays_the_answer_beside_a_surer_one(
     assert answer.bump == (first, surer)[reported].bump
     (other,) = answer.other_rises
     assert (other.x_mm, other.distance_mm) == ((NARROW, WIDE)[reported][0], 33.0)
+
+
+def test_a_place_is_clear_of_both_lumps_of_a_scene_by_twice_their_larger_width(monkeypatch: pytest.MonkeyPatch) -> None:
+    two, lump = scene(narrow=0.2), measured(0.3, WIDE)
+    drawn = replace(lump.map_posterior, sigma_y_mm=np.full((1, 3), 8.0))
+    estimate = replace(lump, map_posterior=drawn)
+
+    def clear(x: float) -> bool:
+        return masses_module._clear_of_lump(x, WIDE[1], two, estimate)
+
+    assert [clear(WIDE[0] + away) for away in (9.0, 15.0, 17.0, 33.0)] == [False, False, True, True]
+    for second, expected in ((NARROW, False), ((90.0, 2.0), True)):  # off the map it stands for a rise at the rim
+        bump = ModalBump(0.0, *second, 4.0, 4.0)
+        monkeypatch.setattr(masses_module, "_second_lump", lambda _, one=bump: one)
+        assert clear(NARROW[0] + 7.0) == expected
