@@ -273,6 +273,9 @@ class TrackerPoses(Record, eq=False):
         return len(self.time_s)
 
 
+LANDMARK_NAMES: Final = ("sternal_notch", "xiphoid")  #: Without one of them a map has no axes of the patient.
+
+
 class Landmarks(Record, eq=False):
     """Points touched just before the scan, (3,) in `base`, mm."""
 

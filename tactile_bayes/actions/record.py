@@ -305,11 +305,10 @@ def make_recording(request: Request) -> tuple[RecordingReport, bool]:
             speed=request.replay_speed,
         )
         for name, position_mm in {} if landmarks is None else landmarks.points().items():
-            writer.add_landmark(name, position_mm, device_ns=0, host_ns=0)
-            observer.landmark(name, position_mm)
+            recorder.store_landmark(name, position_mm)
         signals = after.enter_context(noted_signals())  # to the end: a second Ctrl-C broke off what the first began
         try:
-            report = _run(recorder, signals, head, request)
+            report = _run(recorder, signals, head, calibration, request)
             writer.close(as_dict(report) | {"cautions": "\n".join(report.cautions)})
         except OSError as error:
             writer.stop_syncing()
@@ -374,7 +373,7 @@ def calibration_for(
         if not full_scale:
             raise DeviceError(f"{name}: its HELLO has saturation count 0; it must be the count at full scale, as 4095")
         shape = hello.rows, hello.columns
-        return ElementCalibration(np.full(shape, PRESSURE_RANGE_KPA[1] / full_scale), np.zeros(shape), full_scale)
+        return ElementCalibration(np.full(shape, _nominal_gain(full_scale)), np.zeros(shape), full_scale)
     if owner not in ("", hello.device_id) and not request.accept_calibration:
         raise UsageError(
             f"{name} is {hello.device_id!r}, {request.like} was recorded with {owner!r}; give this head's "
@@ -388,7 +387,18 @@ def calibration_for(
     return given
 
 
-def _run(recorder: Recorder, signals: list[str], head: HeadGeometry, request: Request) -> RecordingReport:
+def _nominal_gain(full_scale: int) -> float:
+    return PRESSURE_RANGE_KPA[1] / full_scale
+
+
+def _is_nominal(calibration: ElementCalibration) -> bool:
+    gain = _nominal_gain(calibration.saturation_count)
+    return bool(np.all(calibration.gain_kpa_per_count == gain) and not calibration.offset_kpa.any())
+
+
+def _run(
+    recorder: Recorder, signals: list[str], head: HeadGeometry, calibration: ElementCalibration, request: Request
+) -> RecordingReport:
     wait, drawn = request.duration_s is None and not request.at_once, request.live and can_redraw()
     keys = Keys(recorder, head.scanhead_from_tracker, wait=wait, drawn=drawn)
 
@@ -399,7 +409,7 @@ def _run(recorder: Recorder, signals: list[str], head: HeadGeometry, request: Re
 
     with keys.listening():
         report = recorder.run(poll)
-    if request.uncalibrated and request.tracker_url:
+    if request.tracker_url and _is_nominal(calibration):  # also that of the scan of --like
         report.cautions.append("the nominal gain is for bladder steps: uneven taxels may hide a lump or pass for one")
     return report
 

@@ -20,7 +20,7 @@ from tactile_bayes.files.tables import header_of, read_table
 from tactile_bayes.findings import finding_lines, findings_in
 from tactile_bayes.mapping.select import Span, missing_records, with_times
 from tactile_bayes.presets import RESEARCH_USE
-from tactile_bayes.scans import HeadGeometry
+from tactile_bayes.scans import LANDMARK_NAMES, HeadGeometry
 from tactile_bayes.shell import padded, text_width
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.pooling import Calibration
@@ -263,7 +263,7 @@ def _scan(path: Path) -> dict[str, Any]:
         pose_s = scan_mcap.message_times(records.messages("/pose", schema="foxglove.PoseInFrame"), topic="/pose")
         touches = {
             name: len(records.messages("/landmark", schema="foxglove.PoseInFrame", name=name))
-            for name in (*scan_mcap.LANDMARK_NAMES, scan_mcap.NIPPLE)
+            for name in (*LANDMARK_NAMES, scan_mcap.NIPPLE)
         }
         findings = with_times(scan_mcap.file_findings(records), Span.of(time_s), Span.of(pose_s))
         provenance = scan_mcap.provenance_of(records)
@@ -284,7 +284,7 @@ def _scan(path: Path) -> dict[str, Any]:
         "frames_missing": missing_records(time_s),
         "notes": sum(len(records.by_channel.get(number, ())) for number in logs),
         **({"recording": recording} if recording else {}),
-        "landmarks": all(touches[name] for name in scan_mcap.LANDMARK_NAMES),
+        "landmarks": all(touches[name] for name in LANDMARK_NAMES),
         "nipple": touches[scan_mcap.NIPPLE] > 0,
         "units": {"counts": "raw, 0 to saturation", "pressure": "kPa", "position": "mm", "time": "s"},
         "session": dict(records.metadata.get("session", {})),

@@ -39,7 +39,6 @@ from tactile_bayes.geometry import FloatArray
 
 SCAN_SCHEMA: Final = "tactile-bayes/scan/1"
 CHUNK_BYTES: Final = 64 * 1024
-LANDMARK_NAMES: Final = ("sternal_notch", "xiphoid")
 NIPPLE: Final = "nipple"  #: An optional landmark; a file has a channel for it only where it was touched.
 TOPICS: Final = ("/pressure", "/pose", "/landmark")
 _NS: Final = 1_000_000_000
@@ -96,7 +95,7 @@ class ScanWriter:
         self._schema_of = {kind: self._schema(kind) for kind in (Grid, PoseInFrame)}
         self._frame_channel = self._channel("/pressure", Grid)
         self._pose_channel = self._channel("/pose", PoseInFrame)
-        self._landmark_channel = {name: self._channel("/landmark", PoseInFrame, name=name) for name in LANDMARK_NAMES}
+        self._landmark_channel = {name: self._channel("/landmark", PoseInFrame, name=name) for name in scans.LANDMARK_NAMES}
         self._grid = _grid_of(head).SerializeToString(deterministic=True)
 
     def _schema(self, kind: Any) -> int:
@@ -372,7 +371,7 @@ def _pose_table(messages: Messages) -> FloatArray:
 def _landmarks(records: McapRecords) -> scans.Landmarks | None:
     """Last touches, and the largest distance of an earlier one; None unless all `LANDMARK_NAMES` were touched."""
     points, apart = {}, []
-    for name in (*LANDMARK_NAMES, NIPPLE):
+    for name in (*scans.LANDMARK_NAMES, NIPPLE):
         touches = records.messages("/landmark", schema="foxglove.PoseInFrame", name=name)
         if not len(touches):
             if name == NIPPLE:

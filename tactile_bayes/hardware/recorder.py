@@ -19,7 +19,7 @@ from tactile_bayes.geometry import LEAST_APART_MM, FloatArray, inverse, rotation
 from tactile_bayes.hardware import readings
 from tactile_bayes.hardware.ports import SILENT_S, Port, Stream
 from tactile_bayes.mapping.select import Jumps, Span, disjoint, overlap_cautions
-from tactile_bayes.scans import CountArray
+from tactile_bayes.scans import LANDMARK_NAMES, CountArray
 
 # --- Summary of a recording: what arrived, what was lost, and what makes it unfit for use.
 
@@ -247,6 +247,7 @@ class Recorder:
         self._pose_ns = -1
         self._stopped_ns: int | None = None
         self._touched: dict[str, LandmarkTouch] = {}
+        self._stored: set[str] = set()
 
     def start(self) -> None:
         """Start the devices and record them."""
@@ -265,6 +266,12 @@ class Recorder:
         if self.touch and (touch is None or touch.name != self.touch.name):
             self.report.landmarks.append(str(self.touch))
         self.touch = touch
+
+    def store_landmark(self, name: str, position_mm: FloatArray, *, device_ns: int = 0, host_ns: int = 0) -> None:
+        """Store the place of a landmark, and show it."""
+        self._stored.add(name)
+        self.sink.add_landmark(name, position_mm, device_ns=device_ns, host_ns=max(0, host_ns))
+        self.observer.landmark(name, position_mm)
 
     def stop(self, why: str) -> None:
         """End the recording once data on their way have arrived."""
@@ -431,8 +438,7 @@ class Recorder:
             words += f"; not stored: this is the place of the {at_place[0].words}, touch both again"
         else:
             self._touched[touch.name] = touch
-            self.sink.add_landmark(touch.name, touch.position_mm, device_ns=device_ns, host_ns=max(0, host_ns))
-            self.observer.landmark(touch.name, touch.position_mm)
+            self.store_landmark(touch.name, touch.position_mm, device_ns=device_ns, host_ns=host_ns)
         self.report.landmarks.append(words)
         self._note(words, "tracker", device_ns, host_ns, serious=bool(at_place) or not touch.steady)
 
@@ -488,6 +494,9 @@ class Recorder:
         report.cautions = [*overlap_cautions(*spans), *_cautions(report, passed_s, silent_s, self.rate_hz, pose_s)]
         report.cautions += self._jumps.cautions()
         self.begin_touch(None)
+        missing = [name.replace("_", " ") for name in LANDMARK_NAMES if name not in self._stored]
+        if missing and self._stored:
+            report.landmarks.append(f"{' and '.join(missing)} not stored: maps will have no axes of the patient")
         report.cautions += [
             f"the head moved by {touch.spread_mm:.0f} mm while it touched the {touch.words}: places may be wrong"
             for touch in self._touched.values()

@@ -119,6 +119,7 @@ def test_a_recorded_scan_gives_the_bit_identical_map(record, tmp_path, source, s
     assert done.returncode == 0, done.stderr
     assert "200 frames in 0.995 s, 200.0 Hz; 120 poses" in done.stdout
     assert "frames lost 0" in done.stdout
+    assert NOMINAL not in done.stdout
     path = tmp_path / "a.mcap"
     file = read_scan_report(path)
     assert file.complete
@@ -177,6 +178,18 @@ def test_every_tracker_is_recorded_as_its_wire_carries_it(record, tmp_path, scan
     apart = np.abs(poses.position_mm[:, None] - scan.poses.position_mm[None]).max(axis=2)
     assert apart.min(axis=1).max() < step
     assert np.diff(poses.time_s).min() >= 0
+
+
+def test_the_nominal_gain_of_a_scan_to_record_like_is_told(record, tmp_path, scan):
+    """It was taken without a word: the scan it came from was recorded for bladder steps."""
+    step = scan.element_calibration
+    nominal = replace(step, gain_kpa_per_count=np.full_like(step.gain_kpa_per_count, 34 / step.saturation_count))
+    nominal = replace(nominal, offset_kpa=np.zeros_like(step.offset_kpa))
+    write_scan(tmp_path / "p8.mcap", replace(scan, element_calibration=nominal), provenance=Provenance("test", {}))
+    with head_and_tracker(scan, speed=FAST) as devices:
+        done = record(*devices, "--like", "p8.mcap", like=False)
+    assert done.returncode == 0, done.stderr
+    assert f"caution: {NOMINAL}\n" in done.stdout
 
 
 @pytest.mark.long

@@ -421,6 +421,7 @@ def test_landmarks_in_a_hurry_in_one_place_or_in_motion_are_told() -> None:
         "touch both again",
         "nipple at 7.0 0.0 0.0 mm, spread 3.46 mm over 3 samples; the head moved, touch it again",
         "xiphoid: given up after 0 of 3 samples; touch it again",
+        "xiphoid not stored: maps will have no axes of the patient",
     ]
     assert session.sink.landmarks == ["sternal_notch", "nipple"]
     assert "the head moved by 3 mm while it touched the nipple: places may be wrong" in report.cautions
