@@ -86,7 +86,8 @@ def read_wide(path: Path, mapping: ColumnMap, readings: Sequence[ReadingColumns]
     rows = _rows(path, mapping, [name for names in named for name in names])
     tidy = [_reading(row, reading, mapping) for row in rows for reading in readings]
     keys = ("patient", "mass", "modality", "replicate")
-    return _table(path, tidy, keys, lines=[row.line for row in rows for _ in readings])
+    called = [_called(reading, mapping) for reading in readings] * len(rows)
+    return _table(path, tidy, keys, lines=[row.line for row in rows for _ in readings], called=called)
 
 
 def read_wide_excision(path: Path, mapping: ColumnMap, excision: ExcisionColumns) -> Table:
@@ -107,13 +108,34 @@ def read_wide_excision(path: Path, mapping: ColumnMap, excision: ExcisionColumns
         }
         for row in rows
     ]
-    return _table(path, sizes, ("patient", "mass"), lines=[row.line for row in rows])
+    others = {"ex_vivo_second_mm": excision.second, "sd_mm": excision.sd, "date": excision.date}
+    called = _key_columns(mapping) | {name: column or excision.size for name, column in others.items()}
+    called |= {"ex_vivo_mm": excision.size}
+    return _table(path, sizes, ("patient", "mass"), lines=[row.line for row in rows], called=[called] * len(rows))
 
 
-def _table(path: Path, rows: Sequence[Mapping[str, Any]], keys: Sequence[str], *, lines: list[int]) -> Table:
+def _key_columns(mapping: ColumnMap) -> dict[str, str]:
+    return {"patient": mapping.patient, "mass": mapping.mass or mapping.patient}
+
+
+def _called(reading: ReadingColumns, mapping: ColumnMap) -> dict[str, str]:
+    """Column of the wide table by the one of a trial table; that of the size where it has none of its own."""
+    own = {"sd_mm": reading.sd, "low_mm": reading.low, "high_mm": reading.high, "date": reading.date}
+    own |= dict.fromkeys(("modality", "replicate", "size_mm", "status", "probability", "visit", "posterior"))
+    return _key_columns(mapping) | {name: column or reading.size for name, column in own.items()}
+
+
+def _table(
+    path: Path,
+    rows: Sequence[Mapping[str, Any]],
+    keys: Sequence[str],
+    *,
+    lines: list[int],
+    called: list[dict[str, str]],
+) -> Table:
     """Table of rows; no two may have the same keys."""
     columns = {name: [row[name] for row in rows] for name in rows[0]}
-    table = Table(path=path, columns=columns, line_numbers=lines)
+    table = Table(path=path, columns=columns, line_numbers=lines, called=called)
     check_unique(table, keys, way_out="remove one row, or name the column of the mass")
     return table
 

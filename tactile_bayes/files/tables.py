@@ -122,6 +122,7 @@ def may_be_thousands(number: str) -> bool:
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _DATE = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}")
 _INTEGER = re.compile(r"[+-]?[0-9]+")
+_IN_MM = re.compile(r"\w+_mm")
 _NOT_FINITE = {"nan", "inf", "infinity"}
 
 
@@ -141,12 +142,17 @@ class Table(Record):
     date. A blank cell is None, and so is each cell of an optional column that the file leaves out.
     """
     line_numbers: list[int]  #: The line of the file at which each row begins; the header is line 1.
+    called: Sequence[Mapping[str, str]] = ()
+    """What the file calls the columns of each row, where it calls them otherwise."""
 
     def __len__(self) -> int:
         return len(self.line_numbers)
 
     def error(self, row: int, column: str, what: str, *, way_out: str) -> BadDataError:
-        """Error for a cell that is wrong beyond its schema, worded as the reader's; rows count from 0."""
+        """Error for a cell that is wrong beyond its schema, in the reader's words and columns; rows count from 0."""
+        names = self.called[row] if self.called else {}
+        column = " + ".join(dict.fromkeys(names.get(name, name) for name in column.split(" + ")))
+        what, way_out = (_IN_MM.sub(lambda name: names.get(name[0], name[0]), text) for text in (what, way_out))
         return _fault(self.line_numbers[row], column, what, way_out=way_out).with_path(self.path)
 
 

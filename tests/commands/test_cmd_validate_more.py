@@ -94,6 +94,11 @@ def test_a_wide_table_is_read_by_its_mapping(tmp_path: Path) -> None:
         (WIDE.replace("1.2", "about 1"), MAPPING, "line 2, column us_cm: 'about 1' is not a number"),
         (WIDE.replace("1.2", "<1"), MAPPING, "'<1' is a bound, not a number; give the number measured"),
         (WIDE.replace("1.2", "1.2%"), MAPPING, "'1.2%' has a percent sign; write the number that is meant without it"),
+        (WIDE.replace("9,14", "9,"), MAPPING, "line 2, column map1_high: is blank while the interval's other cells are "
+         "not; an interval needs map1_low, map1_high and probability, or all three blank"),
+        (WIDE.replace("9,14", "14,9"), MAPPING, "column map1_low: is 14, above map1_high 9; exchange or correct them"),
+        (WIDE.replace("P2,20", "P1,20"), MAPPING, "line 3, column record_id: 'P1' + '1' stands on line 2 already"),
+        (WIDE.replace("P1,10", "P1,"), MAPPING, "line 2, column record_id: 'P1' + '1' has no size in"),
         (WIDE.replace("9,14", "-9,14"), MAPPING, "line 2, column map1_low: '-9' is not at least 0"),
         (WIDE.replace("NV", "0"), MAPPING.replace('"ex_mm"', '"ex_mm"\nsecond = "us_cm"'),
          "column us_cm: is 0; was it not measured? then leave the cell blank"),
