@@ -459,6 +459,8 @@ def read_worklist(path: Path) -> Identity:
 
 
 def _checked_identity(values: Mapping[str, Any], path: Path) -> Identity:
+    if not any(values.values()):
+        raise BadDataError("says nothing of a patient or study", way_out=_ONE_ITEM, path=str(path))
     try:
         return Identity(**{name: value for name, value in values.items() if value})
     except UsageError as error:
@@ -505,8 +507,6 @@ def _identity_from_dicom(dataset: Any, path: Path) -> Identity:
         birth = str(dataset.get("PatientBirthDate") or "").strip()
     if birth:
         values["birth_date"] = f"{birth[:4]}-{birth[4:6]}-{birth[6:]}" if len(birth) == 8 else birth
-    if not any(values.values()):
-        raise BadDataError("says nothing of a patient or study", way_out=_ONE_ITEM, path=str(path))
     return _checked_identity(values, path)
 
 

@@ -336,6 +336,7 @@ def _where(cells: BoolArray) -> str:
 _NORMALISED_MEDIAN: Final = (0.2, 5.0)
 _LEAST_SPACING_MM: Final = 0.01
 _MOST_READINGS: Final = 1e9  #: In a cell: no exam has more frames.
+_SMALLEST: Final = 1e-100  #: Largest value below which squares vanish: a lump of 1e-160 was not found.
 _MOST_KPA: Final = 1000.0  #: Median of a grid in kPa: no examination presses with more, and as Pa it is a light touch.
 _LONGEST_MM: Final = 500.0
 """No examined breast is longer; frames that stand one in a row, or one below the other, are."""
@@ -388,6 +389,9 @@ def grid_map(grid: Grid, options: GridOptions) -> tuple[TactileMap, list[str]]:
         raise UsageError(f"--cell-mm is {cell:g}, and the grid's cells are {spacing:g} mm; give that or more")
     if (times := int(cell / spacing + 1e-6)) > 1:
         tactile_map = _average_cells(tactile_map, times)
+        if not tactile_map.covered.any():
+            what = f"no {times} x {times} cells of {spacing:g} mm have data in half of them"
+            raise BadDataError(what, way_out="give a smaller --cell-mm, or a larger grid")
         notes.append(f"{times} x {times} cells of {spacing:g} mm were averaged into one of {times * spacing:g} mm")
     if options.level is not None:
         tactile_map = _divide_by_level(tactile_map, options.level)
@@ -492,7 +496,9 @@ def _map(arrays: dict[str, np.ndarray[Any, Any]], *, spacing_mm: float, normalis
     if index := _first((count > 0) & ~(variance >= 0) & ~((count == 1) & np.isnan(variance))):
         what = f"variance is {variance[index]:g} at {index}, where count is {count[index]}"
         raise BadDataError(what, way_out="it must not be negative, and NaN (not known) only where count is 0 or 1")
-    median = float(np.median(mean[count > 0]))
+    median, largest = float(np.median(mean[count > 0])), float(np.abs(mean[count > 0]).max())
+    if 0 < largest < _SMALLEST:
+        raise BadDataError(f"the largest value is {largest:.4g}", way_out="give readings, in kPa or a unit near it")
     if units.strip().lower() == "kpa" and median > _MOST_KPA:
         what = f"the median value is {median:.4g} kPa"
         raise BadDataError(what, way_out="looks like Pa, give --units Pa, or divide by 1000")

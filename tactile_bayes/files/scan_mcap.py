@@ -95,7 +95,9 @@ class ScanWriter:
         self._schema_of = {kind: self._schema(kind) for kind in (Grid, PoseInFrame)}
         self._frame_channel = self._channel("/pressure", Grid)
         self._pose_channel = self._channel("/pose", PoseInFrame)
-        self._landmark_channel = {name: self._channel("/landmark", PoseInFrame, name=name) for name in scans.LANDMARK_NAMES}
+        self._landmark_channel = {
+            name: self._channel("/landmark", PoseInFrame, name=name) for name in scans.LANDMARK_NAMES
+        }
         self._grid = _grid_of(head).SerializeToString(deterministic=True)
 
     def _schema(self, kind: Any) -> int:

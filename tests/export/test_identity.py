@@ -90,6 +90,8 @@ def test_a_worklist_of_plain_keys_is_read_and_checked(tmp_path: Path) -> None:
         ('{"patient_id": 7}', "patient_id"),
         ('{"patient_id": "A\\nB"}', "cannot be printed"),
         ("[]", "0 worklist items"),
+        ("{}", "says nothing of a patient or study; give one worklist item"),
+        ('[{"patient_id": ""}]', "says nothing of a patient or study"),
         ("[1]", "no worklist item"),
         ('{"patient_id"', "JSON"),
     ):

@@ -129,6 +129,13 @@ GRID_FAULTS: list[tuple[Arrays, dict[str, Any], type[Exception], str]] = [
     ({"mean": ONES}, {"spacing_mm": 0.001}, BadDataError, "spacing is 0.001 mm; looks like metres"),
     ({"mean": 9000 * ONES}, {"spacing_mm": 1.0, "units": "kPa"}, BadDataError, "9000 kPa; looks like Pa"),
     ({"mean": np.ones(4)}, {"spacing_mm": 1.0}, BadDataError, r"shape \(4,\)"),
+    ({"mean": ONES * 1e-160}, {"spacing_mm": 1.0, "level": "fit"}, BadDataError, "largest value is 1e-160; give read"),
+    (
+        {"mean": np.ones((1, 1))},
+        {"spacing_mm": 1.0, "cell_mm": 2.0, "level": "fit"},
+        BadDataError,
+        "no 2 x 2 cells of 1 mm have data in half of them; give a smaller --cell-mm, or a larger grid",
+    ),
     ({"mean": ONES * np.inf}, {"spacing_mm": 1.0}, BadDataError, "infinite"),
     ({"mean": ONES * np.nan}, {"spacing_mm": 1.0}, BadDataError, "no cell holds data"),
     ({"mean": ONES * 1j}, {"spacing_mm": 1.0}, BadDataError, "complex"),
