@@ -81,7 +81,7 @@ def emulate_action(
                 other.start()
             emulators[0].run(once=once)
             # its cable was pulled, as asked, or its host has ended: the other may wait for its own host for good
-            if not once or emulators[0].device.stopped:
+            if not once or emulators[0].left:
                 for one in emulators[1:]:
                     one.unplugged = True
             for other in others:

@@ -494,11 +494,16 @@ class Emulator:
         """Serve until the link breaks, or, with `once`, until a scan has been sent and read, or was stopped."""
         while not self.unplugged:
             self._step()
-            stopped = self.device.starts > 0 and self.device.stopped  # the host reads no more
-            all_sent = self.device.end_sent or time.monotonic() - self._finished_at > LINGER_S
-            if once and (stopped or (self._finished_at and not self._waiting and all_sent)):
-                self.link.finish(0.0 if stopped else LINGER_S)
+            all_sent = self.device.end_sent and not self._waiting
+            at_end = self._finished_at and (all_sent or time.monotonic() - self._finished_at > LINGER_S)
+            if once and (self.left or at_end):
+                self.link.finish(0.0 if self.left else LINGER_S)
                 self.unplugged = True
+
+    @property
+    def left(self) -> bool:
+        """True when the host reads no more: it has stopped the device, or has gone."""
+        return self.device.starts > 0 and (self.device.stopped or not self.link.connected())
 
     def _step(self) -> None:
         writable = [self.link] if self._waiting else []
@@ -520,7 +525,10 @@ class Emulator:
 
     def _send_waiting(self) -> None:
         if self._waiting and not self.unplugged:
-            del self._waiting[: self.link.write(bytes(self._waiting))]
+            written = self.link.write(bytes(self._waiting))
+            del self._waiting[:written]
+            if written and self._finished_at:  # somebody reads
+                self._finished_at = time.monotonic()
 
     def _wait_s(self) -> float:
         """Longest wait for a command before the next record is due."""

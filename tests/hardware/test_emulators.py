@@ -126,6 +126,24 @@ def test_once_ends_when_its_host_stops_before_the_end():
     assert not thread.is_alive()
 
 
+@pytest.mark.parametrize("link_of", [PtyLink, lambda: TcpLink("127.0.0.1", 0)], ids=["pty", "tcp"])
+def test_once_ends_when_its_host_has_gone_without_a_stop(monkeypatch, link_of):
+    """After a `record` that was killed the rest of the scan waited in the emulator's buffer for good."""
+    monkeypatch.setattr("tactile_bayes.hardware.emulated.LINGER_S", 0.2)
+    link = link_of()
+    emulator = Emulator(
+        EmulatedHead(SCAN), link, faults=Faults(), rng=np.random.default_rng(1), stage=Playback(speed=10.0)
+    )
+    thread = threading.Thread(target=lambda: emulator.run(once=True), daemon=True)
+    thread.start()
+    port = Port(link.url, baud=9600, role="head")
+    port.write(START)
+    time.sleep(0.05)
+    port.close()
+    thread.join(5.0)
+    assert not thread.is_alive()
+
+
 def test_an_emulated_network_tracker_needs_a_network_port(tmp_path):
     """On a pseudo-terminal it sent nothing, and `record` advised to start its stream."""
     write_scan(tmp_path / "scan.mcap", SCAN, provenance=Provenance("test", {}))
