@@ -132,8 +132,7 @@ def _said_once(findings: Iterable[Finding], severity: Severity | None) -> Iterat
 
 def first_texts(texts: Sequence[str], *, most: int, lead: str) -> list[str]:
     """One line of `lead`, the first texts and the number of the others; empty without any text."""
-    more = f" (and {len(texts) - most} more)" if len(texts) > most else ""
-    return [f"{lead}{'; '.join(texts[:most])}{more}."] if texts else []
+    return [f"{lead}{first_of(texts, most, '; ')}."] if texts else []
 
 
 def findings_in(document: object) -> tuple[Finding, ...]:
@@ -148,7 +147,7 @@ def counted(count: int, noun: str) -> str:
 
 def first_of(texts: Sequence[str], most: int, separator: str = ", ") -> str:
     """The first texts in a line, and the number of the others."""
-    more = f" and {len(texts) - most} more" if len(texts) > most else ""
+    more = f" (and {len(texts) - most} more)" if len(texts) > most else ""
     return f"{separator.join(texts[:most])}{more}"
 
 

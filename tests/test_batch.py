@@ -250,7 +250,7 @@ def sleep_for_ever(work: tuple[int, Path]) -> int:
 def test_items_of_one_fault_share_a_line():
     outcomes = [batch.Outcome(str(i), error="lost") for i in range(5)]
     lines = fault_lines([*outcomes, batch.Outcome("x", error="odd"), batch.Outcome("y", value=1)])
-    assert lines == ["0, 1, 2 and 2 more: lost", "x: odd"]
+    assert lines == ["0, 1, 2 (and 2 more): lost", "x: odd"]
 
 
 def test_after_the_loss_of_a_cluster_nothing_more_is_handed_out(tmp_path):

@@ -40,4 +40,4 @@ def test_an_unknown_kind_is_refused_with_the_kinds():
 
 def test_a_number_has_its_noun_and_a_list_counts_what_it_leaves_out():
     assert [counted(1, "mass"), counted(0, "mass"), counted(2, "exam")] == ["1 mass", "0 masses", "2 exams"]
-    assert [first_of("ab", 2), first_of("abcd", 2, "; ")] == ["a, b", "a; b and 2 more"]
+    assert [first_of("ab", 2), first_of("abcd", 2, "; ")] == ["a, b", "a; b (and 2 more)"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,8 +32,14 @@ from tactile_bayes.shell import progress_bar
 
 _LEAST_SPAN_MM: Final = 15.0  #: Range of the places along their longest axis: a stroke is longer.
 _LEVERS_MM: Final = (10, 300)  #: Lengths of lever arms; 0 is that of poses of the head.
-_SCAN_FILES: Final = ("poses", "head_geometry", "array_calibration", "landmarks")
-"""Options of files beside the frames'; a later one stands for an earlier."""
+_SCAN_FILES: Final[Mapping[str, Callable[[Path, ArrayMap, Mapping[str, str]], Source]]] = {
+    "poses": lambda path, arrays, _: imports.pose_source(path, arrays),
+    "head_geometry": lambda path, *_: imports.head_source(path),
+    "array_calibration": lambda path, *_: imports.calibration_source(path),
+    "landmarks": lambda path, _, facts: imports.landmark_source(touched_landmarks(path, facts)),
+}
+"""Readers of files beside the frames', by option, with the arrays' layout and the session; a later one stands for an
+earlier."""
 
 
 class ImportRequest(Record):
@@ -151,13 +157,10 @@ def _import_scan(source: Path, output: Path, request: ImportRequest) -> list[str
         if landmarks := request.scan_files.get("landmarks"):
             scan = replace(scan, landmarks=touched_landmarks(landmarks, {**scan.session, **facts}))
     else:
-        readers: dict[str, Callable[[Path], Source]] = {
-            "poses": lambda path: imports.pose_source(path, request.arrays),
-            "head_geometry": imports.head_source,
-            "array_calibration": imports.calibration_source,
-            "landmarks": lambda path: imports.landmark_source(touched_landmarks(path, facts)),
-        }
-        parts = [replace(readers[name](path), path=str(path)) for name, path in request.scan_files.items()]
+        parts = [
+            replace(_SCAN_FILES[name](path, request.arrays, facts), path=str(path))
+            for name, path in request.scan_files.items()
+        ]
         scan, notes = imports.import_arrays(source, request.arrays, parts)
         notes.insert(0, _lengths(scan))
     settings = {"as": "scan", "lost": list(lost), "correct": list(request.corrections), **request.arrays.given}

@@ -494,9 +494,9 @@ class Recorder:
         report.cautions = [*overlap_cautions(*spans), *_cautions(report, passed_s, silent_s, self.rate_hz, pose_s)]
         report.cautions += self._jumps.cautions()
         self.begin_touch(None)
-        missing = [name.replace("_", " ") for name in LANDMARK_NAMES if name not in self._stored]
-        if missing and self._stored:
-            report.landmarks.append(f"{' and '.join(missing)} not stored: maps will have no axes of the patient")
+        unstored = [name.replace("_", " ") for name in LANDMARK_NAMES if name not in self._stored]
+        if unstored and self._stored:
+            report.landmarks.append(f"{' and '.join(unstored)} not stored: maps will have no axes of the patient")
         report.cautions += [
             f"the head moved by {touch.spread_mm:.0f} mm while it touched the {touch.words}: places may be wrong"
             for touch in self._touched.values()

@@ -259,7 +259,7 @@ def test_an_export_of_tekscan_is_a_map_with_its_spacing_and_unit(tmp_path: Path)
         ("0.9,2,1.234,\n1,2,3,\n", "every row ends with a separator"),
         ("0.9;2;1.234;\r\n1;2;3;\r\n", "every row ends with a separator"),
         ("left,middle,right\n0.9,2,1.234\n1,2,3\n", "text before the numbers was left out: 'left middle right'"),
-        ("# made by mat 3\n# kPa\n0.9 2 1.234\n1 2 3\n", "'# made by mat 3' and 1 more"),
+        ("# made by mat 3\n# kPa\n0.9 2 1.234\n1 2 3\n", "'# made by mat 3' (and 1 more)"),
         ("Mat,3,\nUnits,kPa\n\n0.9,2,1.234\n1,2,3\n\nmean,1.6\n", ""),
         ('"0,9";"2";"1,234"\n"1";"2";"3"\n', ""),
         ('"0,9","2","1,234"\n"1","2","3"\n', ""),
