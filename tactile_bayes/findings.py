@@ -151,9 +151,9 @@ def first_of(texts: Sequence[str], most: int, separator: str = ", ") -> str:
     return f"{separator.join(texts[:most])}{more}"
 
 
-def first_lines(lines: Sequence[str], most: int) -> list[str]:
-    """The first lines, and one with the number of the others."""
-    return [*lines[:most], *([f"And {len(lines) - most} more: -v."] if len(lines) > most else [])]
+def first_lines(lines: Sequence[str], most: int, rest: str) -> list[str]:
+    """The first lines, and one with the number of the others and what to say of the `rest`."""
+    return [*lines[:most], *([f"And {len(lines) - most} more{rest}"] if len(lines) > most else [])]
 
 
 def capitalised(text: str) -> str:

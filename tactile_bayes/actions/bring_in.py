@@ -38,8 +38,7 @@ _SCAN_FILES: Final[Mapping[str, Callable[[Path, ArrayMap, Mapping[str, str]], So
     "array_calibration": lambda path, *_: imports.calibration_source(path),
     "landmarks": lambda path, _, facts: imports.landmark_source(touched_landmarks(path, facts)),
 }
-"""Readers of files beside the frames', by option, with the arrays' layout and the session; a later one stands for an
-earlier."""
+"""Readers of files beside the frames', by option; a later one stands for an earlier."""
 
 
 class ImportRequest(Record):

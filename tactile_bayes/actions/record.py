@@ -40,6 +40,7 @@ from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks
 from tactile_bayes.shell import can_redraw
 
 _KEYS: dict[int, str] = {signal.SIGINT: "Ctrl-C", signal.SIGTSTP: "Ctrl-Z", signal.SIGQUIT: "Ctrl-\\"}
+_NOMINAL = "the nominal gain is for bladder steps: uneven taxels may hide a lump or pass for one"
 _PATHS = ("like", "head_geometry", "array_calibration", "landmarks")
 
 
@@ -308,7 +309,10 @@ def make_recording(request: Request) -> tuple[RecordingReport, bool]:
             recorder.store_landmark(name, position_mm)
         signals = after.enter_context(noted_signals())  # to the end: a second Ctrl-C broke off what the first began
         try:
-            report = _run(recorder, signals, head, calibration, request)
+            report = _run(recorder, signals, head, request)
+            nominal = calibration.gain_kpa_per_count == PRESSURE_RANGE_KPA[1] / calibration.saturation_count
+            if request.tracker_url and nominal.all() and not calibration.offset_kpa.any():  # also where --like gave it
+                report.cautions.append(_NOMINAL)
             writer.close(as_dict(report) | {"cautions": "\n".join(report.cautions)})
         except OSError as error:
             writer.stop_syncing()
@@ -373,7 +377,7 @@ def calibration_for(
         if not full_scale:
             raise DeviceError(f"{name}: its HELLO has saturation count 0; it must be the count at full scale, as 4095")
         shape = hello.rows, hello.columns
-        return ElementCalibration(np.full(shape, _nominal_gain(full_scale)), np.zeros(shape), full_scale)
+        return ElementCalibration(np.full(shape, PRESSURE_RANGE_KPA[1] / full_scale), np.zeros(shape), full_scale)
     if owner not in ("", hello.device_id) and not request.accept_calibration:
         raise UsageError(
             f"{name} is {hello.device_id!r}, {request.like} was recorded with {owner!r}; give this head's "
@@ -387,18 +391,7 @@ def calibration_for(
     return given
 
 
-def _nominal_gain(full_scale: int) -> float:
-    return PRESSURE_RANGE_KPA[1] / full_scale
-
-
-def _is_nominal(calibration: ElementCalibration) -> bool:
-    gain = _nominal_gain(calibration.saturation_count)
-    return bool(np.all(calibration.gain_kpa_per_count == gain) and not calibration.offset_kpa.any())
-
-
-def _run(
-    recorder: Recorder, signals: list[str], head: HeadGeometry, calibration: ElementCalibration, request: Request
-) -> RecordingReport:
+def _run(recorder: Recorder, signals: list[str], head: HeadGeometry, request: Request) -> RecordingReport:
     wait, drawn = request.duration_s is None and not request.at_once, request.live and can_redraw()
     keys = Keys(recorder, head.scanhead_from_tracker, wait=wait, drawn=drawn)
 
@@ -408,10 +401,7 @@ def _run(
             recorder.stop(signals[-1])
 
     with keys.listening():
-        report = recorder.run(poll)
-    if request.tracker_url and _is_nominal(calibration):  # also that of the scan of --like
-        report.cautions.append("the nominal gain is for bladder steps: uneven taxels may hide a lump or pass for one")
-    return report
+        return recorder.run(poll)
 
 
 # --- From scripts: the same recorder, started at once.

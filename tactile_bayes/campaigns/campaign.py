@@ -21,7 +21,7 @@ from tactile_bayes.files.atomic import refuse_same
 from tactile_bayes.files.manifest_csv import JOURNAL, Exam, read_manifest
 from tactile_bayes.files.reading import check_address, upload
 from tactile_bayes.files.size_json import NONE, size_calibration_path
-from tactile_bayes.findings import counted
+from tactile_bayes.findings import counted, first_lines
 from tactile_bayes.options import CampaignOptions
 from tactile_bayes.presets import RESEARCH_USE
 from tactile_bayes.size.pooling import Repeatability
@@ -44,20 +44,16 @@ class CampaignResult(TextResult, eq=False):
     @property
     def failed(self) -> tuple[str, ...]:
         """A line for each of the first exams or masses that failed, and one that counts the others."""
-        faults = self.campaign.faults
-        lines = [f"{name}: {fault.step}: {fault.reason}" for name, fault in list(faults.items())[:FEW]]
-        more = [f"{len(faults) - FEW} more, see failures.csv"] if len(faults) > FEW else []
-        return (*lines, *more)
+        lines = [f"{name}: {fault.step}: {fault.reason}" for name, fault in self.campaign.faults.items()]
+        return tuple(first_lines(lines, FEW, ", see failures.csv"))
 
     def _planned(self) -> Iterator[str]:
         plan = self.campaign
         for step, todo in plan.todo.items():
             named = f" ({', '.join(plan.names[step])})" if _all_named(plan, step) and plan.kept[step] else ""
             yield f"{step}: {todo} to do{named}, {plan.kept[step]} done"
-        for name, fault in list(plan.faults.items())[:FEW]:
-            yield f"{name}: {fault.step} failed: {fault.reason}"
-        if len(plan.faults) > FEW:
-            yield f"{len(plan.faults) - FEW} more failed"
+        faults = [f"{name}: {fault.step} failed: {fault.reason}" for name, fault in plan.faults.items()]
+        yield from first_lines(faults, FEW, " failed")
         yield "Nothing was run."
 
     def _done(self, written: report.Written) -> Iterator[str]:

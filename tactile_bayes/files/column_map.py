@@ -6,7 +6,7 @@ for and not found the mapping gives the table's word.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NamedTuple
@@ -19,6 +19,7 @@ from tactile_bayes.files.tables import RawTable, Table, check_unique, composed, 
 from tactile_bayes.presets import MM_PER_UNIT
 
 _WAY_OUT: Final = "see the column mapping in the tutorial"
+_OWN: Final = {"sd_mm": "sd", "low_mm": "low", "high_mm": "high", "ex_vivo_second_mm": "second", "date": "date"}
 Unit = Literal["mm", "cm", "in"]
 Column = Annotated[str, Meta(min_length=1)]
 Modality = Annotated[
@@ -85,9 +86,8 @@ def read_wide(path: Path, mapping: ColumnMap, readings: Sequence[ReadingColumns]
     named = [(one.size, one.sd, one.low, one.high, one.reader, one.date) for one in readings]
     rows = _rows(path, mapping, [name for names in named for name in names])
     tidy = [_reading(row, reading, mapping) for row in rows for reading in readings]
-    keys = ("patient", "mass", "modality", "replicate")
-    called = [_called(reading, mapping) for reading in readings] * len(rows)
-    return _table(path, tidy, keys, lines=[row.line for row in rows for _ in readings], called=called)
+    keys, lines = ("patient", "mass", "modality", "replicate"), [row.line for row in rows for _ in readings]
+    return _table(path, tidy, keys, lines=lines, called=[_called(mapping, one) for one in readings] * len(rows))
 
 
 def read_wide_excision(path: Path, mapping: ColumnMap, excision: ExcisionColumns) -> Table:
@@ -108,21 +108,15 @@ def read_wide_excision(path: Path, mapping: ColumnMap, excision: ExcisionColumns
         }
         for row in rows
     ]
-    others = {"ex_vivo_second_mm": excision.second, "sd_mm": excision.sd, "date": excision.date}
-    called = _key_columns(mapping) | {name: column or excision.size for name, column in others.items()}
-    called |= {"ex_vivo_mm": excision.size}
-    return _table(path, sizes, ("patient", "mass"), lines=[row.line for row in rows], called=[called] * len(rows))
+    lines, called = [row.line for row in rows], [_called(mapping, excision)] * len(rows)
+    return _table(path, sizes, ("patient", "mass"), lines=lines, called=called)
 
 
-def _key_columns(mapping: ColumnMap) -> dict[str, str]:
-    return {"patient": mapping.patient, "mass": mapping.mass or mapping.patient}
-
-
-def _called(reading: ReadingColumns, mapping: ColumnMap) -> dict[str, str]:
-    """Column of the wide table by the one of a trial table; that of the size where it has none of its own."""
-    own = {"sd_mm": reading.sd, "low_mm": reading.low, "high_mm": reading.high, "date": reading.date}
-    own |= dict.fromkeys(("modality", "replicate", "size_mm", "status", "probability", "visit", "posterior"))
-    return _key_columns(mapping) | {name: column or reading.size for name, column in own.items()}
+def _called(mapping: ColumnMap, columns: ReadingColumns | ExcisionColumns) -> Mapping[str, str]:
+    """Column of the wide table by that of the tidy one: that of the size where it has none of its own."""
+    own = {tidy: getattr(columns, name, None) for tidy, name in _OWN.items()}
+    own |= {"patient": mapping.patient, "mass": mapping.mass or mapping.patient}
+    return defaultdict(lambda: columns.size, {tidy: column for tidy, column in own.items() if column})
 
 
 def _table(
@@ -131,7 +125,7 @@ def _table(
     keys: Sequence[str],
     *,
     lines: list[int],
-    called: list[dict[str, str]],
+    called: Sequence[Mapping[str, str]],
 ) -> Table:
     """Table of rows; no two may have the same keys."""
     columns = {name: [row[name] for row in rows] for name in rows[0]}

@@ -30,6 +30,7 @@ from tactile_bayes.files.mcap_records import McapRecords, Messages, read_records
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.findings import Finding, finding, findings_in
 from tactile_bayes.geometry import FloatArray
+from tactile_bayes.scans import LANDMARK_NAMES
 
 # --- Scan files: MCAP that Foxglove opens, readable after the recording program was killed.
 #
@@ -95,9 +96,7 @@ class ScanWriter:
         self._schema_of = {kind: self._schema(kind) for kind in (Grid, PoseInFrame)}
         self._frame_channel = self._channel("/pressure", Grid)
         self._pose_channel = self._channel("/pose", PoseInFrame)
-        self._landmark_channel = {
-            name: self._channel("/landmark", PoseInFrame, name=name) for name in scans.LANDMARK_NAMES
-        }
+        self._landmark_channel = {name: self._channel("/landmark", PoseInFrame, name=name) for name in LANDMARK_NAMES}
         self._grid = _grid_of(head).SerializeToString(deterministic=True)
 
     def _schema(self, kind: Any) -> int:
@@ -373,7 +372,7 @@ def _pose_table(messages: Messages) -> FloatArray:
 def _landmarks(records: McapRecords) -> scans.Landmarks | None:
     """Last touches, and the largest distance of an earlier one; None unless all `LANDMARK_NAMES` were touched."""
     points, apart = {}, []
-    for name in (*scans.LANDMARK_NAMES, NIPPLE):
+    for name in (*LANDMARK_NAMES, NIPPLE):
         touches = records.messages("/landmark", schema="foxglove.PoseInFrame", name=name)
         if not len(touches):
             if name == NIPPLE:

@@ -122,7 +122,7 @@ def may_be_thousands(number: str) -> bool:
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _DATE = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}")
 _INTEGER = re.compile(r"[+-]?[0-9]+")
-_IN_MM = re.compile(r"\w+_mm")
+_IN_MM = re.compile(r"\b(size|sd|low|high|ex_vivo|ex_vivo_second)_mm\b")
 _NOT_FINITE = {"nan", "inf", "infinity"}
 
 
@@ -150,9 +150,10 @@ class Table(Record):
 
     def error(self, row: int, column: str, what: str, *, way_out: str) -> BadDataError:
         """Error for a cell that is wrong beyond its schema, in the reader's words and columns; rows count from 0."""
-        names = self.called[row] if self.called else {}
-        column = " + ".join(dict.fromkeys(names.get(name, name) for name in column.split(" + ")))
-        what, way_out = (_IN_MM.sub(lambda name: names.get(name[0], name[0]), text) for text in (what, way_out))
+        if self.called:
+            names = self.called[row]
+            column = " + ".join(dict.fromkeys(map(names.__getitem__, column.split(" + "))))
+            what, way_out = (_IN_MM.sub(lambda name: names[name[0]], text) for text in (what, way_out))
         return _fault(self.line_numbers[row], column, what, way_out=way_out).with_path(self.path)
 
 

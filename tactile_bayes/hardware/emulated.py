@@ -483,6 +483,7 @@ class Emulator:
 
     sent = dropped = faulty = 0  #: Records sent, dropped and changed by faults since a START.
     unplugged = False
+    left = False  #: Whether the host reads no more: it has stopped the device, or has gone.
 
     def __post_init__(self) -> None:
         self._waiting = bytearray()
@@ -494,16 +495,12 @@ class Emulator:
         """Serve until the link breaks, or, with `once`, until a scan has been sent and read, or was stopped."""
         while not self.unplugged:
             self._step()
+            self.left = self.device.starts > 0 and (self.device.stopped or not self.link.connected())
             all_sent = self.device.end_sent and not self._waiting
             at_end = self._finished_at and (all_sent or time.monotonic() - self._finished_at > LINGER_S)
             if once and (self.left or at_end):
                 self.link.finish(0.0 if self.left else LINGER_S)
                 self.unplugged = True
-
-    @property
-    def left(self) -> bool:
-        """True when the host reads no more: it has stopped the device, or has gone."""
-        return self.device.starts > 0 and (self.device.stopped or not self.link.connected())
 
     def _step(self) -> None:
         writable = [self.link] if self._waiting else []

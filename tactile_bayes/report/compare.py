@@ -312,7 +312,7 @@ def compare_summary(report: CompareReport) -> str:
         more = [MORE]
     else:
         bare = [(visit.visit, one.reason) for visit in visits for one in visit.maps if one.status != "estimate"]
-        lines += first_lines([f"Visit {number}: {reason}." for number, reason in bare], 4)
+        lines += first_lines([f"Visit {number}: {reason}." for number, reason in bare], 4, ": -v.")
     return "\n".join([*lines, *finding_summary(report.findings, "check", most=2), *more, RESEARCH_USE]) + "\n"
 
 

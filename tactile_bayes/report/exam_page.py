@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from tactile_bayes.findings import finding_lines
+from tactile_bayes.findings import finding_lines, first_lines
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.posterior.verdict import SHARE_WITH_LUMP, chance_text
 from tactile_bayes.presets import INTERVAL
@@ -34,8 +34,7 @@ def exam_page(exam: ShownExam) -> str:
     height_mm = _LOWER_MM if crowded else _PICTURE_MM[1]
     frame = None if drawn is None else svg.Frame.within(drawn, width_mm=_PICTURE_MM[0], height_mm=height_mm)
     seed, findings = report.provenance.get("seed"), finding_lines(exam.report.findings, paper=True)
-    if len(findings) > most:
-        findings = [*findings[:most], f"And {len(findings) - most} more, which the full report tells."]
+    findings = first_lines(findings, most, ", which the full report tells.")
     masses = sorted(exam.main.masses, key=lambda one: one.number)
     masses = masses if len(masses) > 1 or exam.elsewhere else []
     made = f"method {report.origin.settings.get('method', 'unknown')}"

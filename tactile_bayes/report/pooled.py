@@ -201,7 +201,7 @@ def pooled_summary(report: PooledReport) -> str:
     if largest is None:
         lines.append(_no_size_line(report))
         bare = [f"Map {i}: {one.reason}." for i, one in enumerate(report.maps, 1) if one.max_size_mm is None]
-        lines += first_lines(bare, 4)
+        lines += first_lines(bare, 4, ": -v.")
     else:
         lines += estimate_text.size_table(report) + estimate_text.width_lines(report.leading.variance_share)
         parts = [
