@@ -343,10 +343,9 @@ def _bound(fit: ShiftFit, design: FloatArray, noise: dict[str, float]) -> float:
     """Standard error from independent errors of readings and from the tracker position error."""
     information = float(design @ design)
     reading_variance = float(fit.data.var()) / information
-    if POSE_NOISE[0] not in noise:
-        return float(np.sqrt(reading_variance))
     leverage = [np.bincount(fit.frame_numbers(), design * slope) for slope in fit.gradient.T]
-    position = sum(noise[name] ** 2 * float(axis @ axis) for name, axis in zip(POSE_NOISE[:2], leverage, strict=True))
+    pairs = zip(POSE_NOISE[:2], leverage, strict=True)
+    position = sum(noise.get(name, 0.0) ** 2 * float(axis @ axis) for name, axis in pairs)
     return float(np.sqrt(reading_variance + position / information**2))
 
 

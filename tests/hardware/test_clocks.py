@@ -27,7 +27,7 @@ from tactile_bayes.hardware.readings import (
     wrap_period,
 )
 from tactile_bayes.hardware.recorder import DeviceLine, LandmarkTouch, Recorder, RecordingReport
-from tactile_bayes.mapping.select import scan_findings
+from tactile_bayes.mapping.select import Span, overlap_cautions, scan_findings
 from tactile_bayes.scans import PressureFrames, TrackerPoses
 
 S = 1_000_000_000
@@ -349,6 +349,27 @@ def test_poses_that_do_not_cover_the_frames_are_reported(frames, poses, said):
     report = mismatch(frames, poses)
     assert report.cautions == said
     assert ("none of its" in report.fault) == any("no frame has a pose" in text for text in said)
+
+
+@pytest.mark.parametrize(
+    ("frames_s", "poses_s", "said"),
+    [
+        (np.arange(40) * 0.15, np.arange(600) * 0.01, []),  # a slow array
+        (0.01 * np.arange(600) + 0.08 * (np.arange(600) > 100), np.arange(610) * 0.01, []),
+        (
+            0.01 * np.arange(600) + 0.19 * (np.arange(600) > 100),
+            np.arange(620) * 0.01,
+            ["no frame for 0.20 s from 1.00 s on (longest gap)"],
+        ),
+        (
+            0.01 * np.arange(300, 500),
+            np.arange(200) * 0.01,
+            ["no frame has a pose: poses cover 0.00 to 1.99 s, frames 3.00 to 4.99 s"],
+        ),
+    ],
+)
+def test_a_gap_is_longer_than_a_tenth_of_a_second_and_than_five_intervals(frames_s, poses_s, said):
+    assert overlap_cautions(Span.of(frames_s), Span.of(poses_s)) == said
 
 
 def test_an_old_record_sent_again_is_a_gap_and_spoils_no_clock():

@@ -206,6 +206,20 @@ def test_readings_that_differ_by_rounding_alone_say_nothing():
     assert found.best is found.stated
 
 
+@pytest.mark.parametrize(
+    ("explained", "lasting", "spread", "contradicting"),
+    [(0.2, 0.6, 0.03, True), (0.3, 0.6, 0.03, False), (0.2, 0.4, 0.03, False), (0.2, 0.6, 0.01, False)],
+)
+def test_frames_contradict_each_other_by_lasting_errors_that_nothing_explains(
+    explained, lasting, spread, contradicting
+):
+    """Noise does not last, and what the head's response makes is small or explained."""
+    stated = Arrangement((), spread=spread, explained=explained, lasting=lasting, agreement=1.0)
+    assert stated.contradicting == contradicting
+    check = ArrangementCheck(stated, stated, 0.0, {"half-turn": 0.0}, stated.contradicting)
+    assert [one.kind for one in check.findings] == ["frames_contradict" if contradicting else "arrangement_unknown"]
+
+
 def test_a_scan_of_a_second_is_too_short():
     scan = lump()
     short = replace(scan, frames=PressureFrames(scan.frames.time_s[:100], scan.frames.counts[:100]))

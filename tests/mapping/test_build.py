@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.geometry import apply, rigid
+from tactile_bayes.mapping.arrangement import check_scan
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.scans import HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
@@ -334,11 +335,14 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize(("make", "message"), REFUSED.values(), ids=REFUSED)
-def test_scans_without_a_map_are_refused_in_one_line(make, message):
-    with pytest.raises(BadDataError, match=message) as refusal:
-        build_map(make())
-    assert "\n" not in str(refusal.value)
+@pytest.mark.parametrize("name", REFUSED)
+def test_scans_without_a_map_are_refused_in_one_line(name):
+    """By `check` in the same words, but for a motion that spans no plane, which it does not fit."""
+    make, message = REFUSED[name]
+    for refuses in (build_map,) if name in ("a line", "turned all round") else (build_map, check_scan):
+        with pytest.raises(BadDataError, match=message) as refusal:
+            refuses(make())
+        assert "\n" not in str(refusal.value)
 
 
 @pytest.mark.parametrize(
@@ -422,7 +426,7 @@ def test_landmarks_that_lie_apart_tell_that_a_patient_moved_between_scans(notch_
     scan = scans.make_scan(scans.strokes(), field=scans.uniform)
     marks, up = MARKS, np.array([0.0, 0.0, 1.0])
     moved = Landmarks(marks.sternal_notch_mm + notch_mm * up, marks.xiphoid_mm + xiphoid_mm * up)
-    built = build_map([replace(scan, landmarks=marks), replace(scan, landmarks=moved)])
+    built = build_map([replace(scan, landmarks=one) for one in (marks, marks, moved)])
     found = [one.text for one in built.findings if one.kind == "frames_contradict"]
     assert [text.startswith("the landmarks of two scans lie 12 mm apart") for text in found] == [True] * told
 

@@ -93,10 +93,11 @@ def test_a_full_call_of_extreme_values_sums_exactly():
     assert sums.variance()[0, 0] == 0.0
 
 
-def test_a_vast_map_is_refused_before_memory_is_asked_for():
+@pytest.mark.parametrize("far_mm", [1e9, 3e3])
+def test_a_vast_map_is_refused_before_memory_is_asked_for(far_mm):
     sums = CellSums(1.0)
     with pytest.raises(BadDataError, match=f"at most {MAX_CELLS} fit"):
-        add(sums, np.array([0.0, 1e9]), np.array([0.0, 1e9]), np.ones(2))
+        add(sums, np.array([0.0, far_mm]), np.array([0.0, far_mm]), np.ones(2))
 
 
 def test_nothing_added_is_an_empty_map():

@@ -164,6 +164,13 @@ def test_a_minute_gives_the_latency_to_a_tenth_of_a_millisecond(seed):
     assert build_map(late, latency_ms="auto").recipe.latency_ms == pytest.approx(LATE_MS, abs=0.1)
 
 
+def test_a_scan_shorter_than_the_delays_that_are_tried_has_no_latency():
+    """150 ms from the earliest to the latest: at one end or the other no frame has a pose."""
+    short = scans.make_scan(scans.strokes(), field=scans.gaussian(), interval_s=0.001)
+    with pytest.raises(BadDataError, match="no frame has a pose at every delay"):
+        build_map(short, latency_ms="auto", as_stated=True)
+
+
 def test_without_a_lump_every_latency_fits_and_none_is_given():
     plain = scanned(duration_s=7.0, lines=5, lumps=(), tracker=Tracker(latency_ms=LATE_MS))
     with pytest.raises(

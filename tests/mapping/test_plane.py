@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile_bayes.errors import BadDataError
 from tactile_bayes.geometry import apply, inverse
 from tactile_bayes.mapping.cells import FramePoses, HeadMoments, head_moments
 from tactile_bayes.scans import HeadGeometry
@@ -77,6 +78,13 @@ def test_the_normal_follows_the_head_turned_upside_down():
     down = head_moments(head, FramePoses(poses.position_mm, poses.rotation @ over, poses.known)).plane()
     assert down.plane_from_base[2, :3] == pytest.approx(-up.plane_from_base[2, :3], abs=1e-9)
     assert np.linalg.det(down.plane_from_base[:3, :3]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("far_mm", [1e12, -1e12])
+def test_a_head_beyond_all_trackers_is_refused(far_mm):
+    """From 2^52 steps of 15 nm on the places of the taxels have gaps."""
+    with pytest.raises(BadDataError, match=r"the head was 1e\+12 mm from the tracker's base; check the unit"):
+        head_moments(curved_head(), some_poses(1, far_mm=far_mm))
 
 
 def test_no_frame_has_no_moments():

@@ -21,9 +21,17 @@ from tactile_bayes.geometry import rigid
 from tactile_bayes.mapping.arrangement import check_scan
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.plausibility import against_no_lump, exam_findings, map_findings
-from tactile_bayes.mapping.select import find_faults
+from tactile_bayes.mapping.select import Jumps, find_faults
 from tactile_bayes.posterior.verdict import no_verdict
-from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import (
+    ElementCalibration,
+    HeadGeometry,
+    HeadShape,
+    Landmarks,
+    PressureFrames,
+    Scan,
+    TrackerPoses,
+)
 
 WINDOW = (5.0, 14.0)
 KPA_PER_COUNT = 0.004
@@ -136,6 +144,7 @@ UNLIKE: dict[str, tuple[Callable[[Scan], Scan], str]] = {
     ),
     "readings stand still": (counts(frozen), "readings stand still"),
     "hardly a frame in the window": (counts(light), "frames are used ("),
+    "two tools side by side": (moved(other_mm=8.0), "to and fro: they lie 13.9 mm beside"),
     "places in m": (moved(1e-3), "the head stood still"),
     "places in inches": (moved(1 / 25.4), "the head stood still"),
     "places in twentieths": (moved(20.0), "the places spread over"),
@@ -178,9 +187,12 @@ def test_an_estimate_from_it_says_that_it_cannot_show_a_lump(name: str) -> None:
     assert told in found.reason
 
 
-@pytest.mark.parametrize("amplitude", [0.0, 0.6])
-def test_a_right_scan_is_not_doubted(amplitude: float) -> None:
-    right = scan(amplitude)
+sixteen_bits = counts(lambda c: c * 65000 // c.max(), gain=4000 / 65000, saturation=65535)
+
+
+@pytest.mark.parametrize(("amplitude", "bits"), [(0.0, 12), (0.6, 12), (0.6, 16)])
+def test_a_right_scan_is_not_doubted(amplitude: float, bits: int) -> None:
+    right = scan(amplitude) if bits == 12 else sixteen_bits(scan(amplitude))
     assert check_scan(right, pressure_window_kpa=WINDOW, thorough=False).doubts == ()
     assert not [one for one in build_map(right).findings if one.kind in ("unlike_an_exam", "unusual_scan")]
 
@@ -258,6 +270,9 @@ def test_a_clock_that_stands_still_is_told_and_a_map_without_times_is_not_doubte
 def test_what_is_to_be_done_follows_from_the_figures(figures: dict[str, float], told: str | None) -> None:
     findings = exam_findings({"frames_total": 500.0, **figures})
     assert [one.remedy.startswith(str(told)) for one in findings] == ([] if told is None else [True])
+    for one in findings:  # on paper only what an examiner does
+        theirs = one.remedy.startswith(("press ", "scan "))
+        assert one.on_paper == (one.remedy if theirs else "have the sensor, the tracker and the recording checked")
 
 
 def test_a_map_of_few_frames_or_of_fine_cells_is_not_of_a_head_that_stood_still() -> None:
@@ -360,6 +375,7 @@ def test_a_map_that_dips_where_a_lump_would_rise_is_told_and_a_slope_is_not() ->
     assert any("the map dips by" in text for text in grid(lambda v: 2.0 - v))
     assert any("the map dips by" in text for text in grid(lambda v: 10.0 * (2.0 - v)))
     assert grid(lambda v: v - 0.6 * np.roll(v - 1.0, 15, axis=1)) == []  # beside a higher rise
+    assert grid(lambda v: v - 1.2) == []  # a level below 0, as of differences
     slope = 0.5 * np.mgrid[-25:26, -25:26][1] / 51
     assert grid(lambda v: v + slope) == grid(lambda v: v * (1.0 + slope)) == []
 
@@ -386,15 +402,34 @@ def corner(cells: int) -> np.ndarray:
     return inside
 
 
+@pytest.mark.parametrize(("saturated", "told"), [(128.0, []), (192.0, ["3.0 % of the readings were at full scale"])])
+def test_readings_left_out_at_full_scale_are_told_as_a_share_of_all(saturated: float, told: list[str]) -> None:
+    """Of 100 frames of 8 x 8 taxels."""
+    head, quality = HeadShape(8, 8, 2.0, None), {"saturated_readings": saturated}
+    one = replace(grid_map(np.ones((51, 51)) + np.arange(51) / 500), head=head, frame_count=100, quality=quality)
+    assert [found.text[:40] for found in map_findings(one)] == told
+
+
 def test_a_dead_line_and_a_plateau_are_told_and_a_lump_is_not() -> None:
     assert any("51 of 2601 cells lie far outside the rest" in text for text in grid(dead))
     assert any("cells stand at the highest value" in text for text in grid(lambda v: np.minimum(v, 1.2)))
     assert grid(lambda v: v) == []
     assert grid(lambda v: np.minimum(v, np.sort(v, axis=None)[-20])) == []  # 20 cells at the top: too few to tell
+    assert grid(lambda v: v + (np.arange(51) > 25)) == []  # two levels are no values that stand for none
     assert grid(lambda v: np.rint(100 * v)) == []  # whole numbers, as an image has them
 
 
 # --- taxels and refusals
+
+
+@pytest.mark.parametrize(
+    ("away", "told"),
+    [([False, True, True], ["once"]), ([False, True, False], ["2 times"]), ([False, False, False], [])],
+)
+def test_jumps_are_counted(away: list[bool], told: list[str]) -> None:
+    places = np.zeros((3, 3)) + 300.0 * np.array(away)[:, None]
+    jumps = Jumps.of(TrackerPoses(np.arange(3) / 100, places, np.tile([1.0, 0, 0, 0], (3, 1))))
+    assert [line.split(",")[0] for line in jumps.cautions()] == [f"the poses jump {often}" for often in told]
 
 
 @pytest.mark.parametrize(
