@@ -364,7 +364,7 @@ def _compared(overlap: _Overlap, judged: Sequence[Arrangement], *, tried: int) -
         if len(one.corrections) == 1
     }
     log_odds = stretches * best.gain_over(against) - log(tried)
-    if best is stated or min(log_odds, stretches * beside - log(tried)) < log(LIKELY_ODDS):
+    if min(log_odds, stretches * beside - log(tried)) < log(LIKELY_ODDS):
         return ArrangementCheck(stated, stated, 0.0, excluded, stated.contradicting)
     return ArrangementCheck(stated, best, log_odds, excluded, stated_latency_ms=overlap.latency_ms)
 

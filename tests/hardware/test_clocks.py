@@ -14,6 +14,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, DeviceError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import ScanWriter, read_scan
+from tactile_bayes.findings import finding
 from tactile_bayes.hardware.readings import (
     LATEST_NS,
     MOST_STEPS,
@@ -27,7 +28,7 @@ from tactile_bayes.hardware.readings import (
     wrap_period,
 )
 from tactile_bayes.hardware.recorder import DeviceLine, LandmarkTouch, Recorder, RecordingReport
-from tactile_bayes.mapping.select import Span, overlap_cautions, scan_findings
+from tactile_bayes.mapping.select import Span, overlap_cautions, scan_findings, with_times
 from tactile_bayes.scans import PressureFrames, TrackerPoses
 
 S = 1_000_000_000
@@ -369,7 +370,10 @@ def test_poses_that_do_not_cover_the_frames_are_reported(frames, poses, said):
     ],
 )
 def test_a_gap_is_longer_than_a_tenth_of_a_second_and_than_five_intervals(frames_s, poses_s, said):
-    assert overlap_cautions(Span.of(frames_s), Span.of(poses_s)) == said
+    spans = Span.of(frames_s), Span.of(poses_s)
+    assert overlap_cautions(*spans) == said
+    noted = [finding("times_apart", text) for text in said]  # by the recorder, too
+    assert [one.text for one in with_times(noted, *spans)] == said
 
 
 def test_an_old_record_sent_again_is_a_gap_and_spoils_no_clock():

@@ -141,7 +141,7 @@ def test_a_motion_along_a_line_tells_nothing_and_the_report_says_so():
 def test_the_way_to_the_skin_does_not_count():
     """Poses without a used frame near them may go any way."""
     scan = scan_of(1)
-    away = np.arange(200) / 50.0 + 300.0
+    away = np.arange(200) / 50.0 + scan.poses.time_s[-1] + 0.06
     lift = np.linspace(0, 500, 200)[:, None] * inverse(np.eye(4))[2, :3]
     poses = TrackerPoses(
         np.concatenate([scan.poses.time_s, away]),

@@ -8,11 +8,12 @@ import pytest
 
 from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.geometry import rigid
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.map import advise_cell
 from tactile_bayes.mapping.select import timing_figures
 from tactile_bayes.report.map import map_text
-from tactile_bayes.scans import ElementCalibration, Landmarks, PressureFrames, Scan, TrackerPoses
+from tactile_bayes.scans import ElementCalibration, HeadGeometry, Landmarks, PressureFrames, Scan, TrackerPoses
 
 
 def curved_strokes(*, field=None, bend_mm: float = 0.0) -> Scan:
@@ -57,6 +58,39 @@ def test_the_plane_near_the_mass_follows_the_skin_there():
     assert "all frames used; longest over second spread" in map_text(whole)
     with pytest.raises(BadDataError, match=r"no frame lies within 0\.001 mm|lie on a line"):
         build_map(bent, plane_radius_mm=0.001)
+
+
+def test_a_radius_whose_frames_lie_on_a_line_grows():
+    """A row of taxels that slides lengthwise over the lump, its other strokes 10 mm beside."""
+    across = scans.strokes(lines=3, spacing_mm=10.0)
+    row = scans.flat_head(rows=1, columns=16, pitch_mm=1.0, lever_mm=(5.0, -20.0, 80.0))
+    lengthwise = scans.make_scan(across[:, ::-1], field=scans.gaussian(sigma_x=3.0, sigma_y=3.0), head=row)
+    quality = build_map(lengthwise, plane_radius_mm="auto", as_stated=True).quality
+    assert quality["plane_radius_mm"] == pytest.approx(1.5 * 15.0 / 2)
+    assert quality["plane_rms_mm"] == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 12.0])
+def test_the_motion_of_the_head_is_measured_in_degrees_and_millimetres(tilt_deg):
+    """Of a head so small that its own taxels do not count; strokes of 30 mm, 15 mm from the first to the last."""
+    centres = scans.strokes(reach_mm=15.0, lines=4, spacing_mm=5.0)
+    turned = scans.make_scan(centres, head=scans.flat_head(pitch_mm=0.02), yaw_deg=16.0 * (-1.0) ** np.arange(120))
+    lever = rigid(scans.rotation(tilt_deg, about=(0, 1, 0)), np.zeros(3))
+    head = HeadGeometry(turned.head.surface_mm, turned.head.pitch_mm, lever)
+    made = build_map(replace(turned, head=head), as_stated=True)
+    spread = centres.std(axis=0)
+    expected = {
+        "tilt_deg": np.degrees(
+            np.arctan(np.tan(np.radians(tilt_deg)) * np.cos(np.radians(16.0)))
+        ),  # of the mean normal
+        "yaw_sd_deg": 16.0,
+        "span_x_mm": 30.0,
+        "span_y_mm": 15.0,
+        "plane_condition": spread[0] / spread[1],
+    }
+    assert {name: made.quality[name] for name in expected} == pytest.approx(expected, rel=0.01, abs=0.05)
+    told = {one.kind for one in made.findings} & {"tilted_head", "turned_head"}
+    assert told == ({"tilted_head", "turned_head"} if tilt_deg else {"turned_head"})
 
 
 @pytest.mark.parametrize("radius", [0.0, -3.0, float("nan"), float("inf"), "wide"])

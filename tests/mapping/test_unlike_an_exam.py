@@ -374,6 +374,7 @@ def test_a_map_that_dips_where_a_lump_would_rise_is_told_and_a_slope_is_not() ->
     """Readings that fall where pressure rises, as of a white that is zero or an inverting amplifier."""
     assert any("the map dips by" in text for text in grid(lambda v: 2.0 - v))
     assert any("the map dips by" in text for text in grid(lambda v: 10.0 * (2.0 - v)))
+    assert any("the map dips by" in text for text in grid(lambda v: np.where(corner(5), np.nan, 2.0 - v)))
     assert grid(lambda v: v - 0.6 * np.roll(v - 1.0, 15, axis=1)) == []  # beside a higher rise
     assert grid(lambda v: v - 1.2) == []  # a level below 0, as of differences
     slope = 0.5 * np.mgrid[-25:26, -25:26][1] / 51
@@ -415,7 +416,7 @@ def test_a_dead_line_and_a_plateau_are_told_and_a_lump_is_not() -> None:
     assert any("cells stand at the highest value" in text for text in grid(lambda v: np.minimum(v, 1.2)))
     assert grid(lambda v: v) == []
     assert grid(lambda v: np.minimum(v, np.sort(v, axis=None)[-20])) == []  # 20 cells at the top: too few to tell
-    assert grid(lambda v: v + (np.arange(51) > 25)) == []  # two levels are no values that stand for none
+    assert grid(lambda v: v + 3.0 * (np.arange(51) > 25)) == []  # two levels are no values that stand for none
     assert grid(lambda v: np.rint(100 * v)) == []  # whole numbers, as an image has them
 
 
