@@ -391,7 +391,6 @@ Result = TypeVar("Result")
 _WINDOW = 1024  #: Most items submitted ahead of their results; bounds the memory of waiting items.
 _LISTED = 3  #: Most items named in the line of an error they share.
 
-
 DIED_TWICE = (
     "its process ended twice without an answer (killed, perhaps for lack of memory); run it again with fewer --workers"
 )

@@ -23,7 +23,6 @@ EXIT_NO_ESTIMATE = 6
 EXIT_INTERRUPTED = 130
 EXIT_READER_GONE = 141
 
-
 BY_OPTIONS: ContextVar[bool] = ContextVar("by_options", default=False)
 """True while the command line runs: its errors name options, those of Python's functions their keywords."""
 

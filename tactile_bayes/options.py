@@ -332,7 +332,6 @@ class IdentityOptions(Options):
 
 # --- Options of the commands on devices and in the laboratory.
 
-
 Baud = Annotated[int, Meta(ge=300)]
 Side = Literal["left", "right", "phantom"]
 Posture = Literal["supine", "oblique", "sitting", "phantom"]

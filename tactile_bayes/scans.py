@@ -24,7 +24,6 @@ SIDE_SHARE: Final = 0.08
 RISE_MM: Final = 0.3
 UNEVEN_MM: Final = 0.1
 
-
 Count = Annotated[int, Meta(ge=1)]
 
 

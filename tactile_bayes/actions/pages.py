@@ -65,8 +65,6 @@ def compare_action(
         raise UsageError("--pdf prints the page that --output names; give -o GROWTH.html too")
     PageLabels(title, name)
     page = None if output is None else PageFiles(output, pdf, force)
-    if page is not None:
-        page.check()
     estimates, total = list[list[SizeEstimate]](), sum(len(maps) for maps in visits)
     with progress_bar("maps") as progress:
         for maps in visits:
@@ -100,7 +98,6 @@ def report_action(
 ) -> None:
     """Write one page of an exam: the map, the size with its intervals, the place, and how good the exam was."""
     labels, page = PageLabels(title, name, day), PageFiles(output, pdf, force)
-    page.check()
     typed = [name for name in options if name in typed_options()]
     notice = partial(click.echo, err=True)
     exam = exam_from_files(files, partial(make_settings, **options), typed=typed, notice=notice)

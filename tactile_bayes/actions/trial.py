@@ -32,7 +32,7 @@ def validate_action(
     if pdf is not None and html is None:
         raise UsageError("--pdf prints the page that --html names; give --html REPORT.html too")
     if html is not None:
-        PageFiles(html, pdf, force).check()
+        PageFiles(html, pdf, force)
     title, chosen = settings_by(protocol, settings, typed=typed_options())
     inputs = load_trial(trial, excision, columns)
     protect_inputs(*inputs.files.values())

@@ -146,7 +146,6 @@ class Comparison(TextResult, eq=False):
     ) -> None:
         """Write one page of the mass over time as HTML, as ``compare -o`` does, and with `pdf` also print it."""
         files = PageFiles(output_path(path, "HTML"), path_of(pdf), force)
-        files.check()
         PageLabels(title, name)
         files.write(self.page_text(title=title, name=name))
 

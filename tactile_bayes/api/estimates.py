@@ -270,7 +270,6 @@ def exam_report(
         When a file is damaged or of another kind, or the maps are of different exams.
     """
     page, labels = PageFiles(output_path(path, "HTML"), path_of(pdf), force), PageLabels(title, name, day)
-    page.check()
     sources = as_list(files)
     if not sources:
         raise UsageError("nothing was given to report; give maps, or an estimate")

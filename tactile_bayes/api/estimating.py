@@ -36,7 +36,6 @@ from tactile_bayes.size.pooling import Calibration
 Notice = Callable[[str], None]
 WhyNone = tuple[str, str]  #: Reason for widths without a size where no calibration was named, and a remedy.
 
-
 _LEAST_SQUARES: WhyNone = (
     "optimise is the paper's least squares, and the shipped calibrations were learned with correlated errors "
     "and a free level, which make other widths; widths only",

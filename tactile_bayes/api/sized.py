@@ -267,7 +267,6 @@ class SizedExam(SizeResult, eq=False, dict=True, kw_only=True):
         from tactile_bayes.report.exam_page import exam_page  # a plain estimate has no page
 
         page, labels = PageFiles(output_path(path, "HTML"), path_of(pdf), force), PageLabels(title, name, day)
-        page.check()
         page.write(exam_page(replace(self.exam(), labels=labels)))
 
 

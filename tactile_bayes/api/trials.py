@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
 # --- Analysis of a trial from its tables: errors, lines, agreement and calibration of each modality.
 
-
 _FROM_FILES: Final = (
     "Intervals from the column posterior are those of max_size_mm: without --repeatability for exams as alike as "
     "simulated ones, narrower than the interval that `estimate` leads with"

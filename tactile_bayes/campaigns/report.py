@@ -34,7 +34,6 @@ from tactile_bayes.trial.readings import at_excision, day_of
 TACTILE, POOLED_MODALITY = "tactile", "tactile-pooled"
 _SIZES: Final = {"size_mm": "median", "sd_mm": "sd", "low_mm": "low", "high_mm": "high", "probability": "probability"}
 
-
 Pooled = Mapping[str, PooledReport]  #: Each pooled mass, by its name.
 
 

@@ -23,7 +23,6 @@ from tactile_bayes.inference.draws import Quantity
 
 PROBABILITY = 0.95
 
-
 _COLUMNS: Final = {"size_mm": "median", "low_mm": "low", "high_mm": "high", "probability": "probability"}
 """Columns of a trial table that a size fills."""
 StatedSize = Quantity | Interval

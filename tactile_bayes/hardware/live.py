@@ -44,7 +44,6 @@ from tactile_bayes.scans import CountArray, ElementCalibration, HeadGeometry, Tr
 _SIZES: Final = struct.Struct("<II")
 _REPORTED: Final = ("frames", "frames_lost", "poses", "duration_s", "unseen")  #: Fields of the recorder's report.
 
-
 FeedMessage = tuple[Any, ...]
 """``"frame"``, device time, host time, counts; ``"pose"``, device time, place, quaternion; ``"landmark"``, name, place;
 or ``"report"`` and some fields of the report."""

@@ -107,7 +107,6 @@ def from_xiphoid(x_mm: float, y_mm: float) -> str:
 
 # --- Masses of a map that may be one lump: whether they touch, and how long they are together.
 
-
 SizedMass = tuple[int, tuple[float, float], Sequence[Quantity]]
 """Number, x and y in mm, and the largest size: as `max_size_mm`, and with the interval that reports lead with."""
 
@@ -266,7 +265,6 @@ SUPPOSED_PAIRS = (
     ("it centred on the gland's surface", "centred", "resting", "", " on the gland"),
 )
 """Words of the first supposition, names of both, and words after each with its value."""
-
 
 Suppositions = Mapping[str, reports.Supposed]
 

@@ -116,7 +116,6 @@ NARROWED_BY = {
 }
 WORTH_NARROWING = 10.0  #: Percent of the variance from which a source is worth a way to narrow it.
 
-
 ON_PAPER = {
     "map": "how clearly this map shows the lump",
     "between_maps": "differences between exams of one lump",

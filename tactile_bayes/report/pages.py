@@ -126,14 +126,13 @@ def growth_line(rows: Sequence[Growth], table: str) -> str:
 
 
 class PageFiles(Record):
-    """Files that a page is written to."""
+    """Files that a page is written to; names that could not be written are refused, before any work is done."""
 
     html: Path
     pdf: Path | None = None  #: None writes none.
     force: bool = False  #: Overwrite them.
 
-    def check(self) -> None:
-        """Refuse names that could not be written, before any work is done."""
+    def __post_init__(self) -> None:
         check_suffix(self.html, "HTML")
         refuse_existing(self.html, force=self.force)
         if self.pdf is not None:

@@ -189,7 +189,6 @@ _BAR_STEPS: Final = 40
 _COLOUR_STEPS: Final = 3 * (_BAR_STEPS - 1)  #: With grey and white few enough that a PNG's palette has each as it is.
 _BARBS: Final = ((0.87, 0.5), (0.87, -0.5))
 
-
 THUMB_SCALE: Final = 0.4  #: Of life size, of thumbnails.
 THUMB_ENDS: Final = (0.85, 1.45)  #: Values at the ends of their colours, in parts of the level beside the lump.
 _THUMB_ROOM_MM: Final = 48.0

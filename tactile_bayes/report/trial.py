@@ -18,7 +18,6 @@ DIGITS: Final = 12  #: Of the numbers of `validate`'s file, so that the order of
 
 # --- Text of a trial plan: one line per design, then the benefit of more maps.
 
-
 _NO_MASS_SD: Final = (
     "The pilot's masses differ no more than maps of one mass do, so its mass sd is taken as 0: with few masses that is "
     "chance; see what --mass-sd 0.1 makes of the plan."

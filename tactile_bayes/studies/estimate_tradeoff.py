@@ -295,7 +295,6 @@ FIELDS = (8, 12, 18, 24, 30, MOST_FIELD_COSINES)
 RADII_MM = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)
 METHOD, ACCURACY, FIELD, WINDOW = "method", "draws", "noise field", "fit window"
 
-
 EstimateSetting = Setting[SamplerSettings]
 
 

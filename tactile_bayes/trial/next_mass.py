@@ -47,7 +47,6 @@ CALIPER = 0.05
 # observed, also when that is 0 (Kerman 2011, Electron. J. Statist. 5, 1450).
 PRIOR_MISS = 1 / 3
 
-
 ACCURACY_SD = 0.03  #: Monte-Carlo error of interval ends, in posterior SDs.
 Sampler = Callable[..., ParameterDraws]  #: Draws from a log density, as `draw` does.
 

@@ -180,7 +180,6 @@ LEAST_MM, MOST_MM = 2.0, 150.0
 UNITS = {"cm": 10.0, "inches": 25.4, "m": 1000.0}
 NEAR = 1.6  #: A median ratio this near to a unit's factor is doubted: no modality is wrong sixfold in the median.
 
-
 LEAST_COPIED = 5  #: Fewest masses whose sizes are doubted where all are those after excision.
 
 

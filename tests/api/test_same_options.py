@@ -143,7 +143,7 @@ def test_a_page_that_cannot_be_printed_leaves_neither_file(
     monkeypatch.setattr(printed, "find_printer", lambda: lambda page: page.encode()[:9])
     tb.exam_report(folder / "post.nc", tmp_path / "page.html", pdf=tmp_path / "page.pdf")
     assert (tmp_path / "page.pdf").read_bytes() == b"<!doctype"
-    assert printed.PageFiles(tmp_path / "new.html").check() is None
+    assert printed.PageFiles(tmp_path / "new.html").pdf is None
 
 
 @pytest.mark.long

@@ -53,7 +53,7 @@ def test_two_outputs_of_one_file_are_refused_in_every_command(
     with pytest.raises(UsageError, match="records and dictionary"):
         Outputs(tmp_path / "one", tmp_path / "two", to="csv", force=True).check(files=True)
     with pytest.raises(UsageError, match="page and PDF at once"):
-        PageFiles(tmp_path / "one", tmp_path / "two", force=True).check()
+        PageFiles(tmp_path / "one", tmp_path / "two", force=True)
 
 
 @pytest.mark.parametrize(
