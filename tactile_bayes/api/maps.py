@@ -19,6 +19,7 @@ from tactile_bayes.api.arguments import (
     path_of,
     plain,
     required_path,
+    table_of,
     takes,
 )
 from tactile_bayes.declarations import EXACT, Record, as_dict, from_plain, replace, to_plain
@@ -32,7 +33,7 @@ from tactile_bayes.files.instrument import head_geometry, read_scene, scene_of
 from tactile_bayes.files.map_nc import read_map_and_scans, write_map
 from tactile_bayes.files.named_arrays import Grid, Source, read_array_map, step_of
 from tactile_bayes.files.provenance import Provenance, repeated_scans, scan_facts
-from tactile_bayes.files.scan_text import kind_of_column
+from tactile_bayes.files.scan_text import kind_of_column, read_poses
 from tactile_bayes.findings import Finding, finding_lines
 from tactile_bayes.forward.scene import SimulatedScan
 from tactile_bayes.geometry import FloatArray
@@ -54,7 +55,6 @@ if TYPE_CHECKING:
 
 # --- Scans and tactile maps: read, simulate, build, show.
 
-_POSE_COLUMNS = ["time", "x", "y", "z", "qw", "qx", "qy", "qz"]
 _DEMO = Path(__file__).resolve().parents[1] / "demo" / "scan.mcap"
 
 
@@ -306,7 +306,7 @@ def map_of(given: Any, **stated: Any) -> Map:
         return read_map(path)
     if path is None and (not stated or not hasattr(given, "__array__")):
         way_out = "build one with build_map, give a path, or map_of(numpy.array(...), spacing_mm=...)"
-        if isinstance(given, list | tuple) and not stated:
+        if isinstance(given, list | tuple) and not stated and not any(isinstance(one, list | tuple) for one in given):
             way_out = "give one map after the other, or pool the maps of one mass with pool"
         raise UsageError(f"a map is wanted, not {type(given).__name__}; {way_out}")
     marks = stated.get("no_value", ())
@@ -363,8 +363,8 @@ def scan(
         (n,) times of the frames, s, or `rate_hz` in its place.
     poses
         Of the tracker's sensor in its base: ``(time, matrices)`` with (m, 4, 4) homogeneous matrices, ``(time,
-        position, quaternion)`` with mm and the scalar first, or (m, 8) numbers in that order. Or the path of a table of
-        the tracker's, as `--poses` takes.
+        position, quaternion)`` with mm and the scalar first, or (m, 8) numbers in that order. Or a table of the
+        tracker's, as `--poses` takes: its path, or a DataFrame with named columns.
     head
         Path of a HEAD.json, what stands in it, or the head of another scan: ``pitch_mm``, ``surface_mm`` or ``rows``,
         ``columns`` and ``radius_mm``, and ``scanhead_from_tracker``.
@@ -433,6 +433,8 @@ def _poses(poses: Any, stated: ArrayMap) -> Source:
         return imports.pose_source(path_of(poses), stated)
     if isinstance(poses, TrackerPoses):
         poses = poses.time_s, poses.position_mm, poses.quaternion_wxyz
+    elif any(kind_of_column(str(name)) for name in getattr(poses, "columns", ())):
+        return read_poses(table_of(poses, "poses"), stated)
     elif not isinstance(poses, tuple | list) or len(poses) not in (2, 3):
         numbers = _array(poses)
         if numbers.ndim != 2 or numbers.shape[1] != 8:
@@ -440,9 +442,6 @@ def _poses(poses: Any, stated: ArrayMap) -> Source:
                 f"poses is {type(poses).__name__} of shape {numbers.shape}; give (time, matrices), (time, position, "
                 "quaternion) or (m, 8) numbers"
             )
-        kinds = [kind_of_column(str(name)) for name in getattr(poses, "columns", ())]
-        if all(kinds) and kinds not in ([], _POSE_COLUMNS):
-            raise UsageError(f"poses has the columns {', '.join(kinds)}; give them as {', '.join(_POSE_COLUMNS)}")
         poses = numbers[:, 0], numbers[:, 1:4], numbers[:, 4:]
     names = ("pose_time_s", "pose_matrix") if len(poses) == 2 else ("pose_time_s", "position_mm", "quaternion_wxyz")
     return Source({name: _array(value) for name, value in zip(names, poses, strict=True)})

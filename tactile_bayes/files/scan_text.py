@@ -19,7 +19,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.arrays_layout import PoseLayout, Stated
 from tactile_bayes.files.named_arrays import Source
-from tactile_bayes.files.tables import NO_SENSEL, Line, is_label_sequence, number, read_text_table, unit_of_time
+from tactile_bayes.files.tables import NO_SENSEL, Line, Sheet, is_label_sequence, number, read_text_table, unit_of_time
 from tactile_bayes.geometry import BoolArray, FloatArray
 
 # --- Poses: columns by their names, or numbers in a stated layout.
@@ -63,10 +63,10 @@ _IDENTITY: Final = {"matrix": np.eye(4).ravel()[:12], "wxyz": np.eye(7)[3], "xyz
 _LARGEST_MM: Final = 1e7  # NDI writes -3.697314e28 where a tool is not seen
 
 
-def read_poses(path: Path, stated: Stated) -> Source:
+def read_poses(source: Path | Sheet, stated: Stated) -> Source:
     """Read times, places and rotations; rows in which the tool is not seen are left out and counted."""
-    with in_file(path):
-        lines, words = read_text_table(path, stated.decimal)
+    with in_file(source.name if isinstance(source, Sheet) else source):
+        lines, words = read_text_table(source, stated.decimal)
         header = next((line for line in lines if is_header_of_poses(line)), None)
         poses = _poses_without_names(lines, stated) if header is None else _poses_by_names(lines, header, stated)
         return replace(poses, notes=(f"poses: {words}", *poses.notes))

@@ -467,27 +467,29 @@ def number(text: str, *, decimal_comma: bool) -> float | None:
     return None
 
 
-def read_lines(path: Path) -> list[str]:
+def read_lines(source: Path | Sheet) -> list[str]:
     """Lines of a text in UTF-8, or in UTF-16 with a byte order mark; the minus sign U+2212 becomes a hyphen."""
-    data = read_bytes(path, most=TABLE_BYTES)
-    if b"\0" in data and (kind := kind_of(path)):
-        raise BadDataError(f"is {kind}, not a table of text", way_out="save it as .csv", path=str(path))
-    text = decoded(data, path=path, way_out=_TEXT_AS_UTF8, as_utf8=_TEXT_AS_UTF8, may_be=("UTF-16",))
+    if isinstance(source, Sheet):
+        return source.text.splitlines()
+    data = read_bytes(source, most=TABLE_BYTES)
+    if b"\0" in data and (kind := kind_of(source)):
+        raise BadDataError(f"is {kind}, not a table of text", way_out="save it as .csv", path=str(source))
+    text = decoded(data, path=source, way_out=_TEXT_AS_UTF8, as_utf8=_TEXT_AS_UTF8, may_be=("UTF-16",))
     if "\0" in text:
-        raise BadDataError("is not text", way_out="give numbers as .npz, .npy, .mat, HDF5 or a table", path=str(path))
+        raise BadDataError("is not text", way_out="give numbers as .npz, .npy, .mat, HDF5 or a table", path=str(source))
     text = text.replace("\r\n", "\n").replace("\r", "\n").replace("\u2212", "-")
     return text.removesuffix("\n").split("\n")
 
 
-def read_text_table(path: Path, decimal: str | None = None) -> tuple[list[Line], str]:
+def read_text_table(source: Path | Sheet, decimal: str | None = None) -> tuple[list[Line], str]:
     """Lines of a text that are not blank, split so that most fields are numbers, and their separator in words.
 
     Where no `decimal` (``"point"`` or ``"comma"``) is stated, commas that may separate thousands are refused.
     """
-    texts = read_lines(path)
+    texts = read_lines(source)
     separator = detect_separator(texts)
     if not separator:
-        raise BadDataError("holds no table of numbers", way_out="give one frame or pose a line", path=str(path))
+        raise BadDataError("holds no table of numbers", way_out="give one frame or pose a line")
     split = []
     for i, one in enumerate(texts, start=1):
         if one.strip():

@@ -72,6 +72,7 @@ def test_masks_frames_of_pandas_and_files_are_taken(tmp_path: Path) -> None:
         (pandas.Series([1.0, 2.0]), {"spacing_mm": 1}, BadDataError, r"mean has shape \(2,\)"),
         (np.array([["a"]]), {"spacing_mm": 1}, BadDataError, "mean is <U1; give real numbers"),
         ([[1.0, 2.0]], {"spacing_mm": 1}, UsageError, "a map is wanted, not list.*numpy.array"),
+        ([[1.0, 2.0]], {}, UsageError, "a map is wanted, not list.*numpy.array"),
         (np.ones((3, 3)), {"spacing": 1}, TypeError, "has no keyword 'spacing'; did you mean spacing_mm"),
         (np.ones((3, 3)), {"spacing_mm": "1"}, UsageError, "spacing_mm is '1'"),
         (np.ones((3, 3)), {"spacing_mm": 1, "level": "auto"}, UsageError, "level is 'auto'"),

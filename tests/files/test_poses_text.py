@@ -14,7 +14,7 @@ from engineers_arrays import pressures, short_scan
 from scipy.spatial.transform import Rotation
 
 import tactile_bayes as tb
-from tactile_bayes.errors import BadDataError, UsageError
+from tactile_bayes.errors import BadDataError
 from tactile_bayes.scans import Scan
 
 SCAN = short_scan()
@@ -223,13 +223,12 @@ def test_columns_of_a_dataframe_are_not_taken_for_others(tmp_path: Path) -> None
         np.column_stack([TIME, PLACE, quaternion]), columns=["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
     )
     stated = {"head": SCAN.head, "unit": "kPa"}
-    with pytest.raises(UsageError, match="qy, qz, qw; give them as time, x, y, z, qw, qx, qy, qz"):
-        tb.scan(pressures(SCAN), SCAN.frames.time_s, poses, **stated)
+    found = tb.scan(pressures(SCAN), SCAN.frames.time_s, poses, **stated)
+    np.testing.assert_allclose(found.poses.quaternion_wxyz, np.roll(quaternion, 1, axis=1))
     rows = np.column_stack([1000 * SCAN.frames.time_s + 7, pressures(SCAN).reshape(len(SCAN.frames), -1)])
     names = ["time_ms", *(f"S{i}" for i in range(rows.shape[1] - 1))]
     np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header=",".join(names), comments="")
-    ordered = poses[["t", "x", "y", "z", "qw", "qx", "qy", "qz"]]
-    found = tb.scan(tmp_path / "a.csv", SCAN.frames.time_s, ordered, **stated)
+    found = tb.scan(tmp_path / "a.csv", SCAN.frames.time_s, poses, **stated)
     np.testing.assert_allclose(found.poses.quaternion_wxyz, np.roll(quaternion, 1, axis=1))
     np.testing.assert_array_equal(found.frames.time_s, SCAN.frames.time_s)
 

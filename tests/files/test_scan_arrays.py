@@ -661,6 +661,20 @@ def test_python_takes_lists_frames_dates_and_half_floats_and_no_masked_reading(p
         tb.scan(kpa.swapaxes(1, 2), time, scan.poses, head=head, unit="kPa")
 
 
+def test_a_table_of_poses_with_names_is_read_as_the_same_table_in_a_file(pressed: Arrays, scan: Scan) -> None:
+    kpa, time, poses = pressed["frames"], scan.frames.time_s, scan.poses
+    right = {"time_ms": 1000 * poses.time_s}
+    right |= {f"{axis}_cm": 0.1 * poses.position_mm[:, i] for i, axis in enumerate("xyz")}
+    right |= {f"q{axis}": poses.quaternion_wxyz[:, i] for i, axis in enumerate("wxyz")}
+    for names in (list(right), [*list(right)[:4], "qx", "qy", "qz", "qw"]):
+        found = tb.scan(kpa, time, pd.DataFrame(right)[names], head=scan.head, unit="kPa").poses
+        np.testing.assert_allclose(found.position_mm, poses.position_mm, atol=1e-9)
+        np.testing.assert_allclose(found.quaternion_wxyz, poses.quaternion_wxyz, atol=1e-12)
+        np.testing.assert_allclose(found.time_s, poses.time_s, atol=1e-9)
+    with pytest.raises(BadDataError, match=r"poses \(DataFrame\): line 1 names no qz; name columns"):
+        tb.scan(kpa, time, pd.DataFrame(right).drop(columns="qz"), head=scan.head, unit="kPa")
+
+
 def test_a_scene_needs_no_file() -> None:
     made = tb.simulate({"scene": {"duration_s": 0.2}, "lump": [{"amplitude": np.float64(0.3)}]})
     assert len(made.scan.frames) == 40
