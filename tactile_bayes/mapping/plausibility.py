@@ -92,6 +92,8 @@ def _plateau(part: SelectedFrames, frames: IndexArray) -> tuple[int, int]:
 
     It is sought in a sample of the frames, and its readings are counted in all.
     """
+    if not len(frames):
+        return 0, 0
     good = np.flatnonzero(part.good_taxels)
     counts = part.scan.frames.counts.reshape(len(part.used), -1)
     end = part.scan.element_calibration.saturation_count

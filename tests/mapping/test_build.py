@@ -125,6 +125,11 @@ def test_every_frame_twice_gives_the_same_mean_and_twice_the_readings():
     assert two.frame_count == 2 * one.frame_count
 
 
+def test_a_scan_without_a_frame_adds_nothing_to_another():
+    scan = stroke_scan()
+    assert same(build_map([scan, scans.part(scan, slice(0))]), build_map(scan))
+
+
 def test_dividing_by_the_mean_takes_the_frames_levels_out():
     levels = 8 + 3 * np.sin(np.arange(120))
     steady, varying = stroke_scan(levels_kpa=8.0), stroke_scan(levels_kpa=levels)
