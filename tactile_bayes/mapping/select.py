@@ -468,8 +468,8 @@ def refuse_without_frames(selections: list[SelectedFrames], *, pressure_window_k
     if not total:
         raise BadDataError("the scan holds no frame", way_out="give another; `tactile-bayes show` says what it holds")
     known = sum(int(selection.poses.known.sum()) for selection in selections)
-    if not known:
-        raise _without_poses(selections)
+    if 10 * known < total:
+        raise _without_poses(selections, f"{known} of {total} frames have" if known else "no frame has")
     gated = sum(int((selection.low | selection.high).sum()) for selection in selections)
     if not gated:
         best = max(selections, key=lambda part: float(part.valid_share.max()))
@@ -483,7 +483,7 @@ def refuse_without_frames(selections: list[SelectedFrames], *, pressure_window_k
     raise _outside_window(selections, pressure_window_kpa)
 
 
-def _without_poses(selections: list[SelectedFrames]) -> BadDataError:
+def _without_poses(selections: list[SelectedFrames], which_have: str) -> BadDataError:
     first = selections[0]
     frames, poses, fresh = first.scan.frames.time_s, first.scan.poses.time_s, first.fresh.time_s
     if not len(poses):
@@ -492,7 +492,7 @@ def _without_poses(selections: list[SelectedFrames]) -> BadDataError:
         what = f"the tracker's {len(poses)} poses are of one place: it froze"
         return BadDataError(what, way_out="check the tracker, and scan again")
     what = (
-        f"no frame has a tracker pose (frames {frames[0]:.3f} to {frames[-1]:.3f} s, {len(poses)} poses "
+        f"{which_have} a tracker pose (frames {frames[0]:.3f} to {frames[-1]:.3f} s, {len(poses)} poses "
         f"{poses[0]:.3f} to {poses[-1]:.3f} s"
     )
     apart_ms = 1000 * intervals([fresh])[1]
@@ -500,7 +500,8 @@ def _without_poses(selections: list[SelectedFrames]) -> BadDataError:
         what += f", {apart_ms:.0f} ms apart: between them the head's place is not known)"
         return BadDataError(what, way_out="set the tracker to 50 poses a second or more")
     doubt = rate_doubt(1 / intervals([frames])[1]) if len(frames) > 1 else None
-    way_out = doubt[1] if doubt else f"{_short([first])}check that both run on one clock"
+    both = "check that both run on one clock, and that the tracker saw its sensor"
+    way_out = doubt[1] if doubt else f"{_short([first])}{both}"
     return BadDataError(f"{what})", way_out=way_out)
 
 

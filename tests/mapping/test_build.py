@@ -318,6 +318,10 @@ REFUSED = {
         lambda: with_poses(scans.part(stroke_scan(), slice(0, 1)), slice(5, None)),
         "the scan has 1 frame only: record for longer; check that both run on one clock",
     ),
+    "out of sight once pressed": (
+        lambda: with_poses(stroke_scan(levels_kpa=np.where(np.arange(120) < 12, 1.0, 8.0)), slice(0, 10)),
+        "10 of 120 frames have a tracker pose .* and that the tracker saw its sensor",
+    ),
     "frozen tracker": (frozen, "the tracker's 120 poses are of one place: it froze; check the tracker"),
     "no pose": (
         lambda: replace(stroke_scan(), poses=TrackerPoses(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4)))),
