@@ -282,8 +282,8 @@ def _estimate_of_map(task: EstimationTask) -> Estimate:
         estimate = no_estimate(Abstention("undetected", "no lump was assumed"), candidates, assessment.detection)
     else:
         estimate = _estimate_of_lump(task, assessment, candidates)
-    if estimate.code == "ridge" and not estimate.reason.startswith("no lump found"):
-        estimate = replace(estimate, reason=f"no lump found {where}: {estimate.reason}")
+        if estimate.code == "ridge":
+            estimate = replace(estimate, reason=f"no lump found {where}: {estimate.reason}")
     return replace(estimate, weighed=verdict.weigh(tactile_map, estimate.detection or assessment.detection, bump))
 
 

@@ -38,7 +38,7 @@ from tactile_bayes.posterior.white import (
     Candidate,
 )
 from tactile_bayes.posterior.window import Problem, Window, independent_variance
-from tactile_bayes.presets import FIELD_COSINES, FIT_RADIUS_MM
+from tactile_bayes.presets import FIT_RADIUS_MM
 
 # --- Probability that a rise of a map is a lump, calibrated on simulated exams with and without one.
 
@@ -481,7 +481,7 @@ def needed_amplitudes(tactile_map: TactileMap, centre_mm: tuple[float, float]) -
     cells = window_cells(tactile_map, centre_mm, radius_mm=FIT_RADIUS_MM)
     if len(cells) < LEAST_CELLS:
         return np.full(len(WIDTHS_MM), np.inf)
-    window = Window(cells, independent_variance(cells), cosines=FIELD_COSINES)
+    window = Window(cells, independent_variance(cells))
     problem = Problem(window, BumpPrior(), FIT_RADIUS_MM, value_scale(tactile_map))
     target = CollapsedTarget(problem, Scene("round"))
     target.select_lengths()

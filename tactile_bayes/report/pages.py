@@ -88,7 +88,7 @@ class Growth(Record, eq=False):
     mass: str
     earlier: str
     later: str
-    """`patient`, `mass`, `earlier`, `later`: Codes; `later` is blank where the visits could not be compared."""
+    """`patient`, `mass`, `earlier`, `later`: Codes; `later` is the last visit's where visits could not be compared."""
     status: str
     reason: str = ""
     """`status`, `reason`: As `compare` has them, or ``failed``."""

@@ -40,8 +40,10 @@ from plain_reports import estimate_report, pooled_report
 from scipy.io import savemat
 
 import tactile_bayes as tb
+from tactile_bayes.campaigns.exams import masses_with_visits
 from tactile_bayes.campaigns.inputs import open_campaign
-from tactile_bayes.campaigns.report import ExamRow, done_line, grown_line, index_html, trial_lines
+from tactile_bayes.campaigns.report import ExamRow, done_line, grown_line, growth_rows, index_html, trial_lines
+from tactile_bayes.campaigns.run import Fault
 from tactile_bayes.campaigns.steps import Task, make_map, run_step
 from tactile_bayes.errors import UsageError
 from tactile_bayes.files.documents import load_schema
@@ -297,6 +299,26 @@ def test_an_output_that_is_an_input_is_refused(finished: Path) -> None:
     shutil.copy(finished / "excision.csv", finished / "out" / "trial.csv")
     done = campaign(finished, "--excision", "out/trial.csv")
     assert "out/trial.csv is an input of this command; choose another name for the output" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("campaign_fault", "own_fault", "reason"),
+    [
+        ("", None, "exams of fewer than two visits came through"),
+        ("", Fault("compare", "the masses lie 30 mm apart"), "the masses lie 30 mm apart"),
+        ("no dates", Fault("compare", "the masses lie 30 mm apart"), "no dates"),
+    ],
+)
+def test_a_mass_that_was_not_compared_has_the_reason_in_its_row(
+    campaign_fault: str, own_fault: Any, reason: str
+) -> None:
+    exams = [Listed("a.mcap", Path("a.mcap"), "01", visit, "m1", 1) for visit in ("v1", "v2", "v3")]
+    (name,) = masses_with_visits(exams, {})
+    faults = {} if own_fault is None else {name: own_fault}
+    made: Any = SimpleNamespace(exams=exams, days={}, keys={"compare": {}}, faults=faults, not_compared=campaign_fault)
+    (row,) = growth_rows(made)
+    assert (row.patient, row.mass, row.earlier, row.later) == ("01", "m1", "v1", "v3")
+    assert (row.status, row.reason) == ("failed", reason)
 
 
 def test_a_table_has_a_column_for_each_value_of_its_rows() -> None:

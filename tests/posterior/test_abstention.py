@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from functools import cache
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,7 +28,7 @@ from tactile_bayes.posterior.verdict import (
     stroke_advice,
     undetected_reason,
 )
-from tactile_bayes.posterior.white import AT_RIM, Candidate, fit_bump
+from tactile_bayes.posterior.white import AT_RIM, Candidate, MapDraws, fit_bump
 
 FIELD = SamplerSettings(background="free", noise="field")
 WHITE = 0.01 * np.random.default_rng(4).standard_normal((51, 51))
@@ -312,3 +314,32 @@ def test_a_shape_far_beyond_the_limits_at_its_mode_costs_no_draws(
     assert (Odd.drawings > 0) == drawn
     assert found.status == ("estimate" if drawn else "no_estimate")
     assert drawn or found.code in ("unresolved", *NO_LUMP)
+
+
+@pytest.mark.parametrize(
+    ("widths", "code"), [((9.0, 2.0), "ridge"), ((2.0, 9.0), "ridge"), ((6.0, 5.0), "extrapolated")]
+)
+def test_a_ridge_by_its_draws_is_no_lump_though_no_calibration_holds_it_either(
+    monkeypatch: pytest.MonkeyPatch, widths: tuple[float, float], code: str
+) -> None:
+    tactile_map, options = bump_map(noise=WHITE), replace(FIELD, method="laplace")
+    candidates, seen = estimate.search(tactile_map, options)
+    assert seen is not None
+
+    def drawn(*given: Any, **named: Any) -> MapDraws:
+        result = seen.draw(*given, **named)
+        x, y = (np.full_like(result.posterior.x_mm, one) for one in widths)
+        return replace(result, posterior=replace(result.posterior, sigma_x_mm=x, sigma_y_mm=y))
+
+    calibration: Any = SimpleNamespace(
+        at_depth_or_fallback=lambda *_: calibration, outside=lambda *_, **__: ["so wide a lump"], fat_mm=None
+    )
+    shape = {name: getattr(seen, name) for name in ("fit", "detection", "fault", "scene", "bump")}
+    monkeypatch.setattr(estimate, "search", lambda *_: (candidates, SimpleNamespace(draw=drawn, **shape)))
+    monkeypatch.setattr(estimate, "recipe_differences", lambda *_: [])
+    monkeypatch.setattr(estimate, "calibration_for", lambda _, given: given)
+    found = estimate_map(tactile_map, calibration=calibration, options=options, rng=np.random.default_rng(1))
+    assert found.code == code
+    assert (found.reason.count("no lump found on the ") == 1) == (code == "ridge")
+    if code == "ridge":
+        assert found.reason.endswith(": what rises is a ridge, not a lump (sigma 9 by 2 mm)")

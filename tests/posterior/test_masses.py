@@ -435,6 +435,7 @@ def test_the_lump_that_was_asked_about_stays_the_answer_beside_a_surer_one(
     assert places(answer.masses) == [NARROW, WIDE]
     assert [one.reported for one in answer.masses] == [reported == 1, reported == 0]
     assert answer.bump == (first, surer)[reported].bump
+    assert all(0.9 < one.probability <= 0.99 for one in answer.masses)  # calibrated; by their odds both are 1
     (other,) = answer.other_rises
     assert (other.x_mm, other.distance_mm) == ((NARROW, WIDE)[reported][0], 33.0)
 
@@ -452,3 +453,15 @@ def test_a_place_is_clear_of_both_lumps_of_a_scene_by_twice_their_larger_width(m
         bump = ModalBump(0.0, *second, 4.0, 4.0)
         monkeypatch.setattr(masses_module, "_second_lump", lambda _, one=bump: one)
         assert clear(NARROW[0] + 7.0) == expected
+
+
+@pytest.mark.parametrize(("away", "count"), [(3.0, 2), (9.0, 3)])
+def test_two_rises_whose_fits_meet_are_one_mass(monkeypatch: pytest.MonkeyPatch, away: float, count: int) -> None:
+    two, beside = scene(narrow=0.2), (NARROW[0] + away, NARROW[1])
+    rises = tuple(Rise(0.2, *place, 4.0, 4.0, 33.0, 0.99) for place in (NARROW, (NARROW[0] + 12.0, NARROW[1])))
+    monkeypatch.setattr(masses_module, "other_rises", lambda *_: (rises, ()))
+
+    def fitted(_: TactileMap, options: SamplerSettings) -> Estimate:
+        return measured(0.2, NARROW if options.centre_mm == NARROW else beside)
+
+    assert len(with_masses(two, measured(0.3, WIDE), SamplerSettings(), fitted).masses) == count

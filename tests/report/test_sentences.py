@@ -12,12 +12,23 @@ from posterior_maps import bump_map
 
 from tactile_bayes.campaigns.report import repeatability_words
 from tactile_bayes.declarations import replace
-from tactile_bayes.files.reports import AnotherExam, EstimateReport, Interval, MassReport, Place, Point, PooledMap
+from tactile_bayes.files.reports import (
+    AnotherExam,
+    EstimateReport,
+    Interval,
+    MassReport,
+    OtherRise,
+    Place,
+    Point,
+    PooledMap,
+)
+from tactile_bayes.findings import finding
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.posterior.fit import SceneChoice, Structure
 from tactile_bayes.posterior.marginal import Scene
 from tactile_bayes.posterior.result import Sensitivity
 from tactile_bayes.presets import RESEARCH_USE
+from tactile_bayes.report import pooled as pooled_report_module
 from tactile_bayes.report.compare import Doubling, GrowthRate, Rate, Visit, VisitMap, _rate_words, _visit_line
 from tactile_bayes.report.estimate_document import (
     mass_lines,
@@ -29,7 +40,7 @@ from tactile_bayes.report.estimate_document import (
 from tactile_bayes.report.estimate_text import _lump_line, decimals, size_table
 from tactile_bayes.report.exam_words import ShownExam, _scan_rows, exam_map, size_sentences
 from tactile_bayes.report.map import _notes
-from tactile_bayes.report.pooled import pooled_text
+from tactile_bayes.report.pooled import pooled_findings, pooled_text
 from tactile_bayes.report.trial import ratio_line
 from tactile_bayes.trial.accuracy import ModalityRatio
 
@@ -77,6 +88,29 @@ def test_a_page_has_both_intervals_and_the_smallest_size_of_the_one_that_leads()
     assert "If exams of one lump did not differ, " in " ".join(
         size_sentences(replace(exam, maps=(alike,)), around(20.0, 5.0))
     )
+
+
+@pytest.mark.parametrize(
+    ("figures", "settings", "more", "words"),
+    [
+        ({"between_map_sd": 0.04}, {}, {}, "; exams of a lump are taken to differ by 4 %, learned from these maps"),
+        ({"between_map_sd": 0.04}, {"between_map_sd": 0.04}, {}, " by 4 %, as was stated"),
+        ({"between_map_sd": 0.04}, {}, {"repeatability": "2 to 6 %"}, "4 %, by these maps and this site's other exams"),
+        ({}, {}, {}, "between 15.0 and 25.0 mm."),
+    ],
+    ids=["by the maps", "stated", "by the site", "none"],
+)
+def test_a_page_of_several_maps_says_where_the_spread_of_its_interval_is_from(
+    figures: dict[str, float], settings: dict[str, Any], more: dict[str, Any], words: str
+) -> None:
+    own = exam_map(bump_map(), sized(), side="left")
+    sizes = {"max_size_mm": around(20.0, 5.0), "min_size_mm": around(11.0, 4.0)}
+    told = {"figures": figures, "provenance": {"settings": settings, "inputs": []}, "status": "estimate", "maps": ()}
+    pooled = pooled_report(**sizes | told | more)
+    first, second, *_ = size_sentences(ShownExam((own, own), pooled, ()), around(20.0, 5.0))
+    assert first == "The largest diameter is about 20.0 mm (the middle of its probable values)."
+    assert second.startswith("With a probability of 95 % it lies between 15.0 and 25.0 mm")
+    assert second.rstrip(".").endswith(words.rstrip("."))
 
 
 def test_a_page_and_a_map_say_why_frames_and_taxels_are_left_out() -> None:
@@ -217,6 +251,36 @@ def test_a_mass_without_a_common_size_has_the_size_of_each_map_and_the_reason() 
         "No estimate: too few maps.",
         RESEARCH_USE,
     ]
+
+
+def test_every_caution_on_maps_of_one_mass_is_told_with_its_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = finding("coarse_cells", "coarse"), finding("outside_calibration", "of the size alone")
+    rise = OtherRise(
+        x_mm=3.0, y_mm=4.0, amplitude=0.2, sigma_x_mm=5.0, sigma_y_mm=5.0, distance_mm=None, probability=0.99
+    )
+    reports = [sized(findings=own), sized(other_rises=(rise,))]
+    monkeypatch.setattr(pooled_report_module, "maps_lying_apart", lambda _: {1: "30 mm from the others"})
+    monkeypatch.setattr(pooled_report_module, "repeated_scans", lambda _: {1: 0})
+    chances = {"one_place": 0.002, "one_size": 0.3, "one_size_apart": 0.6}
+    made = {"fat_apart_mm": (10.0, 20.0), "outside": ["so wide"], "outlying": [1]}
+    pooled: Any = SimpleNamespace(status="maps_disagree", reason="the masses lie apart", **chances | made)
+    told = list(pooled_findings(pooled, reports))
+    assert [(one.kind, one.about) for one in told] == [
+        ("maps_disagree", ""),
+        ("coarse_cells", "map 1"),
+        ("another_mass", "map 2"),
+        ("same_scan", "map 2"),
+        ("fat_apart", ""),
+        ("outside_calibration", ""),
+        ("outlying", "map 2"),
+        ("several_masses", "map 2"),
+    ]
+    assert "so far apart with a probability of 0.002" in told[0].text
+    assert "10.0 mm deep on one map and 20.0 mm on another" in told[4].text
+    assert told[7].text == "another rise stands at (3.0, 4.0) mm"
+    pooled.one_place = 0.4  # at one place, of two sizes
+    (first, *_) = pooled_findings(pooled, reports)
+    assert "with a probability of 0.300 (0.600 if exams differ as those of patients did)" in first.text
 
 
 def test_a_modality_without_common_masses_has_no_ratio_and_says_why() -> None:
