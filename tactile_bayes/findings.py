@@ -117,7 +117,7 @@ def finding_lines(findings: Iterable[Finding], severity: Severity | None = None,
 def finding_summary(findings: Iterable[Finding], severity: Severity, *, most: int) -> list[str]:
     """One line of the first findings of one severity and the number of the others; empty without any."""
     texts = [one.sentence() for one in _said_once(findings, severity)]
-    return first_texts(texts, most=most, lead=LEADS[severity])
+    return [f"{LEADS[severity]}{first_of(texts, most, '; ')}."] if texts else []
 
 
 def _said_once(findings: Iterable[Finding], severity: Severity | None) -> Iterator[Finding]:
@@ -128,11 +128,6 @@ def _said_once(findings: Iterable[Finding], severity: Severity | None) -> Iterat
             about.setdefault((replace(one, about=""), bool(one.about)), []).append(one.about)
     for (one, _), (*others, last) in about.items():
         yield replace(one, about=f"{', '.join(others)} and {last}" if others else last)
-
-
-def first_texts(texts: Sequence[str], *, most: int, lead: str) -> list[str]:
-    """One line of `lead`, the first texts and the number of the others; empty without any text."""
-    return [f"{lead}{first_of(texts, most, '; ')}."] if texts else []
 
 
 def findings_in(document: object) -> tuple[Finding, ...]:

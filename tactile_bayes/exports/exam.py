@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from tactile_bayes.declarations import Record, as_dict, names_of, replace
+from tactile_bayes.declarations import Record, as_dict, names_of, replace, short_repr
 from tactile_bayes.errors import CANNOT_SHOW, NO_LUMP, BadDataError, TactileBayesError, UsageError
 from tactile_bayes.files import reading
 from tactile_bayes.files.atomic import sha256
@@ -332,15 +332,15 @@ class Moment(Record):
         with_time = " or YYYY-MM-DDTHH:MM, with +HH:MM for the time zone if you know it"
         way_out = "give YYYY-MM-DD" + ("" if date_only else with_time)
         if match is None or (date_only and match[4]):
-            raise UsageError(f"{name} is {quoted(text)}; {way_out}")
+            raise UsageError(f"{name} is {short_repr(text)}; {way_out}")
         year, month, day, hour, minute, second, zone = match.groups()
         try:
             datetime.datetime(int(year), int(month), int(day), int(hour or 0), int(minute or 0), int(second or 0))
         except ValueError as error:
-            raise UsageError(f"{name} is {quoted(text)}: {error}; {way_out}") from None
+            raise UsageError(f"{name} is {short_repr(text)}: {error}; {way_out}") from None
         zone = "+00:00" if zone == "Z" else zone or ""
         if zone and not (int(zone[1:3]) <= 14 and int(zone[4:]) < 60):
-            raise UsageError(f"{name} is {quoted(text)}: no time zone is {zone} from UTC; {way_out}")
+            raise UsageError(f"{name} is {short_repr(text)}: no time zone is {zone} from UTC; {way_out}")
         return cls(f"{year}{month}{day}", f"{hour or ''}{minute or ''}{second or ''}", zone.replace(":", ""))
 
     @property
@@ -364,21 +364,21 @@ class Identity(IdentityOptions):
             value = getattr(self, name)
             if _REPLACED in value:
                 way_out = "a letter was lost on its way (U+FFFD); give it as it is written"
-                raise UsageError(f"{name} is {quoted(value)}: {way_out}")
+                raise UsageError(f"{name} is {short_repr(value)}: {way_out}")
             if not value.isprintable() or "\\" in value:
                 way_out = "leave out backslashes, line ends and other characters that cannot be printed"
-                raise UsageError(f"{name} is {quoted(value)}; {way_out}")
+                raise UsageError(f"{name} is {short_repr(value)}; {way_out}")
             if value != value.strip():
-                raise UsageError(f"{name} is {quoted(value)}; leave out the blanks around it")
+                raise UsageError(f"{name} is {short_repr(value)}; leave out the blanks around it")
         for name in _NAMES:
             groups = getattr(self, name).split("=")
             if len(groups) > 3 or any(len(group) > 64 or group.count("^") > 4 for group in groups):
                 way_out = "give FAMILY^GIVEN^MIDDLE^PREFIX^SUFFIX, at most 64 characters"
-                raise UsageError(f"{name} is {quoted(getattr(self, name))}; {way_out}")
+                raise UsageError(f"{name} is {short_repr(getattr(self, name))}; {way_out}")
         super().__post_init__()
         if self.study_uid and not _UID.fullmatch(self.study_uid):
             way_out = "give numbers with points between, at most 64 characters"
-            raise UsageError(f"study_uid is {quoted(self.study_uid)}; {way_out}")
+            raise UsageError(f"study_uid is {short_repr(self.study_uid)}; {way_out}")
         for name in ("birth_date", "study_date", "content_date"):
             if text := getattr(self, name):
                 Moment.parse(text, name=name, date_only=name == "birth_date")
@@ -396,11 +396,6 @@ class Identity(IdentityOptions):
     def content(self) -> Moment | None:
         """Date and time when the content was made; by default those of the exam."""
         return Moment.parse(self.content_date, name="content_date") if self.content_date else self.study
-
-
-def quoted(value: str) -> str:
-    """A text in quotes, for a message; long ones are cut."""
-    return repr(value if len(value) <= 60 else value[:57] + "...")
 
 
 # --- Identity from a worklist: a modality worklist item of DICOM (a file, or DICOM JSON), or plain keys in JSON.
@@ -430,7 +425,7 @@ def merged_identity(worklist: Path | None, options: Mapping[str, Any]) -> Identi
     for name, value in options.items():
         listed = getattr(identity, name)
         if listed and listed != value:
-            both = f"{quoted(value)} by the option and {quoted(listed)} in the worklist"
+            both = f"{short_repr(value)} by the option and {short_repr(listed)} in the worklist"
             raise UsageError(f"{name} is {both}; leave one out")
     return replace(identity, **options)
 
@@ -495,8 +490,8 @@ def _check_letters(item: Any, charsets: Collection[str], path: Path) -> None:
         value = getattr(item.get_item(keyword), "value", b"")
         if isinstance(value, bytes) and not value.isascii():
             byte = next(one for one in value if one > 127)
-            declaration = f"the character set {quoted(str(names[0]))}, which is none" if names else "no character set"
-            fault = f"{keyword} holds the byte 0x{byte:02x}, and the item declares {declaration}"
+            named = f"the character set {short_repr(str(names[0]))}, which is none" if names else "no character set"
+            fault = f"{keyword} holds the byte 0x{byte:02x}, and the item declares {named}"
             way_out = "declare SpecificCharacterSet in it (ISO_IR 192 for UTF-8), or give the name by options"
             raise BadDataError(fault, way_out=way_out, path=str(path))
 

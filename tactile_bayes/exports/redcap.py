@@ -6,8 +6,9 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Final, Literal, NamedTuple
 
+from tactile_bayes.declarations import short_repr
 from tactile_bayes.errors import UsageError
-from tactile_bayes.exports.exam import EstimateFile, ExportedMass, Identity, content_uuid, quoted
+from tactile_bayes.exports.exam import EstimateFile, ExportedMass, Identity, content_uuid
 from tactile_bayes.files.tables import csv_text
 from tactile_bayes.inference.draws import Quantity
 from tactile_bayes.presets import RESEARCH_USE
@@ -162,7 +163,7 @@ def _record_id(estimate: EstimateFile, finding: ExportedMass, identity: Identity
     name = "-".join(parts)
     if not _RECORD.fullmatch(name):
         way_out = "use letters, digits, points and dashes, at most 100"
-        raise UsageError(f"the record ID {quoted(name)} is none that REDCap takes; {way_out}")
+        raise UsageError(f"the record ID {short_repr(name)} is none that REDCap takes; {way_out}")
     return name
 
 

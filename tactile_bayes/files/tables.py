@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from tactile_bayes.declarations import Record
+from tactile_bayes.declarations import Record, short_repr
 from tactile_bayes.errors import BadDataError, in_file
 from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.reading import TABLE_BYTES, ZIP_MAGIC, decoded, decoding, first_bytes, kind_of, read_bytes
@@ -193,7 +193,7 @@ def check_unique(table: Table, keys: Sequence[str], *, way_out: str = "remove on
     first: dict[tuple[Any, ...], int] = {}
     for row, key in enumerate(zip(*(table.columns[name] for name in keys), strict=True)):
         if (before := first.setdefault(key, row)) != row:
-            shown = " + ".join(_shown(str(part)) for part in key)
+            shown = " + ".join(short_repr(str(part)) for part in key)
             what = f"{shown} stands on line {table.line_numbers[before]} already"
             raise table.error(row, " + ".join(keys), what, way_out=way_out)
 
@@ -315,11 +315,11 @@ def _parse_cell(text: str, field: Mapping[str, Any], *, decimal_comma: bool) -> 
             raise BadDataError("is blank", way_out=field.get("ifZero", f"fill it in: {field['description']}"))
         return None
     if text != text.strip() or not text.isprintable():
-        what = f"{_shown(text)} has blanks or unprintable characters around or in it"
+        what = f"{short_repr(text)} has blanks or unprintable characters around or in it"
         raise BadDataError(what, way_out="remove them")
     if decimal_comma and field["type"] == "number":
         if "." in text:  # thousands?
-            what = f"{_shown(text)} has a point, and other numbers have decimal commas"
+            what = f"{short_repr(text)} has a point, and other numbers have decimal commas"
             raise BadDataError(what, way_out="write all numbers one way")
         text = text.replace(",", ".") if DECIMAL_COMMA.fullmatch(text) else text
     value = _parse_by_type(text, field)
@@ -328,16 +328,16 @@ def _parse_cell(text: str, field: Mapping[str, Any], *, decimal_comma: bool) -> 
         raise BadDataError("is 0", way_out=field["ifZero"])
     for rule, (holds, words) in _LIMITS.items():
         if rule in rules and not holds(value, rules[rule]):
-            what = f"{_shown(text)} is not {words} {rules[rule]}"
+            what = f"{short_repr(text)} is not {words} {rules[rule]}"
             raise BadDataError(what, way_out=f"correct it: {field['description']}")
     if "enum" in rules and value not in rules["enum"]:
         near = difflib.get_close_matches(text.lower(), rules["enum"], n=1)
-        guess = f"did you mean {near[0]}? " if near else ""
-        raise BadDataError(f"{_shown(text)} is not known", way_out=f"{guess}it must be {' or '.join(rules['enum'])}")
+        guess = f"did you mean {near[0]}? it must be" if near else "it must be"
+        raise BadDataError(f"{short_repr(text)} is not known", way_out=f"{guess} {' or '.join(rules['enum'])}")
     if "pattern" in rules and not re.fullmatch(rules["pattern"], text):
         small = text.lower() if re.fullmatch(rules["pattern"], text.lower()) else ""
         way_out = f"write {small}, in small letters" if small else f"correct it: {field['description']}"
-        raise BadDataError(f"{_shown(text)} is too long or has letters that may not be there", way_out=way_out)
+        raise BadDataError(f"{short_repr(text)} is too long or has letters that may not be there", way_out=way_out)
     return value
 
 
@@ -370,7 +370,7 @@ def _parse_by_type(text: str, field: Mapping[str, Any]) -> Any:
                 if text in words:
                     return value
             what, way_out = "is neither true nor false", "write true or false"
-    raise BadDataError(f"{_shown(text)} {what}", way_out=way_out)
+    raise BadDataError(f"{short_repr(text)} {what}", way_out=way_out)
 
 
 def _parse_number(text: str, field: Mapping[str, Any]) -> float:
@@ -379,21 +379,21 @@ def _parse_number(text: str, field: Mapping[str, Any]) -> float:
         if math.isfinite(value):
             return value
     if text.lstrip("+-").lower() in _NOT_FINITE or _NUMBER.fullmatch(text):
-        raise BadDataError(f"{_shown(text)} is not a finite number", way_out=_blank_advice(field))
+        raise BadDataError(f"{short_repr(text)} is not a finite number", way_out=_blank_advice(field))
     if DECIMAL_COMMA.fullmatch(text):
         whole, _, rest = text.partition(",")
         if may_be_thousands(text):
-            what = f"{_shown(text)} has a comma that may separate thousands or decimals"
+            what = f"{short_repr(text)} has a comma that may separate thousands or decimals"
             raise BadDataError(what, way_out=f"write {whole}{rest} or {whole}.{rest}, whichever is meant")
-        raise BadDataError(f"{_shown(text)} has a decimal comma", way_out=f"write {whole}.{rest}")
+        raise BadDataError(f"{short_repr(text)} has a decimal comma", way_out=f"write {whole}.{rest}")
     if text[0] in "<>≤≥":
-        what = f"{_shown(text)} is a bound, not a number"
+        what = f"{short_repr(text)} is a bound, not a number"
         raise BadDataError(what, way_out="give the number measured, or leave it out")
     if text.endswith("%"):
         way_out = "write the number that is meant without it, as 12.5 or 0.125"
-        raise BadDataError(f"{_shown(text)} has a percent sign", way_out=way_out)
-    unit = " in mm" if field["name"].endswith("_mm") else ""
-    raise BadDataError(f"{_shown(text)} is not a number", way_out=f"write digits only{unit}; {_blank_advice(field)}")
+        raise BadDataError(f"{short_repr(text)} has a percent sign", way_out=way_out)
+    digits = f"write digits only{' in mm' if field['name'].endswith('_mm') else ''}"
+    raise BadDataError(f"{short_repr(text)} is not a number", way_out=f"{digits}; {_blank_advice(field)}")
 
 
 def _is_required(field: Mapping[str, Any]) -> bool:
@@ -408,12 +408,8 @@ def _names(fields: Mapping[str, Any]) -> str:
     return ", ".join(name if _is_required(field) else f"[{name}]" for name, field in fields.items())
 
 
-def _shown(text: str) -> str:
-    return repr(text if len(text) <= 40 else text[:37] + "...")
-
-
 def _fault(line: int, column: str, what: str, *, way_out: str) -> BadDataError:
-    shown = column if re.fullmatch(r"\w+( \+ \w+)*", column) and len(column) <= 60 else _shown(column)
+    shown = column if re.fullmatch(r"\w+( \+ \w+)*", column) and len(column) <= 60 else short_repr(column)
     return BadDataError(f"line {line}, column {shown}: {what}", way_out=way_out)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from tactile_bayes.declarations import from_plain
 from tactile_bayes.files.reports import EstimateReport, MassReport, PooledReport, SmallestLump
-from tactile_bayes.findings import capitalised, counted, finding_lines, finding_summary, first_texts
+from tactile_bayes.findings import capitalised, counted, finding_lines, finding_summary, first_of
 from tactile_bayes.inference.draws import ParameterDraws, Quantity
 from tactile_bayes.options import BumpPrior
 from tactile_bayes.posterior.result import Estimate
@@ -348,7 +348,7 @@ def estimate_summary(estimate: Estimate, report: EstimateReport) -> str:
     if estimate.scene is not None:
         model = [estimate_document.scene_line(estimate.scene)]
     else:
-        model = first_texts(report.left_out, most=2, lead="Left out: ")
+        model = [f"Left out: {first_of(report.left_out, 2, '; ')}."] if report.left_out else []
     return "\n".join([*body, " ".join([*model, MORE]), RESEARCH_USE]) + "\n"
 
 

@@ -16,7 +16,7 @@ from tactile_bayes.declarations import from_plain, replace
 from tactile_bayes.files.map_nc import write_map
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.reports import AnotherExam, EstimateReport, Supposed
-from tactile_bayes.findings import finding, first_texts
+from tactile_bayes.findings import finding, finding_summary
 from tactile_bayes.inference.draws import summarise
 from tactile_bayes.mapping.map import TactileMap, broken_assumptions
 from tactile_bayes.posterior.draw import SamplerSettings
@@ -240,4 +240,4 @@ def test_sources_of_variance_are_ranked_and_only_large_ones_have_a_remedy() -> N
     assert "--known" in lines[1]
     assert "strokes" not in lines[1]
     assert width_lines({"map": 100.0})[1] == "What would narrow it: a slower scan with more strokes over the lump."
-    assert first_texts([], most=2, lead="Check: ") == []
+    assert finding_summary([], "check", most=2) == []
