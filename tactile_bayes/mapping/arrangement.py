@@ -210,10 +210,12 @@ class ArrangementCheck(Record, eq=False):
         odds = f"(odds {odds_words(self.log_odds)}): overlapping frames agree to {best} if so, to {stated} as stated"
         words = f"{self.best.in_words} {odds}"
         if self.best.late_ms:
+            averaged = "; late frames may be averaged over time, which smears the lump: turn that off at the array"
             return words, finding(
                 "late_poses",
                 "the tracker's times do not fit those of the sensor array; size and place may be wrong",
-                f"map it with --latency-ms {self.stated_latency_ms + self.best.late_ms:.0f}",
+                f"map it with --latency-ms {self.stated_latency_ms + self.best.late_ms:.0f}"
+                + (averaged if self.best.late_ms < 0 else ""),
                 "have the scan mapped again with the tracker's delay",
             )
         if self.best.sway_mm:

@@ -323,6 +323,7 @@ def test_another_clock_is_named_with_its_sign(late_ms):
     assert check.best.late_ms == pytest.approx(late_ms, abs=25.0)
     assert f"--latency-ms {check.best.late_ms:.0f}" in found.remedy
     assert ("too late" if late_ms > 0 else "too early") in found.remedy
+    assert ("averaged over time, which smears the lump" in found.remedy) is (late_ms < 0)
     assert not check.refused  # the map can be told
 
 
