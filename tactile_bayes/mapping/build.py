@@ -222,8 +222,6 @@ def cell_figures(sums: CellSums) -> dict[str, float]:
 
 def stroke_figures(strokes: Sequence[latency.StrokeShift]) -> dict[str, float]:
     """Figures of each stroke's shift, and of the lump's mobility."""
-    if not strokes:
-        return {}
     mobility_mm, sd_mm = latency.mobility(strokes)
     figures = {
         "strokes": float(len(strokes)),

@@ -117,7 +117,9 @@ def test_a_latency_shows_as_a_lag_the_other_way() -> None:
     near = np.abs(origin[:, 0]) < 12.0
     speed = float(np.abs(np.gradient(origin[:, 0], time))[near].mean())
     assert found["stroke_lag_mm"] == pytest.approx(-speed * late_ms / 1000.0, rel=0.3)  # one linear step
-    assert ["--latency-ms auto" in text for text in told(found, "caution")] == [True]
+    (caution,) = told(found, "caution")
+    assert "as if the tracker's positions came late" in caution
+    assert "--latency-ms auto" in caution
     assert told(figures(scan_of(one)), "caution") == []
 
 

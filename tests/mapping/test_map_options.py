@@ -61,10 +61,12 @@ def test_the_plane_near_the_mass_follows_the_skin_there():
 
 
 def test_a_radius_whose_frames_lie_on_a_line_grows():
-    """A row of taxels that slides lengthwise over the lump, its other strokes 10 mm beside."""
-    across = scans.strokes(lines=3, spacing_mm=10.0)
+    """A row of taxels that slides lengthwise over the lump, the next stroke 10 mm beside."""
+    across = scans.strokes(lines=3, spacing_mm=10.0, per_line=120)
     row = scans.flat_head(rows=1, columns=16, pitch_mm=1.0, lever_mm=(5.0, -20.0, 80.0))
-    lengthwise = scans.make_scan(across[:, ::-1], field=scans.gaussian(sigma_x=3.0, sigma_y=3.0), head=row)
+    lengthwise = scans.make_scan(
+        across[:, ::-1], field=scans.gaussian(sigma_x=3.0, sigma_y=3.0, x=10.0, y=-5.0), head=row
+    )
     quality = build_map(lengthwise, plane_radius_mm="auto", as_stated=True).quality
     assert quality["plane_radius_mm"] == pytest.approx(1.5 * 15.0 / 2)
     assert quality["plane_rms_mm"] == pytest.approx(0.0, abs=1e-6)

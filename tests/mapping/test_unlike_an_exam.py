@@ -21,7 +21,7 @@ from tactile_bayes.geometry import rigid
 from tactile_bayes.mapping.arrangement import check_scan
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.plausibility import against_no_lump, exam_findings, map_findings
-from tactile_bayes.mapping.select import Jumps, find_faults
+from tactile_bayes.mapping.select import Jumps, find_faults, scan_findings
 from tactile_bayes.posterior.verdict import no_verdict
 from tactile_bayes.scans import (
     ElementCalibration,
@@ -243,6 +243,7 @@ def test_a_clock_that_stands_still_is_told_and_a_map_without_times_is_not_doubte
     """A live map counts frames and keeps no times."""
     counted = {"frames_total": 500.0, "frames_used": 480.0}
     assert exam_findings(counted) == ()
+    assert not any("clock" in one.text for one in exam_findings({"frames_total": 1.0, "frames_missing": 0.0}))
     assert "clock stands still" in exam_findings({**counted, "frames_missing": 0.0})[0].text
 
 
@@ -444,6 +445,13 @@ def test_jumps_are_counted(away: list[bool], told: list[str]) -> None:
 def test_poses_of_no_hand_are_refused_by_their_cause(made: Callable[[Scan], Scan], told: str) -> None:
     with pytest.raises(BadDataError, match=told):
         build_map(made(scan()), as_stated=True)
+
+
+def test_what_the_recorder_told_is_told_once() -> None:
+    one = moved(other_mm=60.0)(scan())
+    told = scan_findings(one)
+    assert [found.kind for found in told] == ["poses_jump"]
+    assert scan_findings(replace(one, findings=told)) == told
 
 
 @pytest.mark.parametrize("value", [0, 1700], ids=["dead", "stuck"])
