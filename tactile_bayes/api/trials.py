@@ -30,7 +30,7 @@ from tactile_bayes.report.trial_html import plan_figure, trial_html
 from tactile_bayes.trial import planning
 from tactile_bayes.trial.figures import MIN_PATIENTS, Intervals, UndefinedError
 from tactile_bayes.trial.next_mass import next_mass
-from tactile_bayes.trial.readings import Trial, at_excision, readings_from_columns, unit_doubts
+from tactile_bayes.trial.readings import Trial, at_excision, readings_from_columns
 from tactile_bayes.trial.summary import TrialReport, summarise
 
 if TYPE_CHECKING:
@@ -250,8 +250,7 @@ class Pilot(Record, eq=False):
     def doubts(self) -> Iterator[str]:
         """Doubts about the tables, a line each."""
         yield from self.trial.other_visits.lines()
-        sizes, ex_vivo = self.trial.sizes(), np.array(list(self.trial.ex_vivo_mm.values()))
-        yield from (f"doubtful: {doubt}" for doubt in unit_doubts(sizes, ex_vivo))
+        yield from (f"doubtful: {doubt}" for doubt in self.trial.doubts())
 
     def errors(self, against: str, stated: Mapping[str, float]) -> dict[str, float]:
         """Errors of ln size: the stated ones, else the pilot's."""

@@ -17,7 +17,7 @@ from tactile_bayes.errors import CANNOT_SHOW, BadDataError, UsageError
 from tactile_bayes.files import manifest_csv as layout
 from tactile_bayes.files.atomic import write_text
 from tactile_bayes.files.documents import read_record
-from tactile_bayes.files.manifest_csv import Exam, same_code
+from tactile_bayes.files.manifest_csv import Exam
 from tactile_bayes.files.reading import IMAGE_BYTES, read_bytes
 from tactile_bayes.files.reports import EstimateReport, PooledReport, centre_of
 from tactile_bayes.files.tables import Table
@@ -27,7 +27,7 @@ from tactile_bayes.report.campaign_page import ExamEntry, MassEntry, VisitEntry,
 from tactile_bayes.report.compare import CompareReport, growths
 from tactile_bayes.report.exam_words import reason_on_paper
 from tactile_bayes.report.pages import Growth, growth_line
-from tactile_bayes.trial.readings import at_excision, day_of
+from tactile_bayes.trial.readings import at_excision, day_of, same_code
 
 # --- Tables: exams done, failures, and the trial table that `validate` takes.
 

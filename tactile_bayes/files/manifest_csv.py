@@ -17,7 +17,7 @@ from tactile_bayes.files.documents import load_schema
 from tactile_bayes.files.reading import TABLE_BYTES, check_address, is_address, kind_of, read_bytes
 from tactile_bayes.files.size_json import NONE, SHIPPED
 from tactile_bayes.files.tables import RawTable, Table, csv_cell, csv_text, read_raw, read_table
-from tactile_bayes.trial.readings import Reading, at_excision
+from tactile_bayes.trial.readings import Reading, at_excision, same_code
 
 # --- Names of exams and masses of a campaign, and of the files in its output folder.
 
@@ -179,11 +179,6 @@ def _shown(name: str) -> str:
     """Path for a message: quoted, as it is in the table but for unprintable characters, cut to 80 characters."""
     short = name if len(name) <= 80 else f"{name[:77]}..."
     return f"'{short}'" if short.isprintable() and "'" not in short else repr(short)
-
-
-def same_code(code: str) -> str:
-    """What codes share that differ by capitals alone, or by leading zeros, which spreadsheets take off numbers."""
-    return code.lstrip("0") if code.isascii() and code.isdigit() else code.casefold()
 
 
 def _check_spelling(table: Table, exams: Sequence[Exam]) -> None:

@@ -173,6 +173,27 @@ def mass_numbers(masses: Iterable[MassKey]) -> dict[MassKey, int]:
     return {key: index for index, key in enumerate(sorted(masses))}
 
 
+def same_code(code: str) -> str:
+    """What codes share that differ by capitals alone, or by leading zeros, which spreadsheets take off numbers."""
+    return code.lstrip("0") if code.isascii() and code.isdigit() else code.casefold()
+
+
+def _spelling_doubts(masses: Iterable[MassKey]) -> list[str]:
+    """Sentence on codes of patients, or of a patient's masses, that `same_code` makes one; empty without any."""
+    first, pairs = dict[tuple[str, ...], str](), dict[str, None]()
+    for patient, mass in masses:
+        for words, key, code in (
+            ("patients {} and {}", (same_code(patient),), patient),
+            (f"masses {{}} and {{}} of {patient}", (patient, same_code(mass)), mass),
+        ):
+            if (other := first.setdefault(key, code)) != code:
+                pairs[words.format(other, code)] = None
+    if not pairs:
+        return []
+    more = f" (and {len(pairs) - 1} more)" if len(pairs) > 1 else ""
+    return [f"{next(iter(pairs))}{more} differ by capitals or leading zeros alone: are they one?"]
+
+
 # --- Plausibility of a trial's units: impossible sizes, and modalities that differ from excision tenfold.
 
 # Palpable masses measure well between these; a size outside is more likely in another unit or in the wrong column.
@@ -290,6 +311,11 @@ class Trial(Record, eq=False):
                 mass=np.array([mass_number[key] for key in by_mass], dtype=np.int64),
             )
         return sizes
+
+    def doubts(self) -> list[str]:
+        """What speaks against the tables: codes, units and copied sizes, a sentence each."""
+        ex_vivo_mm = np.array(list(self.ex_vivo_mm.values()), dtype=np.float64)
+        return [*_spelling_doubts(self.ex_vivo_mm), *unit_doubts(self.sizes(), ex_vivo_mm)]
 
     def sized_readings(self, modality: str) -> list[Reading]:
         """Readings of a modality that have a size, in order of mass and replicate."""

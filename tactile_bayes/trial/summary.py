@@ -30,7 +30,7 @@ from tactile_bayes.trial.figures import (
 )
 from tactile_bayes.trial.method_comparison import MethodComparison, compare_methods
 from tactile_bayes.trial.next_mass import NextMass
-from tactile_bayes.trial.readings import FloatArray, MassKey, ModalitySizes, Reading, Trial, mass_numbers, unit_doubts
+from tactile_bayes.trial.readings import FloatArray, MassKey, ModalitySizes, Reading, Trial, mass_numbers
 from tactile_bayes.trial.replicates import ReplicateFigures, reader_components, replicate_figures, spread_figures
 
 # --- Coverage of stated intervals against the size after excision.
@@ -346,7 +346,9 @@ class TrialReport(Record, kw_only=True):
     """Percent error of each other modality over the tactile one's, on common masses; empty without a tactile one."""
     paired_comparisons: tuple[accuracy.PairedComparison, ...]
     """Every pair of modalities on the masses that both looked for."""
-    doubts: tuple[str, ...]  #: Columns whose sizes seem to be in another unit than mm, or copied.
+    doubts: tuple[
+        str, ...
+    ]  #: Columns whose sizes seem to be in another unit than mm, or copied; codes that may be of one patient.
     conventions: dict[str, str]
     next_mass: NextMass | UnsetType = UNSET  #: Errors-in-variables model: what the next mass may bring.
     provenance: dict[str, Any]
@@ -381,7 +383,7 @@ def summarise(
         },
         mape_ratio_to_tactile=accuracy.mape_ratios(sizes, intervals=intervals),
         paired_comparisons=tuple(accuracy.paired_comparisons(sizes, intervals=intervals)),
-        doubts=tuple(unit_doubts(sizes, np.array(list(ex_vivo_mm.values()), dtype=np.float64))),
+        doubts=tuple(trial.doubts()),
         conventions=CONVENTIONS,
         provenance=dict(provenance),
         research_use=RESEARCH_USE,

@@ -105,6 +105,24 @@ def test_other_ratios_are_not_doubted(ratio: float) -> None:
     assert unit_doubts({"cbe": one}, one.ex_vivo_mm) == []
 
 
+@pytest.mark.parametrize(
+    ("masses", "doubt"),
+    [
+        ([("7", "1"), ("007", "1")], "patients 7 and 007 differ by capitals or leading zeros alone: are they one?"),
+        (
+            [("P1", "1"), ("p1", "1"), ("Q", "a"), ("Q", "A")],
+            "patients P1 and p1 (and 1 more) differ by capitals or leading zeros alone: are they one?",
+        ),
+        ([("P1", "1"), ("P1", "2"), ("P01", "1"), ("Q1", "01")], None),  # zeros within a code may mean something
+    ],
+)
+def test_codes_that_may_be_of_one_patient_or_mass_are_doubted(masses: list[tuple[str, str]], doubt: str | None) -> None:
+    """Two patients for one make intervals too narrow; `campaign run` refuses such codes."""
+    ex_vivo_mm = {key: 12.0 + i for i, key in enumerate(masses)}
+    readings = [Reading(key, "tactile", 1, "detected", size_mm=13.0) for key in masses]
+    assert Trial(readings, ex_vivo_mm).doubts() == ([] if doubt is None else [doubt])
+
+
 @pytest.mark.long
 def test_a_doubt_and_a_protocols_title_reach_page_json_and_stderr(tmp_path: Path) -> None:
     rows = [line.split(",") for line in TRIAL.read_text().splitlines()]
