@@ -119,8 +119,10 @@ def _modality_lines(name: str, report: ModalityReport) -> Iterator[str]:
             )
     if report.calibration is not None:
         calibration = report.calibration
+        all_state = calibration.n == report.readings_detected
+        of = "" if all_state else f" of {calibration.n} of {report.readings_detected} readings"
         yield (
-            f"{name}: stated uncertainty: CRPS {number(calibration.crps_mm, '.2f')} mm, "
+            f"{name}: stated uncertainty{of}: CRPS {number(calibration.crps_mm, '.2f')} mm, "
             f"interval score {number(calibration.interval_score_mm, '.1f')} mm; {calibration.advice}"
         )
 

@@ -398,7 +398,9 @@ def modality_report(
     families = (family(sizes, intervals=intervals).items() for family in FAMILIES)
     fields = fields_of(dict(chain.from_iterable(families)))
     if prediction is None:
-        fields["reasons"]["calibration"] = "no reading states an interval or a standard deviation"
+        fields["reasons"]["calibration"] = (
+            "no reading states an interval with a width and ends above 0, or a standard deviation"
+        )
     detected_interval, n = None, len(sizes.size_mm)
     if n:  # masses of one patient are not independent: the effective number of patients takes the place of n
         trials = effective_number(np.ones(n), sizes.patient)

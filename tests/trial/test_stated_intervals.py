@@ -9,6 +9,7 @@ import pytest
 from scipy import integrate, stats
 
 from tactile_bayes.declarations import replace
+from tactile_bayes.report.trial import method_lines
 from tactile_bayes.trial.readings import Interval, Reading, Trial
 from tactile_bayes.trial.summary import (
     Calibration,
@@ -18,6 +19,7 @@ from tactile_bayes.trial.summary import (
     interval_score,
     log_normal,
     prediction_of,
+    summarise,
 )
 
 
@@ -129,6 +131,25 @@ def test_the_calipers_error_is_added_in_quadrature() -> None:
 
 def one_reading(stated: Interval | None) -> Trial:
     return Trial([Reading(("p", "m"), "tactile", 1, "detected", 12.0, stated)], {("p", "m"): 10.0})
+
+
+def test_the_text_says_of_how_many_readings_the_calibration_is() -> None:
+    """An interval without a width, or from 0, has no log-normal: left out in silence it would flatter the rest."""
+    ends = [(9.0, 13.0), (8.0, 14.0), (11.0, 11.0), (0.0, 14.0)]
+    made = [
+        Reading((f"p{i}", "1"), "tactile", 1, "detected", 11.0, Interval(low, high, 0.95))
+        for i, (low, high) in enumerate(ends)
+    ]
+    for some, words in (
+        (made, "tactile: stated uncertainty of 2 of 4 readings: CRPS"),
+        (made[:2], "uncertainty: CRPS"),
+    ):
+        report = summarise(Trial(some, {one.key: 10.0 for one in some}))
+        assert words in "\n".join(method_lines(report))
+    report = summarise(Trial(made[2:], {one.key: 10.0 for one in made[2:]}))
+    assert (
+        report.modalities["tactile"].reasons["calibration"].endswith("width and ends above 0, or a standard deviation")
+    )
 
 
 def test_nothing_stated_and_few_masses_have_defined_answers() -> None:
