@@ -373,17 +373,19 @@ def known_body(
 
 def suppositions(
     calibration: BodyCalibration, known: Mapping[str, float], middle: tuple[float, float], *, variance: float
-) -> dict[str, Supposition]:
+) -> tuple[dict[str, Supposition], float]:
     """Those of `SUPPOSED` that the calibration's bodies hold, that the map leaves open and that nobody knows, by name.
 
-    For the mean ln a and p of the maps, and the variance of ln d as it is.
+    For the mean ln a and p of the maps, and the variance of ln d as it is. Also how far what is known moves ln d, in
+    SDs that it has without.
     """
-    hidden, supposed = calibration.hidden, {}
+    hidden, supposed = calibration.hidden, dict[str, Supposition]()
     if hidden is None:
-        return {}
+        return {}, 0.0
     middle_map = np.array([middle[0]]), np.array([middle[1]])
     table_sd = calibration.table_sd(calibration.body_sd(*middle_map, np.zeros(1)))
     expected, spread = known_body(calibration, known, *middle_map, table_sd)
+    moved = float(np.abs(expected[0]) / np.sqrt(variance + table_sd[0] ** 2 - spread[0]))
     features = calibration.features(*middle_map)[0]
     for label, (name, value) in SUPPOSED.items():
         low, high = calibration.bodies.get(name, (value, value))
@@ -394,4 +396,4 @@ def suppositions(
             remaining = float(np.clip(variance - float((spread - left)[0]), 0.0, variance))
             sds = float(np.sqrt(variance)), float(np.sqrt(remaining))
             supposed[label] = Supposition(name, value, float((shifted - expected)[0]), sds)
-    return supposed
+    return supposed, moved

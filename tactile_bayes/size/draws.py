@@ -235,6 +235,7 @@ class SizePosterior(Record, eq=False):
     """The same if exams of a mass differ as much as in the paper's trial; None without a second interval."""
     supposing: Mapping[str, Supposition] = field(default_factory=dict)
     """Sizes under suppositions on the body, by the names of `bodies.SUPPOSED`."""
+    known_sds: float = 0.0  #: How far what is known of the body moves ln d, in SDs that it has without.
 
     @property
     def max_size_mm(self) -> FloatArray:

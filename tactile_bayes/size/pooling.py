@@ -195,11 +195,9 @@ def pooled_size(
     size = pool.size(priors.between_maps or calibration.between_exams)
     middle = [float(np.mean([np.nanmean(getattr(m, n)) for m in matched])) for n in ("log_amplitude", "log_width")]
     variance = float(np.nanvar(np.log(size.max_size_mm)))
-    return replace(
-        size,
-        another_exam=None if priors.another_exam is None else pool.size(priors.another_exam),
-        supposing=suppositions(calibration, priors.known, (middle[0], middle[1]), variance=variance),
-    )
+    supposed, moved = suppositions(calibration, priors.known, (middle[0], middle[1]), variance=variance)
+    another = None if priors.another_exam is None else pool.size(priors.another_exam)
+    return replace(size, another_exam=another, supposing=supposed, known_sds=moved)
 
 
 class _Pool(Record, eq=False, dict=True):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from test_pooling import BODY_SD, calibration, pooled, shape
 
+import tactile_bayes as tb
 from tactile_bayes.declarations import replace
 from tactile_bayes.size.bodies import BodyCalibration
 from tactile_bayes.size.pooling import SizePriors
@@ -53,6 +54,28 @@ def test_what_the_map_tells_is_not_supposed_otherwise() -> None:
     told = replace(use, hidden=replace(use.hidden, covariance=np.array([[0.5, -0.01], [-0.01, 0.01]])))
     assert set(pooled([shape(2.7)], use=told).supposing) == {"soft", "hard"}
     assert set(pooled([shape(2.7)], use=use).supposing) == {"soft", "hard", "centred", "resting"}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("name", "value", "contradicts"),
+    [("depth_mm", 15.0, False), ("seat", 0.0, False), ("stiffness_ratio", 30.0, False), ("depth_mm", 1.5, True)],
+)
+def test_a_depth_in_cm_is_a_caution_and_true_properties_are_none(name: str, value: float, contradicts: bool) -> None:
+    """The demo's lump lies 15 mm deep: 1.5 made a lump of 15 mm one of 2 mm, without a word."""
+    size = tb.estimate(tb.demo_map(), known={name: value}, method="laplace")
+    cautions = [one.text for one in size.findings if one.kind == "own_settings"]
+    assert bool(cautions) == contradicts
+    assert all("times its error: the map contradicts it" in one for one in cautions)
+
+
+def test_what_is_known_moves_a_size_by_so_many_sds() -> None:
+    """Against both sizes: the shift of ln d over the SD that it has where nothing is known."""
+    use, maps = knowing(), [shape(2.7)]
+    free, told = (pooled(maps, use=use, priors=SizePriors(known=known)) for known in ({}, {"stiffness_ratio": 8.0}))
+    shift = np.log(told.median_mm / free.median_mm)
+    assert told.known_sds == pytest.approx(abs(shift) / np.nanstd(np.log(free.max_size_mm)), rel=0.05)
+    assert free.known_sds == 0.0
 
 
 def test_where_bodies_differ_most_what_is_known_tells_no_more() -> None:
