@@ -169,6 +169,9 @@ GROWTH_SHARES: Final = (0.2,)
 """Growth of the diameter, as shares, whose probability is reported; 20 % is the step of RECIST 1.1."""
 
 
+MOST_DAYS: Final = 36_525  #: Between visits; more are a date written as a number.
+
+
 class CompareOptions(Options):
     """Options of comparing visits."""
 
@@ -195,9 +198,11 @@ class CompareOptions(Options):
             times, later = len(self.days) - 1, visits - 1
             fault = f"times are given for {times} later visits, and there are {later}"
             raise UsageError(f"{fault}; give one for each, and of dates the first visit's, too")
+        listed = ", ".join(f"{day:.9g}" for day in self.days)
         if any(after <= before for before, after in zip(self.days, self.days[1:], strict=False)):
-            listed = ", ".join(f"{day:g}" for day in self.days)
             raise UsageError(f"the visits' days are {listed}; give them in order, each later than the one before")
+        if self.days[-1] - self.days[0] > MOST_DAYS:
+            raise UsageError(f"the visits' days are {listed}, a century and more; give days since the first visit")
 
 
 IntervalMethod = Literal["corrected", "jackknife", "bca"]

@@ -193,6 +193,7 @@ def test_a_stated_spread_between_exams_widens_the_change_and_leaves_one_interval
         (("a0.nc",), 2, "Missing option '--with'"),
         (("a0.nc", "--with", "same0.nc", "--days", 3, "--days", 9), 2, "times are given for 2 later visits"),
         (("a0.nc", "--with", "same0.nc", "--days", -3), 2, "each later than the one before"),
+        (("a0.nc", "--with", "same0.nc", "--days", 20260301), 2, "0, 20260301, a century and more; give days since"),
         (
             ("a0.nc", *" ".join(f"--with no{i}.nc" for i in range(10)).split()),
             2,
