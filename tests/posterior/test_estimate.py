@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from plain_calibration import RECIPE
@@ -12,6 +16,7 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.options import BumpPrior
+from tactile_bayes.posterior import estimate
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.estimate import estimate_map
 from tactile_bayes.posterior.result import Estimate
@@ -204,8 +209,21 @@ def test_rotation_is_spent_where_the_map_asks_for_it() -> None:
 
 
 def test_a_level_off_that_of_the_map_is_a_caution() -> None:
-    kinds = [[one.kind for one in run(WHITE + off, method="optimise").findings] for off in (0.0, -0.06)]
-    assert kinds == [[], ["uneven_level"]]
+    none, lower, higher = (run(WHITE + off, method="optimise").findings for off in (0.0, -0.06, 0.06))
+    assert none == ()
+    for (found,), share in ((lower, r"-\d\.\d"), (higher, r"\+\d\.\d")):
+        assert found.kind == "uneven_level"
+        assert re.match(rf"the pressure round the lump is {share} % off that of the rest of the map: ", found.text)
+
+
+def test_a_size_beyond_the_lumps_that_were_learned_is_a_caution_though_its_bump_is_within() -> None:
+    drawn: Any = SimpleNamespace(medians=(0.3, 5.0, 5.0), irregular=False)
+    calibration = SimpleNamespace(outside=lambda *_: ["amplitude 3"], beyond_lumps=lambda _: ["largest size 4 mm"])
+    for size, words in ((None, "amplitude 3"), (object(), "amplitude 3 and largest size 4 mm")):
+        result: Any = SimpleNamespace(posterior=drawn, calibration=calibration, size=size, figures={})
+        (found,) = estimate._findings(result, cell_mm=1.0)
+        assert found.kind == "outside_calibration"
+        assert found.text.endswith(f": {words}")
 
 
 def test_coarse_cells_are_flagged() -> None:
