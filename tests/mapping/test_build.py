@@ -447,6 +447,7 @@ def test_scans_that_do_not_belong_together_are_refused():
         build_map([scan, replace(scan, landmarks=moved)])
     with pytest.raises(BadDataError, match=r"differ in side \(left, right\)"):
         build_map([replace(scan, session={"side": side}) for side in ("right", "left")])
+    assert build_map([scan, replace(scan, session={"side": "left"})]).frame_count == 240  # one says nothing of its side
     with pytest.raises(BadDataError, match=r"differ in visit \(1, 2\)"):
         build_map([replace(scan, session={"visit": visit}) for visit in "12"])
     with pytest.raises(BadDataError, match="no scan was given"):

@@ -10,8 +10,9 @@ from tactile_bayes.declarations import replace
 from tactile_bayes.errors import BadDataError, UsageError
 from tactile_bayes.forward.scene import Lump, Noise, Scene, Strokes, Tracker
 from tactile_bayes.forward.simulate import head_poses, simulate
-from tactile_bayes.mapping.build import build_map
+from tactile_bayes.mapping.build import build_map, stroke_figures
 from tactile_bayes.mapping.convention import stroke_starts
+from tactile_bayes.mapping.latency import StrokeShift
 from tactile_bayes.mapping.map import TactileMap
 from tactile_bayes.posterior.draw import SamplerSettings
 from tactile_bayes.posterior.white import fit_bump
@@ -169,6 +170,22 @@ def test_a_scan_shorter_than_the_delays_that_are_tried_has_no_latency():
     short = scans.make_scan(scans.strokes(), field=scans.gaussian(), interval_s=0.001)
     with pytest.raises(BadDataError, match="no frame has a pose at every delay"):
         build_map(short, latency_ms="auto", as_stated=True)
+
+
+def test_mobility_is_half_of_what_lies_between_strokes_forth_and_back():
+    """Strokes whose shift is not known count for nothing, and strokes one way have no mobility."""
+    forth, back = StrokeShift(0, 9, 0, 1, 2.0, 0.3, True), StrokeShift(20, 29, 0, -1, -1.0, 0.4, True)
+    unknown = StrokeShift(10, 19, 0, -1)
+    one_way = {
+        "strokes": 2.0,
+        "strokes_known": 1.0,
+        "stroke_1_shift_x_mm": 2.0,
+        "stroke_1_sd_x_mm": 0.3,
+    }
+    assert stroke_figures([forth, unknown]) == one_way
+    both = {"strokes": 3.0, "strokes_known": 2.0, "stroke_3_shift_x_mm": -1.0, "stroke_3_sd_x_mm": 0.4}
+    figures = one_way | both | {"mobility_mm": 1.5, "mobility_sd_mm": 0.25}
+    assert stroke_figures([forth, unknown, back]) == pytest.approx(figures)
 
 
 def test_without_a_lump_every_latency_fits_and_none_is_given():

@@ -21,7 +21,7 @@ from tactile_bayes.geometry import rigid
 from tactile_bayes.mapping.arrangement import check_scan
 from tactile_bayes.mapping.build import build_map
 from tactile_bayes.mapping.plausibility import against_no_lump, exam_findings, map_findings
-from tactile_bayes.mapping.select import Jumps, find_faults, scan_findings
+from tactile_bayes.mapping.select import Jumps, find_faults, rate_doubt, scan_findings
 from tactile_bayes.posterior.verdict import no_verdict
 from tactile_bayes.scans import (
     ElementCalibration,
@@ -445,6 +445,26 @@ def test_jumps_are_counted(away: list[bool], told: list[str]) -> None:
 def test_poses_of_no_hand_are_refused_by_their_cause(made: Callable[[Scan], Scan], told: str) -> None:
     with pytest.raises(BadDataError, match=told):
         build_map(made(scan()), as_stated=True)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "unit"),
+    [(0.2, "milli"), (2e-4, "micro"), (2e-7, "nano"), (12_000.0, "minutes"), (1e8, None), (5.0, ""), (2000.0, "")],
+)
+def test_a_rate_that_no_array_has_names_the_unit_of_times_that_would_fit(rate_hz: float, unit: str | None) -> None:
+    """In s they would come at 200 Hz."""
+    doubt = rate_doubt(rate_hz)
+    asked = "check the frames' times" if unit is None else f"are the times in {unit}"
+    assert (doubt is None) if unit == "" else doubt[1].startswith(asked)
+
+
+@pytest.mark.parametrize(
+    ("lever_mm", "told"), [(0.0, False), (9.0, True), (50.0, False), (290.0, False), (310.0, True)]
+)
+def test_a_sensor_nearer_or_farther_than_a_handle_is_told(lever_mm: float, told: bool) -> None:
+    one = scan()
+    head = HeadGeometry(one.head.surface_mm, one.head.pitch_mm, rigid(np.eye(3), np.array([0.0, 0.0, -lever_mm])))
+    assert [found.kind for found in scan_findings(replace(one, head=head))] == ["unusual_scan"] * told
 
 
 def test_what_the_recorder_told_is_told_once() -> None:
