@@ -179,19 +179,13 @@ def same_code(code: str) -> str:
 
 
 def _spelling_doubts(masses: Iterable[MassKey]) -> list[str]:
-    """Sentence on codes of patients, or of a patient's masses, that `same_code` makes one; empty without any."""
-    first, pairs = dict[tuple[str, ...], str](), dict[str, None]()
+    """Sentences on codes of patients, or of a patient's masses, that `same_code` makes one; empty without any."""
+    first, pairs = dict[tuple[str, str], str](), list[str]()
     for patient, mass in masses:
-        for words, key, code in (
-            ("patients {} and {}", (same_code(patient),), patient),
-            (f"masses {{}} and {{}} of {patient}", (patient, same_code(mass)), mass),
-        ):
-            if (other := first.setdefault(key, code)) != code:
-                pairs[words.format(other, code)] = None
-    if not pairs:
-        return []
-    more = f" (and {len(pairs) - 1} more)" if len(pairs) > 1 else ""
-    return [f"{next(iter(pairs))}{more} differ by capitals or leading zeros alone: are they one?"]
+        for whose, code in (("patients", patient), (f"masses of {patient},", mass)):
+            if (other := first.setdefault((whose, same_code(code)), code)) != code:
+                pairs.append(f"{whose} {other} and {code}")
+    return [f"{one} differ by capitals or leading zeros alone: are they one?" for one in dict.fromkeys(pairs)]
 
 
 # --- Plausibility of a trial's units: impossible sizes, and modalities that differ from excision tenfold.
