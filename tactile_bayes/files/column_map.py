@@ -18,7 +18,7 @@ from tactile_bayes.files.reading import TOML_BYTES, read_text
 from tactile_bayes.files.tables import RawTable, Table, check_unique, composed, read_raw
 from tactile_bayes.presets import MM_PER_UNIT
 
-_WAY_OUT: Final = "see the column mapping in the tutorial"
+_WAY_OUT: Final = "see A wide table in docs/guides/validate.md"
 _OWN: Final = {"sd_mm": "sd", "low_mm": "low", "high_mm": "high", "ex_vivo_second_mm": "second", "date": "date"}
 Unit = Literal["mm", "cm", "in"]
 Column = Annotated[str, Meta(min_length=1)]

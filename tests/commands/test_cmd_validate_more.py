@@ -111,7 +111,7 @@ def test_a_wide_table_is_read_by_its_mapping(tmp_path: Path) -> None:
          "map.toml: NV stands in not_detected and in not_done; leave it in one of them"),
         (WIDE, MAPPING.replace("probability = 0.9", ""), "without probability"),
         (WIDE, MAPPING + "colour = 1\n", "map.toml"),
-        (WIDE, "patient = [", "is not TOML"),
+        (WIDE, "patient = [", "see A wide table in docs/guides/validate.md"),
     ],
 )  # fmt: skip
 def test_a_wide_tables_faults_are_named(tmp_path: Path, table: str, mapping: str, words: str) -> None:
