@@ -66,6 +66,9 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
     if len(rows[0]) > 2 and all(row[-1] == "" for row in rows):
         rows = [row[:-1] for row in rows]
         notes.append("every row ends with a separator: it begins no column")
+    if separator == "," and (part := next((one for row in rows for one in row if re.fullmatch(r"0\d+", one)), "")):
+        what = f"holds {part!r} between commas, as of a number with a decimal comma"
+        raise BadDataError(what, way_out="separate the columns by semicolons or tabs")
     values = _values(rows, marks, first)
     for mark in dict.fromkeys(marks):
         if count := sum(field == mark for row in rows for field in row):
@@ -334,6 +337,7 @@ def _where(cells: BoolArray) -> str:
 
 # A map divided by its level has a median near 1; farther off than this, it was not divided.
 _NORMALISED_MEDIAN: Final = (0.2, 5.0)
+_RANGE_ENDS: Final = (1.0, 100.0, 255.0, 65535.0)  #: To which programs stretch the values of a picture.
 _LEAST_SPACING_MM: Final = 0.01
 _MOST_READINGS: Final = 1e9  #: In a cell: no exam has more frames.
 _SMALLEST: Final = 1e-100  #: Largest value below which squares vanish: a lump of 1e-160 was not found.
@@ -384,6 +388,8 @@ def grid_map(grid: Grid, options: GridOptions) -> tuple[TactileMap, list[str]]:
         _refuse_outlying(values)
     units = options.units or (grid.units if options.normalise == "none" else "")
     tactile_map = _map(arrays, spacing_mm=spacing, normalise=options.normalise, units=units)
+    if options.normalise != "none" or options.level is not None:
+        _refuse_stretched(tactile_map)
     cell = options.cell_mm or (CELL_MM if spacing < _FINEST_MM * (1 - 1e-6) else spacing)
     if cell < spacing * (1 - 1e-6):
         raise UsageError(f"--cell-mm is {cell:g}, and the grid's cells are {spacing:g} mm; give that or more")
@@ -417,6 +423,14 @@ def _average_cells(tactile_map: TactileMap, times: int) -> TactileMap:
     x_mm, y_mm = (axis[::times] + (times - 1) / 2 * np.ptp(axis[:2]) for axis in (tactile_map.x_mm, tactile_map.y_mm))
     recipe = replace(tactile_map.recipe, cell_mm=times * tactile_map.recipe.cell_mm)
     return replace(tactile_map, mean=mean, variance=variance, count=count, x_mm=x_mm, y_mm=y_mm, recipe=recipe)
+
+
+def _refuse_stretched(tactile_map: TactileMap) -> None:
+    """Raise `BadDataError` for values from 0 to the end of a range: their level beside a lump is lost."""
+    values = tactile_map.mean[tactile_map.covered]
+    if values.min() == 0 and (high := values.max()) in _RANGE_ENDS:
+        what = f"values go from 0 to {high:g}, as those stretched to a range do: their level is lost"
+        raise BadDataError(what, way_out="give them as measured, or without --normalise and --level for widths alone")
 
 
 def _divide_by_level(tactile_map: TactileMap, level: float | str) -> TactileMap:

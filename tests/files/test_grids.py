@@ -569,3 +569,20 @@ def test_a_signalling_nan_of_32_bits_is_a_gap_like_another() -> None:
     values.view(np.uint32)[3, 4] = 0x7F800001
     made = tactile_bayes.map_of(values, spacing_mm=1.0)
     assert np.count_nonzero(~made.tactile_map.covered) == 1
+
+
+@pytest.mark.parametrize(("end", "stated"), [(1.0, {"normalise": "gain"}), (255.0, {"level": "fit"})])
+def test_values_stretched_to_a_range_have_no_level_and_give_no_size(end: float, stated: dict[str, str]) -> None:
+    """A map of 13 mm was sized at 20.5 mm, or said to hold no lump."""
+    values = tactile_bayes.demo_map().tactile_map.mean
+    stretched = end * ((values - np.nanmin(values)) / (np.nanmax(values) - np.nanmin(values)))
+    with pytest.raises(BadDataError, match=f"values go from 0 to {end:g}, as those stretched to a range do.*measured"):
+        tactile_bayes.map_of(stretched, spacing_mm=1.0, **stated)
+    assert tactile_bayes.map_of(stretched, spacing_mm=1.0).tactile_map.background is None  # widths alone
+
+
+def test_decimal_commas_between_commas_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "g.csv"
+    path.write_text("1,0000,1,0123\n1,0200,1,0456\n")
+    with pytest.raises(BadDataError, match="holds '0000' between commas, as of a number with a decimal comma; sep"):
+        tactile_bayes.map_of(path, spacing_mm=1.0)
