@@ -218,7 +218,7 @@ def test_a_level_off_that_of_the_map_is_a_caution() -> None:
 def test_a_size_beyond_the_lumps_that_were_learned_is_a_caution_though_its_bump_is_within() -> None:
     drawn: Any = SimpleNamespace(medians=(0.3, 5.0, 5.0), irregular=False)
     calibration = SimpleNamespace(outside=lambda *_: ["amplitude 3"], beyond_lumps=lambda _: ["largest size 4 mm"])
-    for size, words in ((None, "amplitude 3"), (object(), "amplitude 3 and largest size 4 mm")):
+    for size, words in ((None, "amplitude 3"), (SimpleNamespace(known_sds=0.0), "amplitude 3 and largest size 4 mm")):
         result: Any = SimpleNamespace(posterior=drawn, calibration=calibration, size=size, figures={})
         (found,) = estimate._findings(result, cell_mm=1.0)
         assert found.kind == "outside_calibration"
