@@ -98,6 +98,8 @@ def _pair_angles(x: FloatArray, y: FloatArray) -> tuple[FloatArray, bool]:
         angles.append(np.where(dx == 0, np.nan, np.arctan(dy / np.where(dx == 0, 1.0, dx))))
     ordered = np.concatenate(angles)
     ordered[np.isnan(ordered)] = math.pi / 2 if tau >= 0 else -math.pi / 2
+    at_45 = np.abs(np.abs(ordered) - math.pi / 4) < EQUAL  # but for rounding: 13.3 - 12.1 is not 1.2
+    ordered[at_45] = np.copysign(math.pi / 4, ordered[at_45])
     ordered.sort()
     return ordered, tau >= 0
 

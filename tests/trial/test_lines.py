@@ -153,6 +153,18 @@ def test_passing_bablok_by_its_definition(seed: int) -> None:
     assert flat == pytest.approx(plain_passing_bablok(x, y))
 
 
+def test_passing_bablok_is_of_one_slope_in_mm_and_in_tenths_of_them() -> None:
+    """Tenths are whole numbers, whose pairs of slope -1 are exact; in mm 13.3 - 12.1 is not 1.2: they were missed."""
+    rng = np.random.default_rng(77)
+    for _ in range(60):
+        x = np.round(10 * rng.lognormal(2.8, 0.4, 12))
+        y = np.round(1.1 * x * np.exp(rng.normal(0, 0.15, 12)))
+        tenths, mm = passing_bablok(x, y), passing_bablok(x / 10, y / 10)
+        assert mm.slope == pytest.approx(tenths.slope, rel=1e-12)
+        assert mm.stated is not None and tenths.stated is not None  # noqa: PT018
+        assert mm.stated[1] == pytest.approx(tenths.stated[1], rel=1e-12)
+
+
 def test_passing_bablok_counts_ties_and_slopes_of_minus_one_by_half() -> None:
     """Slopes of the six pairs by hand: 1, 1, 1, -1 twice, vertical once. Shift: two at -1 are half each, so 1."""
     x, y = np.array([0.0, 1.0, 1.0, 2.0]), np.array([0.0, 1.0, -1.0, 2.0])
