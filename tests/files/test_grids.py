@@ -584,5 +584,7 @@ def test_values_stretched_to_a_range_have_no_level_and_give_no_size(end: float, 
 def test_decimal_commas_between_commas_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "g.csv"
     path.write_text("1,0000,1,0123\n1,0200,1,0456\n")
-    with pytest.raises(BadDataError, match="holds '0000' between commas, as of a number with a decimal comma; sep"):
+    with pytest.raises(BadDataError, match="holds '0456' between commas, as of a number with a decimal comma; sep"):
         tactile_bayes.map_of(path, spacing_mm=1.0)
+    path.write_text("001,012,120\n003,040,009\n")  # of a fixed width
+    assert tactile_bayes.map_of(path, spacing_mm=1.0).tactile_map.mean.max() == 120
