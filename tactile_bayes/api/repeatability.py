@@ -57,7 +57,7 @@ def exams_of_campaign(folder: Path) -> list[ExamFolder]:
     table = folder / DONE
     if not table.is_file():
         raise BadDataError(f"holds no {DONE}", way_out="give a folder of `campaign run`", path=str(folder))
-    exams = []
+    exams = dict[str, ExamFolder]()
     for row in read_raw(table).rows:
         try:
             patient, visit, mass, replicate = (row[name] for name in ("patient", "visit", "mass", "replicate"))
@@ -67,8 +67,10 @@ def exams_of_campaign(folder: Path) -> list[ExamFolder]:
         name = exam_name(of_mass, replicate)
         if Path(name).name != name or not name.isprintable():
             raise BadDataError(f"names an exam {name!r}", way_out=_AGAIN, path=str(table))
-        exams.append(ExamFolder(name, of_mass, f"{patient} {mass}", folder / EXAMS / name))
-    return exams
+        if name in exams:
+            raise BadDataError(f"names the exam {name} twice", way_out=_AGAIN, path=str(table))
+        exams[name] = ExamFolder(name, of_mass, f"{patient} {mass}", folder / EXAMS / name)
+    return list(exams.values())
 
 
 def learn_from_exams(

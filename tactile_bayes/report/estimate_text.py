@@ -183,8 +183,8 @@ def estimate_text(estimate: Estimate, report: EstimateReport) -> str:
     lines += _detail_lines(estimate, report)
     if estimate.scene is not None:
         lines += estimate_document.scene_lines(estimate.scene)
-        if beside := " and ".join(str(mass.number) for mass in estimate_document.other_masses(report.masses)):
-            lines.append(f"These odds are of this window alone: mass {beside} of the map is above.")
+        if beside := ", ".join(str(mass.number) for mass in estimate_document.other_masses(report.masses)):
+            lines.append(f"These odds are of this window alone; other masses of the map ({beside}) are above.")
     if estimate.sensitivity is not None:
         lines.append(estimate_document.sensitivity_line(estimate.sensitivity))
     lines += [*finding_lines(report.findings, "check"), *passed_over_lines(estimate)]

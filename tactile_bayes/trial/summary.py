@@ -346,9 +346,8 @@ class TrialReport(Record, kw_only=True):
     """Percent error of each other modality over the tactile one's, on common masses; empty without a tactile one."""
     paired_comparisons: tuple[accuracy.PairedComparison, ...]
     """Every pair of modalities on the masses that both looked for."""
-    doubts: tuple[
-        str, ...
-    ]  #: Columns whose sizes seem to be in another unit than mm, or copied; codes that may be of one patient.
+    doubts: tuple[str, ...]
+    """Columns whose sizes seem to be in another unit than mm, or copied; codes that may be of one patient or mass."""
     conventions: dict[str, str]
     next_mass: NextMass | UnsetType = UNSET  #: Errors-in-variables model: what the next mass may bring.
     provenance: dict[str, Any]

@@ -238,10 +238,11 @@ def test_exams_by_several_calibrations_are_refused(tmp_path: Path) -> None:
     [
         ("patient,visit,mass\n01,v1,m1\n", "exams_done.csv: has no column 'replicate'; run the campaign again"),
         ("patient,visit,mass,replicate\n../x,1,1,1\n", "exams_done.csv: names an exam '../x.v1.m1.r1'; run the"),
+        ("patient,visit,mass,replicate\n1,1,1,1\n1,1,1,1\n", "exams_done.csv: names the exam 1.v1.m1.r1 twice; run"),
         ("patient,visit,mass,replicate\n0\0" + "1,1,1,1\n", r"names an exam '0\x001.v1.m1.r1'; run the campaign again"),
         ("patient,visit,mass,replicate\n01,1,1,1\n01,1,1,2\n", "exams/01.v1.m1.r1/estimate.json: cannot be read"),
     ],
-    ids=["a column less", "out of the folder", "a NUL", "without its exams"],
+    ids=["a column less", "out of the folder", "a row twice", "a NUL", "without its exams"],
 )
 def test_a_damaged_table_of_exams_is_refused_in_one_line(tmp_path: Path, table: str, fault: str) -> None:
     (tmp_path / "exams_done.csv").write_text(table)

@@ -209,7 +209,7 @@ def test_text_json_and_pool_name_the_other_rise(folder: Path) -> None:
     assert "Mass 2 at (1" in short
     text = told("two.nc", "-v")
     assert "Mass 2 at (15." in text or "Mass 2 at (14." in text
-    assert "These odds are of this window alone: mass 2 of the map is above." in text
+    assert "These odds are of this window alone; other masses of the map (2) are above." in text
     assert "a second lump in this window (odds" in text
     assert "Scene in the fit window of 20 mm about the lump: " in text
     rise = json.loads(told("two.nc", "--json"))["other_rises"][0]

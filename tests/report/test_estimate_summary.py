@@ -170,7 +170,7 @@ def test_the_worst_case_takes_at_most_12_lines_and_counts_what_it_does_not_show(
     whole = estimate_text(full, report)
     assert whole.count("CAUTION") == 9  # the control: there is more than 12 lines can hold
     assert len(re.findall(r"^Mass \d+ at ", whole, re.MULTILINE)) == 9
-    assert "These odds are of this window alone: mass 2 and 3 and 4 and " in whole
+    assert "These odds are of this window alone; other masses of the map (2, 3, 4, " in whole
 
 
 def test_a_broken_assumption_stands_first_and_one_to_check_after_the_size() -> None:
