@@ -312,12 +312,8 @@ def _corrected(table: Path | Sheet, base: str, options: LearnOptions, progress: 
             rows = read_table(table, "size_table.table.json")
             _check_table(rows, calibration, options)
             names = [f"line {line}" for line in rows.line_numbers]
-        maps, left_out, made, by_recipe = (
-            [],
-            [],
-            dict[object, str](),
-            Settings(size_calibration=base, seed=options.seed),
-        )
+        maps, left_out, by_recipe = [], [], Settings(size_calibration=base, seed=options.seed)
+        made = dict[object, str]()  # the row of each scan
         lines = [dict(zip(rows.columns, cells, strict=True)) for cells in zip(*rows.columns.values(), strict=True)]
         for i, (phantom, row) in enumerate(zip(_names(rows, lines, names), lines, strict=True)):
             bump = None if by_files else _bump(rows, i, row)
