@@ -114,10 +114,10 @@ def finding_lines(findings: Iterable[Finding], severity: Severity | None = None,
     return [f"{LEADS[one.severity]}{one.sentence(paper=paper)}." for one in _said_once(findings, severity)]
 
 
-def finding_summary(findings: Iterable[Finding], severity: Severity, *, most: int) -> list[str]:
-    """One line of the first findings of one severity and the number of the others; empty without any."""
+def finding_summary(findings: Iterable[Finding], severity: Severity, *, most: int | None = None) -> list[str]:
+    """One line of the findings of one severity, or of the first and the number of the others; empty without any."""
     texts = [one.sentence() for one in _said_once(findings, severity)]
-    return [f"{LEADS[severity]}{first_of(texts, most, '; ')}."] if texts else []
+    return [f"{LEADS[severity]}{first_of(texts, most or len(texts), '; ')}."] if texts else []
 
 
 def _said_once(findings: Iterable[Finding], severity: Severity | None) -> Iterator[Finding]:

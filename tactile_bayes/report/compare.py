@@ -303,7 +303,7 @@ _MOST_VISITS: Final = 3  #: Visits that a short report names one by one.
 
 def compare_summary(report: CompareReport) -> str:
     """Report in at most 12 lines; `compare_text` gives the rest."""
-    lines = [*finding_summary(report.findings, "caution", most=2), verdict_sentence(report)]
+    lines = [*finding_summary(report.findings, "caution"), verdict_sentence(report)]
     more, visits = [], report.visits
     if report.status == "compared":
         shown = visits if len(visits) <= _MOST_VISITS else (visits[0], visits[-1])

@@ -339,7 +339,7 @@ MOST_MASSES = 3  #: Masses besides the reported one that have a line.
 
 def estimate_summary(estimate: Estimate, report: EstimateReport) -> str:
     """Report of one map in at most `MOST_LINES` lines; `estimate_text` gives the rest."""
-    body = finding_summary(report.findings, "caution", most=3)
+    body = finding_summary(report.findings, "caution")
     checks = finding_summary(report.findings, "check", most=2)
     if estimate.status == "no_estimate":
         body += [*_no_estimate_lines(report), *_mass_lines(report.masses, room=MOST_MASSES), *checks]

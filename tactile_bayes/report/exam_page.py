@@ -18,7 +18,8 @@ from tactile_bayes.report.pages import cut, foot, page
 
 TITLE: Final = "Tactile exam"
 MOST_REPEATS: Final = 5
-_FINDINGS: Final = ((2, 320), (1, 220))  #: Findings and letters of each, and on a crowded page.
+_FINDINGS: Final = ((2, 320), (1, 220))
+"""Findings, of which cautions are never left out, and letters of each; and on a crowded page."""
 _PICTURE_MM: Final = (108.0, 96.0)
 _LOWER_MM: Final = 54.0
 """Height of the picture on a crowded page: one that has both repeats and several masses below it."""
@@ -34,7 +35,8 @@ def exam_page(exam: ShownExam) -> str:
     height_mm = _LOWER_MM if crowded else _PICTURE_MM[1]
     frame = None if drawn is None else svg.Frame.within(drawn, width_mm=_PICTURE_MM[0], height_mm=height_mm)
     seed, findings = report.provenance.get("seed"), finding_lines(exam.report.findings, paper=True)
-    findings = first_lines(findings, most, ", which the full report tells.")
+    cautions = len(finding_lines(exam.report.findings, "caution"))
+    findings = first_lines(findings, max(most, cautions), ", which the full report tells.")
     masses = sorted(exam.main.masses, key=lambda one: one.number)
     masses = masses if len(masses) > 1 or exam.elsewhere else []
     made = f"method {report.origin.settings.get('method', 'unknown')}"

@@ -190,7 +190,7 @@ def fat_apart(depths_mm: tuple[float, float]) -> Finding:
 def pooled_summary(report: PooledReport) -> str:
     """Report of a mass in at most 12 lines; `pooled_text` gives the rest."""
     findings, largest, figures = report.findings, report.max_size_mm, report.figures
-    lines = finding_summary(findings, "caution", most=2)
+    lines = finding_summary(findings, "caution")
     sizes = [one.max_size_mm for one in report.maps if one.max_size_mm is not None]
     if sizes:
         words = first_of([_size_words(size, with_ends=report.status == DISAGREE) for size in sizes], 4)

@@ -339,6 +339,14 @@ def test_every_finding_is_said(output: str) -> None:
             assert (one.remedy in text) is not how.paper
 
 
+@pytest.mark.parametrize("output", [name for name, how in OUTPUTS.items() if how.shortens])
+def test_a_list_that_is_short_leaves_out_checks_and_no_caution(output: str) -> None:
+    text = said(output, tuple(KINDS))
+    left_out = [kind for kind in KINDS if one_of(kind).sentence(paper=OUTPUTS[output].paper) not in text]
+    assert left_out
+    assert not any(KINDS[kind] == "caution" for kind in left_out)
+
+
 @pytest.mark.parametrize("output", OUTPUTS)
 def test_nothing_is_said_where_nothing_speaks_against_it_and_the_verdict_is_reported(output: str) -> None:
     clear, doubted = said(output, ()), said(output, tuple(KINDS) if not OUTPUTS[output].shortens else ("side",))

@@ -463,12 +463,12 @@ def test_a_page_from_python_is_the_same_and_private(tmp_path: Path) -> None:
 
 
 def full() -> ShownExam:
-    """As much as a page can hold: repeats, masses, cautions, long texts, a tall map."""
+    """As much as one sheet can hold: repeats, masses, a caution, checks, long texts, a tall map."""
     tactile_map, report = demo()
     reason = "a reason that is long " * 20
     masses = tuple(unsized(reason, number=n, reported=n == 1) for n in range(1, 12))
     told = replace(report, masses=masses)
-    entries = tuple(finding("side", f"caution {n} " * 80) for n in range(9))
+    entries = tuple(finding("few_strokes" if n else "side", f"finding {n} " * 80) for n in range(9))
     tall = replace(tactile_map, patient_from_plane=np.eye(4)[[1, 0, 2, 3]] * np.array([1, 1, -1, 1])[:, None])
     pooled = pooled_as(report, 12, findings=entries)
     facts = dict.fromkeys(("subject", "posture", "examiner", "visit", "mass"), "W" * 99)
