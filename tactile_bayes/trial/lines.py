@@ -49,8 +49,8 @@ class Line(Record):
 def passing_bablok(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) -> Line:
     """Fit y on x without assuming a distribution or knowing which method errs more.
 
-    Undefined with fewer than two different points, when the middle slope is vertical, or when so many slopes are
-    steeper than 45 degrees against the line that the shifted median lies beyond the last.
+    Undefined with fewer than two different points, of more than `MOST_MASSES`, when the middle slope is vertical, or
+    when so many slopes are steeper than 45 degrees against the line that the shifted median lies beyond the last.
 
     Passing & Bablok (1983), J. Clin. Chem. Clin. Biochem. 21, 709, for a line that rises; the mirror image for one that
     falls. The intercept is the median of y - slope x. Slope ends are order statistics at the shifted median -+
@@ -58,6 +58,8 @@ def passing_bablok(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) ->
     beyond the ordered slopes, both ends of both intervals are infinite.
     """
     _require_two_masses(x)
+    if len(x) > MOST_MASSES:
+        raise UndefinedError(f"the pairs of more than {MOST_MASSES:,} masses are not listed")
     angles, rising = _pair_angles(x, y)
     if not len(angles):
         raise UndefinedError("all points coincide, so no line is determined")
@@ -82,6 +84,7 @@ def passing_bablok(x: FloatArray, y: FloatArray, *, confidence: float = 0.95) ->
     return Line(float(np.median(y - slope * x)), slope, n, stated=(intercepts, slopes))
 
 
+MOST_MASSES = 10_000  #: Most with a line by Passing and Bablok; their pairs take 0.4 GB.
 _AT_ONCE = 256  #: Masses whose pairs with all earlier ones are listed at a time: 10,000 masses have 50 million pairs.
 
 

@@ -197,6 +197,12 @@ def test_exchanging_the_methods_inverts_passing_and_babloks_line(seed: int) -> N
     assert other.stated[1] == pytest.approx(tuple(1 / end for end in reversed(one.stated[1])))
 
 
+def test_a_line_through_the_pairs_of_too_many_masses_is_undefined() -> None:
+    x = np.linspace(5, 40, lines.MOST_MASSES + 1)
+    with pytest.raises(UndefinedError, match=r"the pairs of more than 10,000 masses are not listed"):
+        passing_bablok(x, x)
+
+
 @pytest.mark.parametrize("digits", [None, 0])
 def test_pairs_listed_in_parts_are_all_pairs(digits: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
     x, y = cloud(9, 240, digits=digits)
