@@ -305,8 +305,7 @@ def _notes(report: TrialReport) -> Iterator[str]:
                 f"on {counted(stated.masses, 'mass')}"
             )
         yield from _reasons(name, one, [key for key in one.reasons if key.removesuffix("_interval") in _FIRST])
-    if report.counts.masses_without_any_reading:
-        yield f"{counted(report.counts.masses_without_any_reading, 'excised mass')} without any reading, left out"
+    yield from general_cautions(report)
     yield (
         f"Errors: mean absolute error, in percent of the size after excision and in mm, with its {percent} interval "
         "below; a mass not found counts as size 0, an error of 100 %."
@@ -315,9 +314,15 @@ def _notes(report: TrialReport) -> Iterator[str]:
     if tested := sum(pair.p_holm is not None for pair in report.paired_comparisons):
         pairs = f", corrected for {tested} pairs by Holm" if tested > 1 else ""
         yield f"p: sign-flip test by patient on the masses that both looked for{pairs}."
-        patients = max(pair.patients for pair in report.paired_comparisons if pair.p_value is not None)
-        if (least := least_p(patients)) >= 0.05:  # no difference between modalities could give less
-            yield f"With {counted(patients, 'patient')} p cannot be below {least:.2g}: the test says nothing here."
+
+
+def general_cautions(report: TrialReport) -> Iterator[str]:
+    """Sentences on masses that nobody read, and on patients too few for a test."""
+    if report.counts.masses_without_any_reading:
+        yield f"{counted(report.counts.masses_without_any_reading, 'excised mass')} without any reading, left out."
+    patients = max((pair.patients for pair in report.paired_comparisons if pair.p_value is not None), default=0)
+    if patients and (least := least_p(patients)) >= 0.05:  # no difference between modalities could give less
+        yield f"With {counted(patients, 'patient')} p cannot be below {least:.2g}: the test says nothing here."
 
 
 def ratio_line(name: str, one: ModalityRatio) -> str:

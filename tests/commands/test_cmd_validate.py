@@ -143,9 +143,11 @@ def test_few_patients_get_no_interval_and_are_told_why(tmp_path: Path) -> None:
 def test_masses_without_readings_are_counted_not_refused(tmp_path: Path) -> None:
     withdrawn = "P9,1,cbe,1,,\n"
     rows = f"P1,1,cbe,1,12,detected\nP2,1,cbe,1,,not_done\n{withdrawn}"
-    text = validate(*split(*small(tmp_path, rows, "P1,1,10\nP2,1,20\nP3,1,9\n"))).stdout
+    tables = split(*small(tmp_path, rows, "P1,1,10\nP2,1,20\nP3,1,9\n"))
+    text = validate(*tables, "--html", tmp_path / "page.html").stdout
     assert "3 masses of 3 patients" in text
-    assert "1 excised mass without any reading" in text
+    for output in (text, (tmp_path / "page.html").read_text()):
+        assert "1 excised mass without any reading, left out." in output
     assert "1 not done, 1 without a row" in text
 
 

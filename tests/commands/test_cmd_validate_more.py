@@ -455,8 +455,10 @@ def test_a_p_value_that_few_patients_cannot_make_small_says_so(tmp_path: Path) -
         names = "ABCDEF"[:n]
         e = [(one, 1, 10.0 + i) for i, one in enumerate(names)]
         rows = [(one, 1, "tactile", x + 0.5) for one, _, x in e] + [(one, 1, "us", x + 4.0) for one, _, x in e]
-        text = validate(*small(tmp_path, rows, e), "--methods").output
-        assert ("With 3 patients p cannot be below 0.25: the test says nothing here." in text) == told, text
+        page = tmp_path / f"{n}.html"
+        text = validate(*small(tmp_path, rows, e), "--methods", "--html", page).output
+        sentence = "With 3 patients p cannot be below 0.25: the test says nothing here."
+        assert ((sentence in text), (sentence in page.read_text())) == (told, told), text
         assert re.search(r"; p 0\.\d+, p Holm", text)
 
 
