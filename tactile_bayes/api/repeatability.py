@@ -18,7 +18,7 @@ from tactile_bayes.files.atomic import sha256
 from tactile_bayes.files.documents import read_record
 from tactile_bayes.files.manifest_csv import DONE, ESTIMATE, EXAMS, SHAPE, exam_name, mass_name
 from tactile_bayes.files.npz import read_shape
-from tactile_bayes.files.provenance import Provenance, recordings, scans_of
+from tactile_bayes.files.provenance import Provenance, exam_with_any, recordings, scans_of
 from tactile_bayes.files.reports import EstimateReport
 from tactile_bayes.files.tables import read_raw
 from tactile_bayes.inference.draws import Quantity
@@ -135,10 +135,9 @@ def _repeats(exams: Sequence[ExamFolder]) -> tuple[list[list[_Repeat]], list[str
             if isinstance(repeat, str):
                 left_out.append(f"{exam.name}: it has no size ({repeat})")
                 continue
-            if shared := [scan for scan in repeat.scans if scan in scans]:
-                left_out.append(f"{exam.name}: of the same scan as {scans[shared[0]]}")
+            if twin := exam_with_any(repeat.scans, exam.name, scans):
+                left_out.append(f"{exam.name}: of the same scan as {twin}")
                 continue
-            scans |= dict.fromkeys(repeat.scans, exam.name)
             group.append(repeat)
         if len(group) > 1:
             groups.append(group)

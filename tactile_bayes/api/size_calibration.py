@@ -16,7 +16,7 @@ from tactile_bayes.api.sized import pooling_shape
 from tactile_bayes.declarations import Record, replace
 from tactile_bayes.errors import BadDataError, NotConvergedError, UsageError, in_file
 from tactile_bayes.files.documents import load_json
-from tactile_bayes.files.provenance import Provenance, hash_inputs, recordings
+from tactile_bayes.files.provenance import Provenance, exam_with_any, hash_inputs, recordings
 from tactile_bayes.files.size_json import SHIPPED, read_size_calibration, size_calibration_path, write_size_calibration
 from tactile_bayes.files.tables import Sheet, Table, header_of, read_table
 from tactile_bayes.forward.tissue import parse_seat
@@ -313,7 +313,7 @@ def _corrected(table: Path | Sheet, base: str, options: LearnOptions, progress: 
             _check_table(rows, calibration, options)
             names = [f"line {line}" for line in rows.line_numbers]
         maps, left_out, by_recipe = [], [], Settings(size_calibration=base, seed=options.seed)
-        made = dict[object, str]()  # the row of each scan
+        made = dict[str, str]()  # the row of each scan
         lines = [dict(zip(rows.columns, cells, strict=True)) for cells in zip(*rows.columns.values(), strict=True)]
         for i, (phantom, row) in enumerate(zip(_names(rows, lines, names), lines, strict=True)):
             bump = None if by_files else _bump(rows, i, row)
@@ -322,10 +322,9 @@ def _corrected(table: Path | Sheet, base: str, options: LearnOptions, progress: 
                 continue
             if bump is None:
                 outcome = estimate_file(folder / names[i], by_recipe)
-                marks = {outcome.tactile_map.fingerprint, *recordings(outcome.provenance.scans)}
-                if twin := next((made[mark] for mark in marks if mark in made), None):
+                marks = str(outcome.tactile_map.fingerprint), *recordings(outcome.provenance.scans)
+                if twin := exam_with_any(marks, names[i], made):
                     raise rows.error(i, "file", f"is of the same scan as {twin}", way_out="list each scan once")
-                made |= dict.fromkeys(marks, names[i])
                 if progress is not None:
                     progress(i + 1, len(rows))
                 bump = pooling_shape(outcome.tactile_map, outcome.estimate)

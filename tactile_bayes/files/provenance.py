@@ -70,6 +70,14 @@ def recordings(scans: Sequence[Mapping[str, str]]) -> Iterator[str]:
         yield from (f"{name} {scan[name]}" for name in _DIGESTS if scan.get(name))
 
 
+def exam_with_any(marks: Sequence[str], name: str, of: dict[str, str]) -> str | None:
+    """Name of an earlier exam that has any of the marks, such as `recordings`; without one they are kept in `of`."""
+    earlier = next((of[mark] for mark in marks if mark in of), None)
+    if earlier is None:
+        of.update(dict.fromkeys(marks, name))
+    return earlier
+
+
 def repeated_scans(exams: Sequence[Sequence[Mapping[str, str]]]) -> dict[int, int]:
     """Exams that share a recording with an earlier one: index of the exam -> index of the earlier one."""
     first_exam: dict[str, int] = {}
