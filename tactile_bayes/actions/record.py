@@ -310,8 +310,7 @@ def make_recording(request: Request) -> tuple[RecordingReport, bool]:
         signals = after.enter_context(noted_signals())  # to the end: a second Ctrl-C broke off what the first began
         try:
             report = _run(recorder, signals, head, request)
-            nominal = calibration.gain_kpa_per_count == PRESSURE_RANGE_KPA[1] / calibration.saturation_count
-            if request.tracker_url and nominal.all() and not calibration.offset_kpa.any():  # also where --like gave it
+            if request.tracker_url and _is_nominal(calibration):  # also where --like gave it
                 report.cautions.append(_NOMINAL)
             writer.close(as_dict(report) | {"cautions": "\n".join(report.cautions)})
         except OSError as error:
@@ -376,8 +375,7 @@ def calibration_for(
     if given is None:
         if not full_scale:
             raise DeviceError(f"{name}: its HELLO has saturation count 0; it must be the count at full scale, as 4095")
-        shape = hello.rows, hello.columns
-        return ElementCalibration(np.full(shape, PRESSURE_RANGE_KPA[1] / full_scale), np.zeros(shape), full_scale)
+        return _nominal((hello.rows, hello.columns), full_scale)
     if owner not in ("", hello.device_id) and not request.accept_calibration:
         raise UsageError(
             f"{name} is {hello.device_id!r}, {request.like} was recorded with {owner!r}; give this head's "
@@ -389,6 +387,17 @@ def calibration_for(
             "this head, or give --accept-calibration"
         )
     return given
+
+
+def _nominal(shape: tuple[int, ...], full_scale: int) -> ElementCalibration:
+    """The same gain for all taxels, by which full scale is the upper end of the pressure range."""
+    return ElementCalibration(np.full(shape, PRESSURE_RANGE_KPA[1] / full_scale), np.zeros(shape), full_scale)
+
+
+def _is_nominal(calibration: ElementCalibration) -> bool:
+    gain, offset = calibration.gain_kpa_per_count, calibration.offset_kpa
+    nominal = _nominal(gain.shape, calibration.saturation_count)
+    return np.array_equal(gain, nominal.gain_kpa_per_count) and np.array_equal(offset, nominal.offset_kpa)
 
 
 def _run(recorder: Recorder, signals: list[str], head: HeadGeometry, request: Request) -> RecordingReport:
