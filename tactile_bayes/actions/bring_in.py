@@ -176,8 +176,10 @@ def _lengths(scan: Scan) -> str:
     moved = " x ".join(f"{side:.0f}" for side in sides)
     turned = "" if np.ptp(scan.poses.quaternion_wxyz, axis=0).any() else " without turning"
     line = f"the sensor lies {lever:.3g} mm from the head, and moved by {moved} mm{turned}"
-    if sides.max() > MOST_SPAN_MM or sides.max() < _LEAST_SPAN_MM:
-        odd = f"no breast is so {'large' if sides.max() > MOST_SPAN_MM else 'small'}"
+    if sides.max() > MOST_SPAN_MM:
+        odd = "no breast is so large"
+    elif sides.max() < _LEAST_SPAN_MM:
+        odd = "no breast is so small"
     elif lever and not _LEVERS_MM[0] <= lever <= _LEVERS_MM[1]:
         odd = f"most sensors lie {_LEVERS_MM[0]} to {_LEVERS_MM[1]} mm from it"
     else:

@@ -66,10 +66,11 @@ def read_table(path: Path, *, no_value: Sequence[str] = ()) -> Grid:
     if len(rows[0]) > 2 and all(row[-1] == "" for row in rows):
         rows = [row[:-1] for row in rows]
         notes.append("every row ends with a separator: it begins no column")
-    padded = {i % 2: field for row in rows for i, field in enumerate(row) if re.fullmatch(r"0\d+", field)}
-    if separator == "," and list(padded) == [1]:  # in every second column alone
-        what = f"holds {padded[1]!r} between commas, as of a number with a decimal comma"
-        raise BadDataError(what, way_out="separate the columns by semicolons or tabs")
+    if separator == ",":
+        padded = {i % 2: field for row in rows for i, field in enumerate(row) if re.fullmatch(r"0\d+", field)}
+        if list(padded) == [1]:  # in every second column alone
+            what = f"holds {padded[1]!r} between commas, as of a number with a decimal comma"
+            raise BadDataError(what, way_out="separate the columns by semicolons or tabs")
     values = _values(rows, marks, first)
     for mark in dict.fromkeys(marks):
         if count := sum(field == mark for row in rows for field in row):

@@ -34,9 +34,9 @@ def exam_page(exam: ShownExam) -> str:
     drawn, report, least = exam.main.tactile_map, exam.main.report, exam.main.report.smallest_lump
     height_mm = _LOWER_MM if crowded else _PICTURE_MM[1]
     frame = None if drawn is None else svg.Frame.within(drawn, width_mm=_PICTURE_MM[0], height_mm=height_mm)
-    seed, findings = report.provenance.get("seed"), finding_lines(exam.report.findings, paper=True)
-    cautions = len(finding_lines(exam.report.findings, "caution"))
-    findings = first_lines(findings, max(most, cautions), ", which the full report tells.")
+    seed, cautions = report.provenance.get("seed"), finding_lines(exam.report.findings, "caution", paper=True)
+    checks = finding_lines(exam.report.findings, "check", paper=True)
+    checks = first_lines(checks, max(0, most - len(cautions)), ", which the full report tells.")
     masses = sorted(exam.main.masses, key=lambda one: one.number)
     masses = masses if len(masses) > 1 or exam.elsewhere else []
     made = f"method {report.origin.settings.get('method', 'unknown')}"
@@ -49,7 +49,7 @@ def exam_page(exam: ShownExam) -> str:
         crowded=crowded,
         facts=list(exam_words.facts(exam)),
         headline=headline(exam),
-        findings=findings,
+        findings=[*cautions, *checks],
         longest_finding=longest,
         exam=exam,
         frame=frame,
