@@ -20,7 +20,16 @@ from tactile_bayes.errors import DeviceError, UsageError
 from tactile_bayes.files.provenance import Provenance
 from tactile_bayes.files.scan_mcap import write_scan
 from tactile_bayes.hardware import head
-from tactile_bayes.hardware.emulated import EmulatedHead, EmulatedTracker, Emulator, Faults, Playback, PtyLink, TcpLink
+from tactile_bayes.hardware.emulated import (
+    EmulatedHead,
+    EmulatedTracker,
+    Emulator,
+    Faults,
+    Link,
+    Playback,
+    PtyLink,
+    TcpLink,
+)
 from tactile_bayes.hardware.head import HeadParser, encode_command
 from tactile_bayes.hardware.ports import Port
 from tactile_bayes.hardware.readings import EndReading, FrameReading, PoseReading
@@ -46,6 +55,15 @@ def poses_of(found) -> list[PoseReading]:
 
 def ended(found) -> bool:
     return bool(found) and isinstance(found[-1], EndReading)
+
+
+def played_once(link: Link, *, speed: float) -> tuple[Port, threading.Thread]:
+    """A port to an emulated head that plays its scan once, and the thread that it runs in."""
+    stage = Playback(speed=speed)
+    emulator = Emulator(EmulatedHead(SCAN), link, faults=Faults(), rng=np.random.default_rng(1), stage=stage)
+    thread = threading.Thread(target=lambda: emulator.run(once=True), daemon=True)
+    thread.start()
+    return Port(link.url, baud=9600, role="head"), thread
 
 
 def is_last(pose: PoseReading) -> bool:
@@ -93,13 +111,7 @@ def test_a_server_plays_for_each_host_that_connects():
 @pytest.mark.long
 @pytest.mark.parametrize("link_of", [PtyLink, lambda: TcpLink("127.0.0.1", 0)], ids=["pty", "tcp"])
 def test_once_ends_when_a_slow_host_has_read_the_last_frame(link_of):
-    link = link_of()
-    emulator = Emulator(
-        EmulatedHead(SCAN), link, faults=Faults(), rng=np.random.default_rng(1), stage=Playback(speed=10.0)
-    )
-    thread = threading.Thread(target=lambda: emulator.run(once=True), daemon=True)
-    thread.start()
-    port = Port(link.url, baud=9600, role="head")
+    port, thread = played_once(link_of(), speed=10.0)
     port.write(START)
     time.sleep(1.0)  # the scan is over long before anything is read
     found = read_until(port, HeadParser(), ended)
@@ -111,11 +123,7 @@ def test_once_ends_when_a_slow_host_has_read_the_last_frame(link_of):
 
 def test_once_ends_when_its_host_stops_before_the_end():
     """`emulate both --once` waited for ever once `record` had stopped."""
-    link = PtyLink()
-    emulator = Emulator(EmulatedHead(SCAN), link, faults=Faults(), rng=np.random.default_rng(1))
-    thread = threading.Thread(target=lambda: emulator.run(once=True), daemon=True)
-    thread.start()
-    port = Port(link.url, baud=9600, role="head")
+    port, thread = played_once(PtyLink(), speed=1.0)
     for command in (STOP, START, STOP):  # the first STOP is asked before the head is known
         assert thread.is_alive()
         with contextlib.suppress(DeviceError):  # after the last STOP the line may go before the host has flushed it
@@ -130,13 +138,7 @@ def test_once_ends_when_its_host_stops_before_the_end():
 def test_once_ends_when_its_host_has_gone_without_a_stop(monkeypatch, link_of):
     """After a `record` that was killed the rest of the scan waited in the emulator's buffer for good."""
     monkeypatch.setattr("tactile_bayes.hardware.emulated.LINGER_S", 0.2)
-    link = link_of()
-    emulator = Emulator(
-        EmulatedHead(SCAN), link, faults=Faults(), rng=np.random.default_rng(1), stage=Playback(speed=10.0)
-    )
-    thread = threading.Thread(target=lambda: emulator.run(once=True), daemon=True)
-    thread.start()
-    port = Port(link.url, baud=9600, role="head")
+    port, thread = played_once(link_of(), speed=10.0)
     port.write(START)
     time.sleep(0.05)
     port.close()
